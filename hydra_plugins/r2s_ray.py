@@ -1,7 +1,7 @@
-"""`hydra/launcher=ray`: the jobs of a sweep as Ray tasks, on this machine or on a cluster.
+"""`hydra/launcher=ray`: run the jobs of a sweep as Ray tasks, on this machine or on a cluster.
 
 Hydra finds launchers in this namespace. If a worker or node dies, Ray restarts jobs with skip_completed=true, which
-continue in their run folder; other jobs would run twice.
+continue in their run folders. It restarts no other job, which would start a second run.
 """
 
 import os
@@ -19,12 +19,12 @@ from omegaconf import DictConfig, open_dict
 
 
 class RayLauncher(Launcher):
-    """One task per job.
+    """Hydra launcher that runs each job as one Ray task.
 
     Args:
-        address: of a cluster's head, "auto" for the cluster of this machine; None: start Ray for this sweep.
-        num_cpus, num_gpus: per job; shares of a GPU are possible.
-        retries: restarts of a job whose worker or node died.
+        address: of the cluster's head node, or "auto" for this machine's cluster; None: start Ray for this sweep.
+        num_cpus, num_gpus: number per job; a job may use a fraction of a GPU.
+        retries: largest number of restarts of a job whose worker or node died.
     """
 
     def __init__(self, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0, retries: int = 3):
@@ -32,11 +32,11 @@ class RayLauncher(Launcher):
         self.each = {"num_cpus": num_cpus, "num_gpus": num_gpus}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Store the arguments of Hydra."""
+        """Store what Hydra passes before a launch."""
         self.context, self.task, self.config = hydra_context, task_function, config
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Run the jobs; return their results in order.
+        """Run the jobs in parallel, and return their results in the order of the jobs.
 
         Raises:
             UserError: Ray is not installed, or there is no cluster at the address.
@@ -52,7 +52,7 @@ class RayLauncher(Launcher):
 
         own = not ray.is_initialized()
         paths = [str(Path(__file__).parent.parent), os.getcwd(), os.environ.get("PYTHONPATH", "")]
-        os.environ["PYTHONPATH"] = os.pathsep.join(p for p in paths if p)  # of the workers on this machine
+        os.environ["PYTHONPATH"] = os.pathsep.join(p for p in paths if p)  # for workers on this machine
         try:
             if own:
                 ray.init(self.address, include_dashboard=False, logging_level="ERROR")
@@ -75,13 +75,13 @@ class RayLauncher(Launcher):
 
 
 def execute(number: int, overrides: list[str], shared: Any) -> tuple[JobReturn, str]:
-    """Run one job in a worker; return its result and its errors, a line each."""
+    """Run one job in a worker; return its result, and a text with one line per error."""
     from hydra.core.hydra_config import HydraConfig
     from hydra.core.singleton import Singleton
     from hydra.core.utils import run_job, setup_globals
 
     context, config, task, state, at = shared
-    if Path(at).is_dir():  # the working folder of relative paths such as root=runs
+    if Path(at).is_dir():  # relative paths such as root=runs begin at this folder
         os.chdir(at)
     sys.path.append(at)
     setup_globals()
@@ -91,7 +91,7 @@ def execute(number: int, overrides: list[str], shared: Any) -> tuple[JobReturn, 
         sweep.hydra.job.id, sweep.hydra.job.num = f"{sweep.hydra.job.name}_{number}", number
     HydraConfig.instance().set_config(sweep)
     with TemporaryDirectory() as folder:
-        failed = Path(folder) / "failed.txt"  # the file of the sweep may be on another machine
+        failed = Path(folder) / "failed.txt"  # the sweep's own file may be on another machine
         os.environ["R2S_FAILED"] = str(failed)
         done = run_job(
             hydra_context=context,
@@ -104,7 +104,7 @@ def execute(number: int, overrides: list[str], shared: Any) -> tuple[JobReturn, 
 
 
 def _result(task: Any, overrides: Sequence[str]) -> JobReturn:
-    """Wait for a job; a job that is lost with its worker counts as failed and does not stop the others."""
+    """Wait for a job and return its result. A job whose worker was lost counts as failed; the others run on."""
     import ray
 
     try:

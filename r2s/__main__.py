@@ -1,4 +1,4 @@
-"""`python -m r2s`: same as `python run.py`."""
+"""Entry point of `python -m r2s`, which does the same as `python run.py`."""
 
 from r2s.cli import main
 

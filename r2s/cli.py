@@ -1,6 +1,6 @@
-"""The command line: `python run.py ...`, installed `r2s ...`. `main` composes the config and calls one stage.
+"""The command line: `python run.py ...`, or `r2s ...` if installed. `main` composes the config and calls one stage.
 
-A user's mistake is one line on stderr and exit status 2.
+A user's mistake prints one line on stderr and ends with exit status 2.
 """
 
 import os
@@ -18,19 +18,19 @@ from r2s.override_checks import COMMANDS, check_overrides, extended
 from r2s.stages.build import GROUP, STAGES
 from r2s.stages.run_config import CONF, PROGRAM, TRUST, loaded, modules, replayed, run_config
 
-STOPPED = 3  # exit status of a run that a stopped arm ended
+STOPPED = 3  # exit status of a run that ended because the arm stopped
 INTERRUPTED = 130
 RESUMABLE = ("identify", "train", "tune", "results")
 PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
-MOST_SEED = 2**32 - 1  # of some generators of NumPy
+MOST_SEED = 2**32 - 1  # largest seed that some generators of NumPy accept
 ABSENT = "not there"
-# keys that may differ where skip_completed goes on: where a run is, how it is shown, on how many cores
+# keys that skip_completed does not compare: where a run is, how it is shown, on how many cores it runs
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
 
 
 def main():
-    """Run what the user typed."""
+    """Run the command or the job that the user typed."""
     if find_spec("hydra") is None:
         problem = f"{sys.executable} lacks the packages of r2s"
         sys.exit(fail(f"{problem}; type `make setup` once, then `source .venv/bin/activate`"))
@@ -70,9 +70,9 @@ def run_hydra(typed):
         errors = Path(folder) / "failed.txt"
         if typed.multirun:  # a job that fails does not stop the others
             os.environ[FAILED] = str(errors)
-            os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints a launcher's exception and exits
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints exceptions of launchers and exits
             os.environ.setdefault(GROUP, default_name(typed.overrides))
-        else:  # a command that a job of a sweep runs is no job of that sweep: it ends with a status of its own
+        else:  # a command that a sweep's job runs has its own exit status
             os.environ.pop(FAILED, None)
         try:
             job()
@@ -91,7 +91,7 @@ def run_hydra(typed):
 
 
 def run_job(cfg):
-    """Call the stage of a composed config."""
+    """Check a composed config and call its stage."""
     from hydra.core.hydra_config import HydraConfig
 
     with errors_in_one_line():
@@ -109,7 +109,7 @@ def run_job(cfg):
 
 
 def check_paths(cfg):
-    """Check the options that name a file or folder, and make them strings: YAML reads some names as numbers."""
+    """Check the options that name a file or folder, and convert them to strings: YAML reads some names as numbers."""
     for key in PATHS:
         value = cfg[key]
         if value is not None and (isinstance(value, bool) or not isinstance(value, str | int | float) or value == ""):
@@ -121,7 +121,7 @@ def check_paths(cfg):
 
 
 def resumed(cfg, overrides):
-    """Return the config and the overrides of the stopped run `resume=`."""
+    """Return config and overrides of the run folder `resume=`, with which its run continues."""
     from r2s.runs import is_done
 
     folder = Path(cfg.resume)
@@ -130,20 +130,20 @@ def resumed(cfg, overrides):
     if extra := [o for o in overrides if not o.startswith(("resume=", "trust=", "device="))]:
         raise UserError(f"resume: a run continues with its own config; leave out {' '.join(extra)}")
     before = run_config(folder, cfg.trust)
-    if before.stage == "tune":  # its trainings replay the overrides of the folder
+    if before.stage == "tune":  # its trainings use the overrides in the folder again
         os.environ[TRUST] = ",".join(modules(cfg.trust))
     if before.stage not in RESUMABLE:
         raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: {choices(RESUMABLE)}")
     if is_done(folder):
         raise UserError(f"resume: {folder} is finished")
     before.resume = str(folder)
-    if any(o.startswith("device=") for o in overrides):  # a checkpoint of a GPU goes on without one
+    if any(o.startswith("device=") for o in overrides):  # a run that began on a GPU can continue on a CPU
         before.device = cfg.device
     return before, typed_overrides(folder)
 
 
 def is_completed(cfg):
-    """Return whether the run folder of this job is finished; if it was stopped, set `resume` to it."""
+    """Return whether the job's run folder is finished; if it exists unfinished, set `resume` to continue it."""
     from r2s.runs import is_done
     from r2s.stages.build import unread
 
@@ -166,7 +166,7 @@ def is_completed(cfg):
 
 
 def differing(saved, cfg, most=3, counts=lambda key: True):
-    """Return how a composed config differs from the saved one of a run folder, in `most` settings that count."""
+    """Return lines that say how a config differs from the saved one, for at most `most` of the keys that count."""
     from omegaconf import OmegaConf
 
     from r2s.reporting.trackers.tracker import flat
@@ -179,7 +179,7 @@ def differing(saved, cfg, most=3, counts=lambda key: True):
 
 
 def typed_overrides(folder):
-    """Return the overrides that the user typed for a run folder."""
+    """Return the overrides that the user typed to create a run folder."""
     from r2s.runs import read_meta
 
     words = loaded(folder / "overrides.yaml")
@@ -193,7 +193,7 @@ def typed_overrides(folder):
 
 @contextmanager
 def errors_in_one_line():
-    """End the job with one line after a user's mistake, a full disk, a stopped arm or Ctrl-C."""
+    """End the job with one line of text after a user's mistake, a full disk, a stopped arm or Ctrl-C."""
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     try:
@@ -216,14 +216,14 @@ def errors_in_one_line():
         print(f"stopped: {in_one_line(reason)}", file=sys.stderr)
         sys.exit(STOPPED)
     except KeyboardInterrupt as stop:
-        folder = str(stop)  # see r2s/runs.py; empty before there is one
+        folder = str(stop)  # set in r2s/runs.py; empty if no run folder exists yet
         again = f"; resume={folder} goes on" if Path(folder).parent.name in RESUMABLE else ""
         print(f"\ninterrupted{f'; {folder} keeps what was written{again}' if folder else ''}", file=sys.stderr)
         sys.exit(INTERRUPTED)
 
 
 def end_workers():
-    """End the worker processes of a parallel sweep; joblib would keep them for five minutes."""
+    """End the worker processes of a parallel sweep, which joblib would keep alive for five minutes."""
     if "joblib" in sys.modules:
         from joblib.externals.loky import get_reusable_executor
 
@@ -231,7 +231,7 @@ def end_workers():
 
 
 def end_job(error):
-    """End a job with exit status 2; in a sweep, append the error to the file of errors instead."""
+    """Print an error and exit with status 2; in a sweep, append it to the file of errors instead of exiting."""
     status = fail(error)
     if FAILED not in os.environ:
         sys.exit(status)
@@ -240,7 +240,7 @@ def end_job(error):
 
 
 def describe(error: OSError) -> str:
-    """Return the message of a system error and its file."""
+    """Return the message of a system error, with the file that it concerns."""
     return f"{error.strerror}{f': {error.filename}' if error.filename else ''}"
 
 
@@ -250,6 +250,6 @@ def in_one_line(error) -> str:
 
 
 def fail(error) -> int:
-    """Print an error as one line and return the exit status."""
+    """Print an error as one line on stderr and return the exit status 2."""
     print(f"error: {in_one_line(error)}", file=sys.stderr)
     return 2

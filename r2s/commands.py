@@ -1,7 +1,7 @@
 """Commands without a run folder of their own.
 
-`r2s list`, `look` and `export` read run folders, `convert` writes a recording for ROS 2 or LeRobot, `check` judges a
-recording, or connects to an arm, `engines` lists the physics engines.
+`r2s list`, `look` and `export` read run folders. `convert` writes a recording for ROS 2 or LeRobot. `check` judges a
+recording, or connects to an arm. `engines` lists the physics engines.
 """
 
 import os
@@ -14,24 +14,24 @@ from typing import Any, NoReturn
 from r2s.errors import UserError, choices, instead_of, nearest, nearest_file
 
 PORT = 9090
-CONVERTED = ("robot", "data", "calibration", "friction", "inertia")  # groups that a command reads
+CONVERTED = ("robot", "data", "calibration", "friction", "inertia")  # config groups that `convert` reads
 JUDGED = (*CONVERTED, "identify")
 TRUSTED = "modules that a run may execute beside r2s, with commas between, also trust=MODULES"
 
 
 class Parser(ArgumentParser):
-    """A parser whose errors are UserErrors."""
+    """A parser that raises UserError for a wrong argument."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise UserError."""
+        """Raise UserError with the message."""
         raise UserError(f"{self.prog.removeprefix('r2s ')}: {message}; see {self.prog} --help")
 
 
 def run_command(words: Sequence[str]) -> None:
-    """Run a command, given as words with its arguments.
+    """Run a command: `words` are its name and its arguments.
 
     Raises:
-        UserError: a wrong argument or run folder.
+        UserError: an argument or a run folder is wrong.
     """
     parser = Parser(prog="r2s")
     commands = parser.add_subparsers(dest="command", required=True)
@@ -61,7 +61,7 @@ def run_command(words: Sequence[str]) -> None:
     )
     converting.add_argument("--trust", help=TRUSTED)
     commands.add_parser("engines", help="the physics engines: version, or how to install it")
-    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first: KEY=VALUE has no fixed number
+    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first, as KEY=VALUE may repeat
     others = [w for w in words[1:] if not w.startswith(("to=", "trust="))]
     typed, unknown = parser.parse_known_args([words[0], *options, *others])
     if unknown:
@@ -91,7 +91,7 @@ def list_runs(typed: Namespace) -> None:
 
 
 def look(typed: Namespace) -> None:
-    """Open the viewer; without a screen print the paths of the figures."""
+    """Open the viewer on one or several runs; without a screen, print the paths of their figures."""
     from r2s.reporting.viewer.look import has_screen, open_native, show_in_browser, side_by_side
 
     folders = [viewable(run) for run in typed.run]
@@ -136,7 +136,7 @@ def export(typed: Namespace) -> None:
 
 
 def check(typed: Namespace) -> None:
-    """Judge a recording, or an arm: print what was compared, and raise UserError if anything is refused."""
+    """Judge recordings or an arm: print the findings, and raise UserError if anything is refused."""
     from r2s.stages.check_data import check_data
 
     if not any(word.split("=")[0].split(".")[0] == "data" for word in typed.override):
@@ -147,10 +147,10 @@ def check(typed: Namespace) -> None:
 
 
 def composed(command: str, words: Sequence[str], groups: Sequence[str]) -> Any:
-    """Return the config of stage=identify with the overrides `words`, all of these groups.
+    """Return the config of stage=identify with the overrides `words`, which may set keys of `groups` only.
 
     Raises:
-        UserError: another group, or an option that does not exist.
+        UserError: an override is of another group, or its option does not exist.
     """
     from hydra import compose, initialize_config_dir
 
@@ -165,7 +165,7 @@ def composed(command: str, words: Sequence[str], groups: Sequence[str]) -> Any:
 
 
 def check_arm(typed: Namespace) -> None:
-    """Connect to an arm, print what was compared, and raise UserError if anything is refused; nothing moves."""
+    """Connect to an arm, print the findings, and raise UserError if anything is refused; the arm does not move."""
     from omegaconf import OmegaConf
     from pandas import DataFrame
 
@@ -184,7 +184,7 @@ def check_arm(typed: Namespace) -> None:
         raise UserError("arm.address must be given: arm.address=...")
     with opened_arm(cfg, make_robot(cfg), moves=False) as arm:
         found = [*arm.findings, *computer_findings("address" in cfg.arm and cfg.arm.realtime)]
-        if cfg.arm.live and typed.seconds > 0:  # in lock-step an arm has no clock
+        if cfg.arm.live and typed.seconds > 0:  # an arm in lock-step has no clock of its own
             try:
                 found += network_findings(*arm.watch(typed.seconds))
             except ArmStopped as lost:
@@ -230,7 +230,7 @@ def convert(typed: Namespace) -> None:
 
 
 def engines(typed: Namespace) -> None:
-    """Print a line for each physics engine."""
+    """Print a line for each physics engine: its version, or how to install it."""
     from r2s.engines.installed import installed
 
     for name, found, needs in installed():
@@ -238,7 +238,7 @@ def engines(typed: Namespace) -> None:
 
 
 def viewable(folder: Path) -> Path:
-    """Return a run folder with a recording; raise UserError if it has none."""
+    """Return the run folder; raise UserError if it has no recording for the viewer."""
     if (folder / "recording.rrd").is_file():
         return folder
     if (folder / "meta.json").is_file():
@@ -247,7 +247,7 @@ def viewable(folder: Path) -> Path:
 
 
 def robot_of(folders: Sequence[Path], trust: str | None = None):
-    """Return the robot of the runs; raise UserError if they have different ones, or foreign parts."""
+    """Return the robot of the runs; raise UserError if their robots differ, or a config names untrusted parts."""
     from r2s.stages.build import make_robot
     from r2s.stages.run_config import run_config
 

@@ -2,9 +2,9 @@
 
 numba caches a compiled function beside its source and recompiles it when that file changes. But the cached code also
 contains the functions that it calls, and those may lie in other files: after a change in physics/safety_filter.py,
-numba would run arm/driver.py with the old filter. So here the source of a compiled function is all compiled code of
-its room and of `physics`, and the modules from which they import constants. Compiled code must not call functions of
-any other room.
+numba would run arm/driver.py with the old filter. So here a function is recompiled when a compiled module of its room
+or of `physics` changes, or a module from which these import constants. Compiled code must not call functions of any
+other room.
 """
 
 import hashlib
@@ -21,13 +21,13 @@ from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, Use
 
 __all__ = ["cfunc", "njit"]
 PACKAGE = Path(__file__).parent
-RELAYED = "R2S_RELAYED"  # environment variable of a process whose output another one shows
-LONG_S = 2.0  # of one compilation, after which a user wonders what happens
+RELAYED = "R2S_RELAYED"  # environment variable, set if another process shows the output of this one
+LONG_S = 2.0  # s, duration of a compilation after which the user gets a message
 
 
 @cache
 def _sources(room: Path) -> bytes:
-    """Return a hash of the compiled modules whose functions a function in folder `room` may call."""
+    """Return a hash of all modules on which the compiled code of a function in the folder `room` may depend."""
     if PACKAGE in room.parents:  # a sub-room counts as part of its room
         names = room.relative_to(PACKAGE).parts[0], "physics"
         paths = {path for name in names for path in (PACKAGE / name).rglob("*.py")}
@@ -42,12 +42,12 @@ def _sources(room: Path) -> bytes:
 
 
 def _imports(path: Path) -> list[list[str]]:
-    """Return the parts of the names of r2s's modules from which a module imports."""
+    """Return the names, split at the dots, of the r2s modules from which a module imports."""
     return [name.split(".") for name in re.findall(r"^from (r2s[\w.]+) import", path.read_text(), re.MULTILINE)]
 
 
 class _Sources:
-    """A numba cache locator's source stamp, extended by the hash of `_sources`."""
+    """Mixin for numba's cache locators: it adds the hash of `_sources` to the source stamp."""
 
     _py_file: str
 
@@ -56,7 +56,7 @@ class _Sources:
 
 
 class Provided(_Sources, UserProvidedCacheLocator):
-    """Cache in the folder NUMBA_CACHE_DIR."""
+    """Cache in the folder that NUMBA_CACHE_DIR names."""
 
 
 class Beside(_Sources, InTreeCacheLocator):
@@ -72,7 +72,7 @@ config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # 
 
 
 class _Announce(event.Listener):
-    """Prints on a terminal, once per process, that compiling takes long: minutes, the first time."""
+    """Listener that prints once per process that a long compilation is running; the first takes minutes."""
 
     def __init__(self):
         self._printed = False

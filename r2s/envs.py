@@ -1,7 +1,7 @@
 """Environments for other libraries: `gymnasium.make("r2s/PandaReach-v0", calibration=RUN)` and `torchrl_env`.
 
-Importing this module registers r2s/PandaReach-v0, PandaTrack, PandaPress, PandaWipe and PandaPush where Gymnasium is
-installed; `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports it itself.
+If Gymnasium is installed, importing this module registers r2s/PandaReach-v0, and likewise PandaTrack, PandaPress,
+PandaWipe and PandaPush. `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports it automatically.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,11 +17,11 @@ from r2s.stages.parts import part
 
 TASKS = ("reach", "track", "press", "wipe", "push")
 SETTINGS = ("task", "robot", "friction", "inertia", "calibration", "dr", "reward", "control", "threads")
-READ = (*SETTINGS, "safety")  # keys of overrides
+READ = (*SETTINGS, "safety")  # first keys that `overrides` may have
 
 
 def gym_env(*, overrides: Sequence[str] = (), **settings: Any) -> Any:
-    """Return one arm as a Gymnasium environment, `r2s.learning.gym_env.ArmEnv`; arguments as in `parts`."""
+    """Return a Gymnasium environment of one arm, `r2s.learning.gym_env.ArmEnv`; see `parts` for the arguments."""
     optional_import("gymnasium", "r2s.envs.gym_env", "gym")
     from r2s.learning.gym_env import ArmEnv
 
@@ -32,7 +32,7 @@ def gym_env(*, overrides: Sequence[str] = (), **settings: Any) -> Any:
 def gym_vector_env(
     num_envs: int = 1, *, autoreset_mode: Any = "NextStep", overrides: Sequence[str] = (), **settings: Any
 ) -> Any:
-    """Return arms as a Gymnasium vector environment, `r2s.learning.gym_env.ArmVectorEnv`; see there and `parts`."""
+    """Return a Gymnasium vector environment of `num_envs` arms, `ArmVectorEnv`; see there and `parts`."""
     optional_import("gymnasium", "r2s.envs.gym_vector_env", "gym")
     from r2s.learning.gym_env import ArmVectorEnv
 
@@ -42,7 +42,7 @@ def gym_vector_env(
 
 
 def torchrl_env(num_envs: int = 32, *, seed: int = 0, overrides: Sequence[str] = (), **settings: Any) -> Any:
-    """Return arms as a TorchRL environment, `r2s.learning.env.TaskEnv`, with staggered episodes; see `parts`."""
+    """Return a TorchRL environment of `num_envs` arms with staggered episodes, `TaskEnv`; see there and `parts`."""
     from r2s.learning.env import TaskEnv
 
     robot, task, draw, reward, threads = parts(settings, overrides)
@@ -51,17 +51,17 @@ def torchrl_env(num_envs: int = 32, *, seed: int = 0, overrides: Sequence[str] =
 
 
 def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any, Any, Any, int]:
-    """Return robot, task, domain randomization, reward and threads of the options of a training.
+    """Return robot, task, domain randomization, reward and number of threads that a training with these options has.
 
     Args:
         settings: {option: value} of SETTINGS, such as {"task": "reach", "calibration": RUN, "dr": "identified"}.
         overrides: further options as on the command line, such as "task.episode_s=3".
 
     Raises:
-        TypeError: a name that is not in SETTINGS, as of any function. UserError: a wrong value or override.
+        TypeError: a name is not in SETTINGS. UserError: a value or an override is wrong.
     """
     for name in settings:
-        if name not in SETTINGS:  # no UserError: sb3 tries again without render_mode after a TypeError
+        if name not in SETTINGS:  # TypeError, because sb3 then tries again without render_mode
             raise TypeError(f"unexpected keyword argument '{name}'; {instead_of(name, SETTINGS)}")
     words = [_word(k, v) for k, v in settings.items() if v is not None]
     if isinstance(overrides, str):
@@ -79,7 +79,7 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
 
 
 def _word(name: str, value: Any) -> str:
-    """Return an option as on the command line; a path may have any character."""
+    """Return an option as typed on the command line; a path is quoted, because it may have any character."""
     from hydra.core.override_parser.types import Quote, QuotedString
 
     is_path = name == "calibration"
@@ -87,7 +87,7 @@ def _word(name: str, value: Any) -> str:
 
 
 def _composed(words: list[str]) -> Any:
-    """Return the config of a training with these overrides."""
+    """Return the config of a training with the overrides `words`."""
     from hydra import compose, initialize_config_dir
 
     with _aside():
@@ -98,7 +98,7 @@ def _composed(words: list[str]) -> Any:
 
 @contextmanager
 def _aside() -> Iterator[None]:
-    """Set the Hydra of the calling program aside, which may be a Hydra job itself."""
+    """Hide the Hydra state of the calling program, which may be a Hydra job itself, and restore it at the end."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
     from hydra.core.utils import JobRuntime

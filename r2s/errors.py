@@ -8,15 +8,15 @@ from numbers import Integral, Real
 from pathlib import Path
 from types import ModuleType
 
-FAILED = "R2S_FAILED"  # environment variable in a sweep: file of the errors of its jobs
+FAILED = "R2S_FAILED"  # environment variable that a sweep sets: file for the errors of its jobs
 
 
 class UserError(ValueError):
-    """A wrong input: one line with the option or file, the expected value, the value found and the nearest match."""
+    """A wrong input. Its line names the option or file, the expected value, the value found and the nearest match."""
 
 
 class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
-    """The arm stopped and the operator did not resume: the run keeps its results and ends as stopped."""
+    """The arm stopped and the operator did not resume; the run keeps its results and ends with status stopped."""
 
 
 def nearest(name: object, allowed: Iterable[str]) -> str:
@@ -26,7 +26,7 @@ def nearest(name: object, allowed: Iterable[str]) -> str:
 
 
 def nearest_file(path: Path, pattern: str = "*") -> str:
-    """Return the `nearest` of the names beside a path that match a pattern."""
+    """Return `nearest` of a path's name among the files beside it that match a pattern."""
     return nearest(path.name, (p.name for p in path.parent.glob(pattern)))
 
 
@@ -36,18 +36,18 @@ def choices(allowed: Iterable[str]) -> str:
 
 
 def instead_of(name: object, allowed: Collection[str]) -> str:
-    """Return "allowed: a, b, c; did you mean 'a'?" for a name that is none of them."""
+    """Return "allowed: a, b, c; did you mean 'a'?" for a name that is not allowed."""
     return f"allowed: {choices(allowed)}{nearest(name, allowed)}"
 
 
 def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
-    """Import a module of one of r2s's extras (docs/how_to/install.md).
+    """Import a module that only an extra of r2s installs (docs/how_to/install.md).
 
     Args:
-        module: such as "panda_py". needed_by: option or file, begins the message. extra: that installs it.
+        module: name such as "panda_py". needed_by: option or file that needs it. extra: name of the extra.
 
     Raises:
-        UserError: it, or what it imports, is not installed.
+        UserError: the module, or one that it imports, is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -57,12 +57,12 @@ def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
 
 
 def import_failure(error: ImportError, package: str, install: str) -> str:
-    """Return why a package does not import: it, a package it needs, or a shared library is missing.
+    """Return why an import failed: the package, another one that it needs, or a shared library is missing.
 
     Args:
-        error: of the import. An extension that misses a shared library, such as libGL, raises an ImportError with its
-            own name; a missing package a ModuleNotFoundError.
-        install: argument of pip that brings the packages.
+        error: of the import. A missing package raises ModuleNotFoundError; an extension without a shared library,
+            such as libGL, raises ImportError with the extension's name.
+        install: argument of `pip install` that installs the packages.
     """
     if not isinstance(error, ModuleNotFoundError):
         return f"which does not import ({error})"
@@ -76,11 +76,11 @@ def check_number(name: str, value: object, interval: str, whole: bool = False) -
 
     Args:
         name, value: of the setting.
-        interval: the allowed range, such as "(0, 1]".
+        interval: the allowed interval, such as "(0, 1]".
         whole: require an integer.
 
     Raises:
-        UserError: the value is not a number within these bounds.
+        UserError: the value is no number, or outside the interval.
     """
     low, high = (float(end) for end in interval[1:-1].split(","))
     if isinstance(value, Integral if whole else Real) and not isinstance(value, bool):

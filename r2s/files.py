@@ -1,4 +1,4 @@
-"""Atomic file writes, JSON, and paths of the files that come with the package."""
+"""Atomic writes, JSON files, and paths of files inside the package."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from typing import Any
 
 from r2s.errors import UserError, nearest_file
 
-# Exceptions that NumPy, pandas, h5py and zipfile raise for a truncated, altered or foreign array file.
+# Exceptions that NumPy, pandas, h5py and zipfile raise for a truncated or altered file, or one of another kind.
 DAMAGED = (
     KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
     SyntaxError, TokenError,  # NumPy parses an array's header as a Python literal
@@ -22,14 +22,14 @@ OWN = "r2s:"  # prefix of paths inside the package
 
 
 def located(path: str | os.PathLike) -> Path:
-    """Return the path of a file; `r2s:models/panda.xml` is a file of the package."""
+    """Return the path of a file. The prefix `r2s:`, as in r2s:models/panda.xml, stands for the package's folder."""
     name = os.fspath(path)
     return Path(__file__).parent / name.removeprefix(OWN) if name.startswith(OWN) else Path(name)
 
 
 @contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary path and rename it to `path` at the end of the block.
+    """Yield a temporary path; at the end of the block, rename that file to `path`.
 
     If the block raises or the process is killed, the file at `path` keeps its old content.
     """
@@ -43,10 +43,10 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def run_file(folder: str | Path, name: str, option: str) -> Path:
-    """Return the file `name` of a run folder, or `folder` itself if that is a file; `option` names it, for errors.
+    """Return the path of the file `name` in a run folder, or `folder` if it is a file; errors begin with `option`.
 
     Raises:
-        UserError: there is no such file.
+        UserError: the file does not exist.
     """
     path = Path(folder) / name if Path(folder).is_dir() else Path(folder)
     if not path.is_file():

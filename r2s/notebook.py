@@ -1,4 +1,4 @@
-"""For notebooks: run a command of r2s and show its figures."""
+"""Functions for notebooks: run a command of r2s, and show the figures of a run."""
 
 import os
 import re
@@ -10,14 +10,14 @@ from pathlib import Path
 
 from r2s.errors import UserError
 
-FIGURES_ONLY = "R2S_FIGURES"  # environment variable: show figures instead of the viewer
+FIGURES_ONLY = "R2S_FIGURES"  # environment variable; if set, `look` shows figures instead of the viewer
 
 
 def r2s(*words: str) -> Path:
-    """Run `r2s WORDS`, print its table, and return its run folder.
+    """Run `r2s WORDS`, print the command's output, and return its run folder.
 
     Raises:
-        UserError: the command fails; the message is its error.
+        UserError: the command fails; the message is its last line on stderr.
     """
     command = [sys.executable, "-m", "r2s", *words]
     env = os.environ | {
@@ -28,17 +28,17 @@ def r2s(*words: str) -> Path:
     if done.returncode:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         raise UserError(lines[-1].removeprefix("error: ") if lines else f"exit status {done.returncode}")
-    out = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)  # escape sequences of bold and dim, which some pages print
+    out = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)  # remove the escape sequences for bold and dim text
     print("\n".join(line.rstrip() for line in out.splitlines()))
     return Path(re.findall(r"^written: (\S+)", out, flags=re.M)[-1])
 
 
 def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520) -> None:
-    """Show a run in the rerun viewer in the notebook; without the package rerun-notebook show its figures.
+    """Show a run in the notebook: in the rerun viewer, or as figures if rerun-notebook is not installed.
 
     Args:
-        folder: of the run. figures: names such as "torque"; none: all.
-        width, height: pixels, of the viewer or at most of a figure.
+        folder: run folder. figures: names such as "torque"; all if none is given.
+        width, height: size of the viewer in pixels; figures also have this width.
     """
     from IPython.display import Image, display
 
@@ -58,7 +58,7 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
 
 
 def _small(path: Path, width: int) -> bytes:
-    """Return a figure as a PNG of this width with 64 colors: notebooks store what they show."""
+    """Return a figure as a PNG of this width with 64 colors, because the notebook file stores it."""
     from PIL import Image
 
     with Image.open(path) as picture:

@@ -1,4 +1,4 @@
-"""Check the overrides of a command line before Hydra runs: a mistake is one line, with the nearest match."""
+"""Check the overrides before Hydra runs, so that a mistake prints one line with the nearest match."""
 
 import re
 import shlex
@@ -11,10 +11,10 @@ from r2s.stages.build import CONF, STAGES, unread
 from r2s.stages.run_config import PROGRAM
 
 COMMANDS = ("look", "list", "export", "check", "convert", "engines")
-OPTIONAL = ("tracker", "experiment")  # groups that may have no option
-EXTENSIBLE = ("tune.space",)  # keys that + may add to
+OPTIONAL = ("tracker", "experiment")  # config groups of which no option has to be selected
+EXTENSIBLE = ("tune.space",)  # keys under which + may add new keys
 STATED = re.compile(r"identify\.prior\.(?!(?:commanded|measured|motor)\b)[A-Za-z_]\w*(?:\.\w+)?=")
-NO_OPTION = "base"  # a file that the options of a group share
+NO_OPTION = "base"  # file of a group that its options share; it is no option itself
 SEARCHPATH = "hydra.searchpath"
 # old names of keys and values, with the new ones
 RENAMED = {
@@ -38,14 +38,14 @@ RENAMED = {
     "task.residual": "control.residual, with control=computed_torque",
     "watch": "estimate",
 }
-# options of Hydra that place files, which r2s does not follow: a run folder is <root>/<stage>/<name>
+# options of Hydra that set output folders; r2s refuses them, because a run folder is <root>/<stage>/<name>
 PLACES = ("hydra.sweep", "hydra.run", "hydra.output_subdir", "hydra.job.chdir")
-PLAIN = re.compile(r"[A-Za-z0-9_/\-\\+.$%*@?|: ]")  # what Hydra's grammar takes in a value without quotes
+PLAIN = re.compile(r"[A-Za-z0-9_/\-\\+.$%*@?|: ]")  # characters that Hydra allows in a value without quotes
 SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweeps`
 
 
 def extended(words: Sequence[str]) -> list[str]:
-    """Return the words with ++ before stated values of parameters, because no file of conf/ has their keys."""
+    """Return the overrides with ++ before stated parameter values, because no file of conf/ has their keys."""
     return [f"++{w}" if STATED.match(w) else w for w in words]
 
 
@@ -53,7 +53,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
     """Check the overrides of a job, or of all jobs of a sweep.
 
     Args:
-        words: KEY=VALUE and GROUP=OPTION. config_dir: --config-dir. multirun: whether -m was given.
+        words: overrides KEY=VALUE and GROUP=OPTION. config_dir: of --config-dir. multirun: whether -m was given.
 
     Raises:
         UserError: an unknown option, an option that no job reads, a grid without -m, or a missing folder.
@@ -75,7 +75,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             return [o for o in loader.repository.get_group_options(group) if o != NO_OPTION]  # type: ignore[attr-defined]
 
         groups = {g: options(g) for g in loader.list_groups("") if g != "hydra"}
-        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # one may choose a launcher
+        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # one may select a launcher
         of_groups = {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")}
         if of_hydra:
             _check_hydra(of_hydra, [*own, *experiments], of_groups)
@@ -93,11 +93,11 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
 def _check_configs(
     configs: Sequence[Any], jobs: Sequence[list[str]], names: Sequence[str], groups: Mapping[str, Any]
 ) -> None:
-    """Check stage, root, switches and unread options of the composed configs of `jobs`."""
+    """Check stage, root and booleans of the configs of `jobs`, and that some job reads each option of `names`."""
     from hydra import compose
     from omegaconf import OmegaConf
 
-    for cfg in configs:  # Hydra needs root before the job can check it
+    for cfg in configs:  # Hydra uses root before the job can check it
         if cfg.get("stage") not in STAGES:
             raise UserError(f"stage: expected one of {choices(STAGES)}, got {cfg.get('stage')}")
         root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
@@ -116,9 +116,9 @@ def _check_configs(
 
 
 def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> None:
-    """Raise UserError if Hydra refuses one of its own options, or r2s does not follow it.
+    """Raise UserError if Hydra refuses one of its own options, or r2s does not support it.
 
-    own: words before them, which Hydra accepts, or the check of the other words finds the mistake.
+    own: overrides that precede them. If Hydra refuses `own`, the check of the other overrides reports it.
     """
     from hydra import compose
     from hydra.errors import HydraException
@@ -145,17 +145,17 @@ def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[st
 
 
 class UnknownOption(Exception):  # noqa: N818 (its message is made where the options are known)
-    """An override adds a key that nothing reads."""
+    """An override adds a key that no stage reads."""
 
 
 def _jobs(
     words: Sequence[str], own: list[str], groups: Mapping[str, Any], multirun: bool
 ) -> tuple[list[str], list[list[str]]]:
-    """Return the typed keys and groups, and jobs that contain every value of each sweep at least once.
+    """Return the typed keys and groups, and a list of jobs in which every value of each sweep occurs at least once.
 
     Raises:
         UserError: a sweep without -m, or a wrong value of a group.
-        UnknownOption, HydraException: another mistake, which `_first_mistake` names.
+        UnknownOption, HydraException: another mistake, for which `_first_mistake` makes the message.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
@@ -177,28 +177,28 @@ def _jobs(
 
 
 def _check_switches(cfg: Any, names: Sequence[str], defaults: Any) -> None:
-    """Raise UserError if an option of `names` is a boolean in `defaults`, but not in `cfg`."""
+    """Raise UserError if an option in `names` is a boolean in `defaults`, but not in `cfg`."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     for name in names:
         try:
             default, value = OmegaConf.select(defaults, name), OmegaConf.select(cfg, name)
-        except OmegaConfBaseException:  # an interpolation without target; the stage reports it
+        except OmegaConfBaseException:  # an interpolation without a target, which the stage reports
             continue
         if isinstance(default, bool) and not isinstance(value, bool):
             raise UserError(f"{name}: expected true or false, got {value!r}")
 
 
 def check_option(group: str, value: Any, options: Sequence[str]) -> None:
-    """Raise UserError if the option of a group is no string, for which Hydra raises a traceback later."""
+    """Raise UserError if the option of a group is no string; Hydra would end with a traceback later."""
     words = value if isinstance(value, list) else [value]
     if not all(isinstance(w, str) for w in words) or not (words or group in OPTIONAL):
         raise UserError(f"{group}: expected one of {choices(options)}, got {value}")
 
 
 def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]], multirun: bool) -> UserError:
-    """Return the error of the first override that Hydra refuses after those before it."""
+    """Return the error for the first override that Hydra refuses in addition to the previous ones."""
     from hydra import compose
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -221,7 +221,7 @@ def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[
 
 
 def renamed(override: str) -> str | None:
-    """Return a message with the new name for an override with an old name; None if the name is not old."""
+    """Return a message with the new name if an override has an old name, else None."""
     word = override.lstrip("+~")
     if word in RENAMED:
         return f"{word} is now {RENAMED[word]}"
@@ -242,7 +242,7 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
-    """Return the error of an override that Hydra refuses with `error`."""
+    """Return the error for an override that Hydra refuses with `error`."""
     if "=" not in word:
         return UserError(f"'{word}' is not KEY=VALUE{nearest(word, [*groups, *COMMANDS])}")
     key, value = word.split("=", 1)
@@ -273,7 +273,7 @@ def _parses(word: str) -> bool:
 
 
 def quoted(word: str) -> str:
-    """Return an override as a shell needs it for its value to be one string: 'data.path="a=b.csv"'."""
+    """Return an override quoted for the shell so that its value is one string: 'data.path="a=b.csv"'."""
     key, _, value = word.partition("=")
     inner = value.replace("\\", "\\\\").replace('"', '\\"')
     return shlex.quote(f'{key}="{inner}"')

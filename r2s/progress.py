@@ -1,4 +1,4 @@
-"""Progress of long computations: share done, elapsed time and time left."""
+"""Progress display of long computations: completed share, elapsed time and remaining time."""
 
 import atexit
 import time
@@ -12,14 +12,14 @@ from rich.table import Column
 
 
 class Progress:
-    """A progress bar on a terminal; elsewhere a line of text every `every_s` seconds.
+    """A progress bar on a terminal; without a terminal, a line of text every `every_s` seconds.
 
-    in_cycle: the calls come from a control cycle, which must not wait for a terminal: a thread writes.
+    in_cycle: whether a control cycle makes the calls. It must not wait for a terminal, so a thread writes.
     """
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
         self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
-        # time and share of the first call of the part whose share grows, where a resumed run is not at 0; last share
+        # time and share of the first call of the current part (not 0 in a resumed run), and share of the last call
         self._part, self._first, self._share = self._began, -1.0, 0.0
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._bar: Bar | None = None
@@ -58,9 +58,9 @@ class Progress:
 
     def _show(self, share: float, text: str) -> None:
         now = time.perf_counter()
-        if share < 0.5 * self._share or share < 1.0 <= self._share:  # the next part, such as another search
+        if share < 0.5 * self._share or share < 1.0 <= self._share:  # the next part begins, such as another search
             self._first = -1.0
-            if self._bar:  # a bar that was full stays finished: it would show no time any more
+            if self._bar:  # a bar that was full counts as finished and would show no time
                 began = self._bar.tasks[0].start_time
                 self._bar.reset(self._task)
                 self._bar.tasks[0].start_time = began
@@ -78,7 +78,7 @@ class Progress:
             self._print(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(now - self._began)}  {left}  {text}")
 
     def close(self, text: str = "") -> None:
-        """Print the elapsed time and the result in `text`."""
+        """End the display; print the elapsed time and `text`, the result."""
         if self._calls is not None:
             self._calls.put(None)
             self._writer.join()
@@ -92,5 +92,5 @@ class Progress:
 
 
 def clock(seconds: float) -> str:
-    """Return m:ss."""
+    """Return a duration as text, m:ss."""
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

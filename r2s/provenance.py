@@ -1,4 +1,4 @@
-"""Provenance of a result: git commit, package versions, machine and file digests."""
+"""Provenance of a result: git commit, package versions, computer and digests of files."""
 
 import hashlib
 import os
@@ -8,18 +8,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-# The packages that numerical results depend on.
+# The packages on which numerical results depend.
 PACKAGES = ("mujoco", "torch", "torchrl", "tensordict", "hydra-core", "pymoo", "dartpy", "numba", "numpy", "scipy")
 
 
 def sha256(path: str | Path) -> str:
-    """Return the SHA-256 digest of a file in hex."""
+    """Return the SHA-256 digest of a file as hexadecimal text."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def git() -> dict[str, Any]:
-    """Return the commit of the checkout and whether it has changes; None if r2s runs outside its checkout."""
+    """Return the commit of the checkout, and whether it has uncommitted changes; both None without a checkout."""
     root = Path(__file__).parent.parent
     if not (root / ".git").exists():  # an installed r2s may lie inside another project's repository
         return {"commit": None, "dirty": None}
@@ -53,7 +53,7 @@ def machine() -> dict[str, Any]:
 
 
 def gpus() -> list[str]:
-    """Return the models of the NVIDIA GPUs, as the driver lists them."""
+    """Return the model names of the NVIDIA GPUs that the driver lists."""
     files = sorted(Path("/proc/driver/nvidia/gpus").glob("*/information"))
     lines = [line for path in files for line in path.read_text().splitlines()]
     return [line.split(":", 1)[1].strip() for line in lines if line.startswith("Model:")]

@@ -1,7 +1,7 @@
 """Run folders: runs/<stage>/<name>/ with config, provenance, growing tables and the summary.
 
-meta.json has the status `running` from the first moment, which also marks a killed run. A folder appears complete and
-belongs to one process at a time: the lock on its overrides.yaml ends with the process, however that ends.
+meta.json has the status `running` from the start, and a killed run keeps it. A folder appears under its name with all
+its first files. Only one process can write in it: the lock on overrides.yaml ends with the process, however it ends.
 """
 
 import csv
@@ -26,9 +26,9 @@ from r2s.errors import Stopped, UserError
 from r2s.files import DAMAGED, atomic_write, write_json
 from r2s.provenance import git, machine, packages, sha256
 
-# of meta.json, for each part of a run that was resumed
+# keys that meta.json has for each part of a resumed run; every resume begins a part
 PART = ("start", "wall_clock_s", "status", "process", "threads", "device", "git", "packages", "machine")
-NOTE_S = 30.0  # between two writes of the wall clock into meta.json, so that a killed part keeps its time
+NOTE_S = 30.0  # s, between updates of the wall clock in meta.json, so that a killed part has its duration
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Job:
     """What a run folder records about its job.
 
     Attributes:
-        stage, name: the folder runs/<stage>/<name>; None: `default_name`. A used name gets a number.
-        config: composed config, YAML. overrides: as typed.
-        seed: of the run. threads: requested, 0: all cores. device: of the learner.
-        inputs: files that the run reads, for their SHA-256. parents: run folders that it starts from.
+        stage, name: of the folder runs/<stage>/<name>; name None: `default_name`. A number is added to a used name.
+        config: composed config as YAML text. overrides: as the user typed them.
+        seed: of the run. threads: requested number, 0: all cores. device: of the learner.
+        inputs: files that the run reads; their SHA-256 is recorded. parents: run folders whose results it uses.
     """
 
     stage: str
@@ -57,20 +57,20 @@ class Run:
     """A run folder, open while its stage runs: `with Run(...) as run`.
 
     Attributes:
-        folder: path. tracker: r2s.reporting.trackers.async_tracker.Trackers, or None; it neither raises nor blocks.
+        folder: path of the folder. tracker: r2s.reporting.trackers.async_tracker.Trackers, which neither raises nor
+            blocks, or None.
 
     Args:
-        root: folder of all runs. job: see `Job`.
+        root: folder of all runs. job: see `Job`. exact_name: whether a used name is an error.
         resume: run folder to continue instead of a new one; its inputs must be unchanged.
-        exact_name: a used name is an error.
 
     Raises:
-        UserError: the folder cannot be made, is in use by another process, or cannot be resumed.
+        UserError: the folder cannot be made, another process is using it, or it cannot be resumed.
     """
 
     def __init__(self, root: Path, job: Job, *, resume: str | Path | None = None, exact_name: bool = False):
         self._began = self._noted = time.monotonic()  # the wall clock may jump
-        self._earlier: list[dict[str, Any]] = []  # the parts before this one
+        self._earlier: list[dict[str, Any]] = []  # earlier parts of a resumed run
         self._tables: dict[str, Any] = {}
         self.tracker: Any = None
         self._meta: dict[str, Any] = {
@@ -100,7 +100,7 @@ class Run:
             raise UserError(f"root: no run folder can be made in {parent}: {error.strerror or error}") from None
 
     def _create(self, parent: Path, job: Job, exact_name: bool) -> None:
-        """Make the folder under a hidden name and rename it when it is complete."""
+        """Make the folder under a hidden name, and rename it when its first files are complete."""
         parent.mkdir(parents=True, exist_ok=True)
         self.folder = parent / f".{os.getpid()}_{time.time_ns()}"
         self.folder.mkdir()
@@ -116,7 +116,7 @@ class Run:
             raise
 
     def _resume(self, folder: Path) -> None:
-        """Lock a run folder and add a part to its meta.json; its config and overrides stay as they were written."""
+        """Lock a run folder and add a part to its meta.json; the files of config and overrides stay unchanged."""
         self.folder = folder
         self._lock = _lock(folder)
         try:
@@ -144,12 +144,12 @@ class Run:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
         if isinstance(error, KeyboardInterrupt):
             self._meta["error"] = "interrupted"
-            error.args = (str(self.folder),)  # which r2s/cli.py prints
+            error.args = (str(self.folder),)  # r2s/cli.py prints it
         try:
             for _, file in self._tables.values():
                 file.close()
             self._write_meta()
-        except OSError:  # full disk: meta.json keeps the status running, as after a kill
+        except OSError:  # if the disk is full, meta.json keeps the status running, as after a kill
             if error is None:
                 raise
         finally:
@@ -163,9 +163,9 @@ class Run:
         return self._meta
 
     def memo(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays of `make`, from checkpoints/<name>.npz if an earlier run of this folder computed them.
+        """Return the arrays that `make` computes, or read them from checkpoints/<name>.npz if that file exists.
 
-        A resumed run thus continues after its last complete step.
+        So a resumed run continues after its last complete step.
 
         Raises:
             UserError: the file is damaged.
@@ -185,9 +185,9 @@ class Run:
         return self.folder / "figures" / f"{name}.png"
 
     def log(self, table: str, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to <table>.csv and return it rounded as in the file; the first row sets the columns.
+        """Append a row to <table>.csv, and return the row rounded as in the file; the first row sets the columns.
 
-        Decisions based on the rounded row are the same after a resume, which reads the file (`rewind`).
+        Base decisions on the rounded row: a resumed run, which reads the file (`rewind`), then decides the same.
         """
         rounded = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in row.items()}
         if table not in self._tables:
@@ -204,7 +204,7 @@ class Run:
         return rounded
 
     def track(self, table: str, row: Mapping[str, Any]) -> None:
-        """Send a row to the tracker only; for tables that are written in another way."""
+        """Send a row to the tracker only; use it for a table that is not written by `log`."""
         if self.tracker:
             self.tracker.log(table, row)
 
@@ -226,7 +226,7 @@ class Run:
         try:
             rows = [[float(v) if v else math.nan for v in row] for row in csv.reader(lines[1:])]
             kept = [dict(zip(head, row, strict=True)) for row in rows if row[head.index(column)] <= most]
-            # the last evaluation of a finished run has the same step as the one before it and is repeated
+            # a finished run ends with two evaluations at the same step: drop the last, which will be repeated
             last = next((k for k, row in enumerate(kept) if row[column] == most), len(kept))
             del kept[last + 1 :]
         except ValueError as error:
@@ -244,7 +244,7 @@ class Run:
             self.tracker.summary(document)
 
     def _write_meta(self) -> None:
-        """Write meta.json; of a resumed run its clock is the sum over its parts, which it lists."""
+        """Write meta.json; for a resumed run it lists all parts, and its wall clock is their sum."""
         self._noted = time.monotonic()
         own = round(self._noted - self._began, 3)
         self._meta["wall_clock_s"] = round(own + sum(p["wall_clock_s"] for p in self._earlier), 3)
@@ -269,7 +269,7 @@ def load_arrays(path: Path) -> dict[str, Any]:
 
 
 def read_summary(folder: str | Path, option: str) -> dict[str, Any]:
-    """Return the summary.json of a run folder; raise UserError with `option` if there is none."""
+    """Return the summary.json of a run folder; raise UserError, which names `option`, if there is none."""
     path = Path(folder) / "summary.json"
     if not path.is_file():
         raise UserError(f"{option}: {folder} is no finished run folder (it has no summary.json)")
@@ -280,7 +280,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
     """Return the meta.json of a run folder.
 
     Raises:
-        UserError: it cannot be read, or has no status or inputs.
+        UserError: the file cannot be read, or has no status or inputs.
     """
     meta = _read_json(folder / "meta.json")
     if not {"status", "inputs"} <= meta.keys():
@@ -289,7 +289,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
 
 
 def parts_of(meta: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the parts of a run, one unless it was resumed: when, how long, by which code, on which machine.
+    """Return the parts of a run with their time, duration, code and machine; a run never resumed has one part.
 
     Raises:
         UserError: meta.json is damaged.
@@ -312,7 +312,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def is_done(folder: Path) -> bool:
-    """Return whether a run is finished; raise UserError if a process still writes into its folder."""
+    """Return whether a run is finished; raise UserError if a process is still writing in its folder."""
     meta = read_meta(folder)
     if meta["status"] == "running":
         os.close(_lock(folder))
@@ -320,7 +320,7 @@ def is_done(folder: Path) -> bool:
 
 
 def is_locked(folder: Path) -> bool:
-    """Return whether a process writes into a run folder."""
+    """Return whether a process holds the lock of a run folder, because it is writing there."""
     try:
         with open(folder / "overrides.yaml", "r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -332,9 +332,9 @@ def is_locked(folder: Path) -> bool:
 
 
 def _lock(folder: Path) -> int:
-    """Lock a run folder for this process; return the file descriptor that holds the lock.
+    """Lock a run folder for this process; return the file descriptor of the lock.
 
-    The system releases the lock when the process ends. Some network file systems do not support locks; there every
+    The system releases the lock when the process ends. Some network file systems do not support locks; there, every
     attempt succeeds.
 
     Raises:
@@ -358,9 +358,9 @@ def _lock(folder: Path) -> int:
 
 
 def status_of(meta: Mapping[str, Any]) -> str:
-    """Return done, stopped, failed, running, or killed (meta.json has running, but the process is gone).
+    """Return done, stopped, failed, running, or killed (meta.json says running, but the process is gone).
 
-    A process on another computer cannot be checked; meta.json then gives the status.
+    A process on another computer cannot be checked; the status is then that of meta.json.
     """
     process = meta.get("process", {})
     if meta["status"] != "running" or process.get("host") != platform.node():
@@ -370,25 +370,25 @@ def status_of(meta: Mapping[str, Any]) -> str:
     except ProcessLookupError:
         return "killed"
     except PermissionError:
-        pass  # another user's
+        pass  # the process of another user
     return "running"
 
 
 def default_name(overrides: Iterable[str]) -> str:
-    """Return a folder name made of the time and the overrides."""
+    """Return a folder name that consists of date, time and overrides."""
     typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=", "root=", "tracker")))
-    readable = re.sub(r"[^A-Za-z0-9.-]+", "_", typed)[:60].strip("_")  # a value that Hydra accepts without quotes
+    readable = re.sub(r"[^A-Za-z0-9.-]+", "_", typed)[:60].strip("_")  # Hydra accepts it without quotes
     return "_".join(p for p in (datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), readable) if p)
 
 
 def _take_name(folder: Path, parent: Path, name: str, exact_name: bool) -> Path:
-    """Rename a folder to the first free one of name, name_2, ...; with exact_name only to name."""
+    """Rename a folder to the first free name of name, name_2, ...; with exact_name, to name or not at all."""
     if not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name.startswith("."):
         raise UserError(f"name: {name!r} cannot be a folder's name")
     for k in range(1, 2 if exact_name else 1000):
         final = parent / (name if k == 1 else f"{name}_{k}")
         try:
-            os.rename(folder, final)  # also replaces an empty folder; of two processes the second finds it full
+            os.rename(folder, final)  # replaces an empty folder too; of two processes the second one fails
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                 raise

@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Adapter(Protocol):
-    """A torque correction of one arm at 1 kHz; it passes the safety filter like the policy's torque.
+    """A torque correction for one arm at 1 kHz; it passes through the safety filter like the policy's torque.
 
     Adapters are picklable: on a real-time arm the 1 kHz cycle runs in its own process.
     """

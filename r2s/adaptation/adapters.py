@@ -25,11 +25,11 @@ from r2s.recordings.recording import Recording
 
 @dataclass(frozen=True)
 class AdapterContext:
-    """Result of an identification, for the adapters of one arm.
+    """What adapters of one arm need: the result of its identification.
 
     Attributes:
         robot, dynamics: the identified arm.
-        posterior: space and draws of its parameters, None if no posterior is available.
+        posterior: space and posterior draws of its parameters; None if not available.
         unloaded: two recordings of commanded torque without a payload, None if not available.
     """
 
@@ -45,12 +45,12 @@ class AdapterContext:
 
     @cached_property
     def corrected(self) -> tuple[ArmModel, Noise]:
-        """The arm with the correction fitted to its recordings, and the remaining noise."""
+        """The arm with a correction fitted to `unloaded`, and the remaining noise."""
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 
     def gated(self, adapter: Holdable) -> Adapter:
-        """Return the adapter, which stops in contact if the arm has a tool that touches."""
+        """Return the adapter; if the robot has a tool, in a `ContactGate` that holds it in contact."""
         if self.robot.tool is None:
             return adapter
         wrench = WrenchObserver(self.robot, self.dynamics)
@@ -65,5 +65,5 @@ def observer(context: AdapterContext, filter_s: float) -> Adapter:
 
 
 def rls(context: AdapterContext) -> Adapter:
-    """Return the feedforward of the recursive estimate, `adapt=rls`."""
+    """Return the feedforward of a recursive payload, friction and offset estimate, `adapt=rls`."""
     return context.gated(Feedforward(*context.corrected))

@@ -1,7 +1,7 @@
 """The identified arm as arrays for compiled functions: links, friction, latency.
 
-A table per joint holds friction of any family: a part with the sign of the sliding direction, one row per direction,
-and a part that depends on speed alone.
+A table per joint represents any friction family over speed: a part with the sign of the sliding direction, in one row
+per direction, and a part that depends on speed alone.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from r2s.physics.newton_euler import links_of
 from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 
-POINTS = 401  # per direction of a table, denser towards rest
+POINTS = 401  # speeds per direction of a table, denser near rest
 FORWARD, BACKWARD, SPEED_ONLY = range(3)  # rows of a table
 
 
@@ -41,13 +41,13 @@ class ArmModel(NamedTuple):
     max_speed: np.ndarray  # (n,) rad/s, at the end of the table
     presliding: np.ndarray  # (n,) rad
     level: np.ndarray  # (n,) Nm, sliding friction
-    breakaway: np.ndarray  # (n,) Nm, the most that stiction carries
+    breakaway: np.ndarray  # (n,) Nm, largest torque that stiction balances
     latency: np.ndarray  # (2,) cycles, delay and lag
     payload_max: np.ndarray  # (2,) kg, m, as in `Robot`
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
-    """Return the arrays of one arm with dynamics `d`, without a batch shape."""
+    """Return the arrays of one arm; its dynamics `d` have no batch shape."""
     position, axes = ee_pose(robot)
     compensated = np.column_stack([robot.mass, robot.mass[:, None] * robot.com])
     compensated[-1] += d.declared_payload

@@ -1,6 +1,6 @@
-"""An adapter that stops while the arm touches something: it would read the contact as an error of the model and push.
+"""A gate that holds an adapter in contact, because it would mistake the contact for a model error and push.
 
-In contact the torque stays what it was before the contact began, and the adapter's estimate is held.
+In contact the added torque stays at its value before the contact began, and the adapter's estimate is frozen.
 """
 
 from typing import Protocol
@@ -10,20 +10,20 @@ import numpy as np
 from r2s.adaptation.adapter import Adapter
 from r2s.adaptation.wrench import WrenchObserver
 
-REWIND = 100  # cycles before a detected contact: longer than its detection takes (benchmarks/wrench.py)
+REWIND = 100  # cycles, age of the torque that is held: longer than a detection takes (benchmarks/wrench.py)
 
 
 class Holdable(Adapter, Protocol):
-    """An adapter whose estimate can be held."""
+    """An adapter whose estimate is frozen while `held` is True."""
 
     held: bool
 
 
 class ContactGate:
-    """The `Adapter` that holds another one in contact.
+    """An `Adapter` that holds another adapter in contact.
 
     Args:
-        adapter: what it holds. wrench: decides on contact.
+        adapter: the adapter to hold. wrench: detects contact.
     """
 
     def __init__(self, adapter: Holdable, wrench: WrenchObserver):
@@ -35,7 +35,7 @@ class ContactGate:
         self.adapter.begin()
         self.wrench.begin()
         self.adapter.held = False
-        self._past = np.zeros((REWIND, len(self.wrench.rests)))  # torques of the last cycles
+        self._past = np.zeros((REWIND, len(self.wrench.rests)))  # added torques of the last cycles without contact
         self._cycle = 0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:

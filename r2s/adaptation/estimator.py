@@ -28,10 +28,10 @@ class Estimate:
     """The estimate at one moment; `_half` marks half widths of 95 % intervals."""
 
     cycle: int  # since the start
-    t: float  # s, with pauses
+    t: float  # s since the start, pauses included
     mass: float  # kg
     mass_half: float
-    centre: np.ndarray  # (3,) m in the payload frame; nan if the mass may as well be zero
+    centre: np.ndarray  # (3,) m in the payload frame; nan if the mass is not significant
     centre_half: np.ndarray
     tensor: np.ndarray  # (3, 3) kg m^2 about the centre, of a physical body
     friction: np.ndarray  # (n,), relative to the model
@@ -41,7 +41,7 @@ class Estimate:
     rests: bool  # no joint slides
     odds: float  # log odds of a payload change
     changed: bool  # a payload change was detected at this moment
-    beyond: bool = False  # the mass is above the arm's largest payload, which is all that is compensated
+    beyond: bool = False  # the mass exceeds the arm's largest payload; only that much is compensated
 
 
 class Estimator:
@@ -49,7 +49,7 @@ class Estimator:
 
     Attributes:
         changes: s, times of detected payload changes.
-        held: True keeps the estimate, because the arm touches something.
+        held: whether the estimate is frozen, because the arm touches something.
 
     Args:
         arm: model of the arm. noise: its uncertainty.
@@ -63,13 +63,13 @@ class Estimator:
         self._filter = Filter.fresh(noise)
         self._cycle, self._paused_s, self._changed = 0, 0.0, False
         self._before = self._payload()
-        self._moved = 0  # spans since a rest, up to SETTLING_SPANS
+        self._moved = 0  # spans of motion since a rest, up to SETTLING_SPANS
         self._now: Estimate | None = None
         apply_jump(Filter.fresh(noise), noise)  # compile before an arm waits
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Begin a motion from rest; the estimate of `pause_s` before is kept, and as uncertain as after that time."""
+        """Begin a motion from rest, `pause_s` after the last one; keep the estimate, less certain after the pause."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None
@@ -111,9 +111,9 @@ class Estimator:
         return self._filter.x[:JUMP].copy(), self._filter.P[:JUMP, :JUMP].copy()
 
     def _replaced_at_rest(self) -> bool:
-        """Return whether the payload after a rest differs from the one before.
+        """Return whether the payload after a rest differs from the payload before that rest.
 
-        The payload's variance grows at rest, so a change at rest needs no jump.
+        The payload's variance grows at rest, so the filter follows a change at rest without a jump.
         """
         if self._filter.counts[AT_REST] >= REST_SPANS:
             self._moved = 0
@@ -173,8 +173,8 @@ class Estimator:
 def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return mass kg, centre (3,) m and tensor (3, 3) kg m^2 about it of the physical body nearest to x (10,).
 
-    Mass and first moments are kept, because data determine them well. The second moment about the centre becomes the
-    nearest one that is not negative, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
+    Mass and first moments stay as they are, because data determine them well. The second moment about the centre is
+    replaced by the nearest non-negative one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
     """
     m = float(x[0])
     if m <= 0.0:

@@ -1,19 +1,18 @@
 """Feedforward of the estimated payload, friction and offsets.
 
-It uses the mass and centre of the payload, within the limits of `plausible_payload`. For joint j the estimate x gives
-c = h x Nm. h holds the payload's ten columns (gravity, Coriolis, acceleration), the model's friction for the relative
-friction error, and 1 for the offset; the variance is s^2 = h P h^T. The feedforward is w c. Let c be an unbiased
-estimate of c*. Then E (w c - c*)^2 is least at w = c*^2 / (c*^2 + s^2), and c^2 - s^2 is an unbiased estimate of
-c*^2, which gives
+It uses the mass and centre of the payload, within the limits of `plausible_payload`. For joint j, the estimate x
+means a torque c = h x, Nm. h contains the payload's ten columns (gravity, Coriolis, acceleration), the model's
+friction for the relative friction error, and 1 for the offset. The variance of c is s^2 = h P h^T. The feedforward is
+w c. Let c be an unbiased estimate of c*. Then E (w c - c*)^2 is least at w = c*^2 / (c*^2 + s^2), and c^2 - s^2 is an
+unbiased estimate of c*^2. Hence
 
     w = max(0, 1 - s^2 / c^2),
 
-the positive part of the James-Stein shrinkage of 1961 for one number: a torque that is consistent with zero is not
-added.
+the positive part of James-Stein shrinkage (1961) for one number: a torque consistent with zero is not added.
 
 The feedforward follows the motion at once, but a new estimate enters through a low-pass over one span. A torque step
-twists elastic gears and lets motors run ahead of their links; the filter interprets this as another payload. On a
-development twin (elastic variant) steps of 30 Nm sustained themselves at 25 Hz.
+twists elastic gears, so motors run ahead of their links, and the filter interprets this as another payload. On a
+development twin (elastic variant), steps of 30 Nm sustained themselves at 25 Hz.
 """
 
 import numpy as np
@@ -45,11 +44,11 @@ class Feedforward:
         n = self._n
         self.estimator = Estimator(self._arm, self._noise)
         self._payload, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))
-        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # of the estimate; the part still to enter
+        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # of the estimate; its part still to be added
 
     @property
     def held(self) -> bool:
-        """True keeps the estimate."""
+        """Whether the estimate is frozen."""
         return self.estimator.held
 
     @held.setter
@@ -75,8 +74,8 @@ class Feedforward:
 def plausible_payload(x, most, out):
     """Write the ten parameters of the payload nearest to the mass and centre of x (10,) within the arm's limits.
 
-    most: (2,) kg, m, largest mass, and largest distance of its centre from the payload frame. The tensor is a ball of
-    water's, because data hardly show a tensor and a wrong one feeds back the acceleration.
+    most: (2,) kg, m, largest mass, and largest distance of its centre from the payload frame. The tensor is that of
+    a ball of water, because data hardly determine it, and a wrong one feeds back the acceleration.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0
@@ -111,7 +110,7 @@ def shrinkage_weights(filter, residual, payload, weight):
 
 @njit(cache=True, error_model="numpy")
 def _estimated_torque(x, state, payload, weight, slow, torque):
-    """Write the weighted torque (n,) Nm of the estimate x; slow: (n, 10), low-passed `payload_p`."""
+    """Write the weighted torque (n,) Nm of the estimate x; `slow` (n, 10) is the low-passed `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
         total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j]

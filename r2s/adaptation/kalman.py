@@ -4,12 +4,12 @@ State of n joints, N = 10 + 4 n:
 - the payload's mass, first moments and tensor about the payload frame: kg, kg m, kg m^2;
 - per joint the relative friction error, a random walk;
 - per joint a torque offset in Nm, a random walk;
-- per joint the model error in Nm, an Ornstein-Uhlenbeck process that also changes with the friction;
+- per joint the model error in Nm, an Ornstein-Uhlenbeck process whose variance grows when friction changes;
 - per joint the relative error of the momentum rate, an Ornstein-Uhlenbeck process.
 
 Measurements are momentum residuals, one joint after the other. They have outliers: a breakaway or a vibrating gear
-gives large residuals for a span or two. An innovation beyond HUBER standard deviations weighs less, by Huber's
-function (Robust Statistics, 1981); a payload change persists and still counts.
+causes large residuals for a span or two. Huber's function (Robust Statistics, 1981) reduces the weight of innovations
+beyond HUBER standard deviations; a payload change persists, so it still counts.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ from r2s.adaptation.payload_jump import (
 from r2s.adaptation.tuning import HUBER, MOMENTUM_CORRELATION, MOST_SURPRISE, ONSETS, REST_SPANS, STICTION_S, T
 from r2s.compiled import njit
 
-SPANS, AT_REST = range(2)  # `Filter.counts`; the others are in payload_jump.py
+SPANS, AT_REST = range(2)  # indices of `Filter.counts`; the others are in payload_jump.py
 
 
 class Noise(NamedTuple):
@@ -40,17 +40,17 @@ class Noise(NamedTuple):
     momentum_share: np.ndarray  # (n,), relative error of the momentum rate
     model: np.ndarray  # (n,) Nm, model error
     correlation_s: float  # s, of the model error
-    reversal: np.ndarray  # (n,), model error after a change of friction, relative to that change
+    reversal: np.ndarray  # (n,), added model error after a change of friction, relative to that change
     level: np.ndarray  # (n,) Nm, as in `ArmModel`
     breakaway: np.ndarray  # (n,) Nm, as in `ArmModel`
-    inertia: np.ndarray  # (n, n) kg m^2, missing in the model, mostly of rotors
-    latency: np.ndarray  # (n, n) s, missing in the model
-    payload_friction: float  # relative to the payload's torque: load-dependent friction, noisy speeds
+    inertia: np.ndarray  # (n, n) kg m^2, inertia missing in the model, mostly of rotors
+    latency: np.ndarray  # (n, n) s, latency missing in the model
+    payload_friction: float  # model error relative to the payload's torque: load-dependent friction, noisy speeds
     friction_drift: float  # 1/sqrt(s)
     offset_drift: np.ndarray  # (n,) Nm/sqrt(s)
-    rest_drift: float  # kg^2/s, of the payload's mass at rest, where its change is invisible
+    rest_drift: float  # kg^2/s, variance of the payload's mass at rest, where its change is invisible
     payload_drift: float  # 1/sqrt(s), relative to the payload's prior
-    adaptation: float  # growth of the white noise with surprising innovations, per span; 0: constant
+    adaptation: float  # growth of white noise under surprising innovations, per span; 0: none
     prior: np.ndarray  # (N,) standard deviations of the initial state
     mean: np.ndarray  # (N,), of the initial state
 
@@ -61,10 +61,10 @@ class Filter(NamedTuple):
     x: np.ndarray  # (N,), mean
     P: np.ndarray  # (N, N), covariance
     signature: np.ndarray  # (ONSETS, N, 4), response of x to a jump
-    information: np.ndarray  # (ONSETS, 4, 4), of the jump
+    information: np.ndarray  # (ONSETS, 4, 4), information matrix of the jump
     vector: np.ndarray  # (ONSETS, 4), information times the estimated jump
     counts: np.ndarray  # (5,), spans; spans at rest in a row; USED, NEXT, SINCE_JUMP
-    log_odds: np.ndarray  # (2,), MEAN over onsets; ONSET, the number of the likeliest
+    log_odds: np.ndarray  # (2,), MEAN: log odds over all onsets; ONSET: index of the likeliest one
     innovations: np.ndarray  # (2, n) Nm and Nm^2, innovations and their variances
     # (n,), white variance relative to `Noise`, at least 1; it grows under persistent innovations, such as a gear's
     # vibration under a load that no recording has
@@ -85,7 +85,7 @@ class Filter(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def update(filter, noise, residual):
-    """Advance `Filter` by one span with its `MomentumResidual`."""
+    """Advance a `Filter` by one span, with the `MomentumResidual` of this span."""
     predict(filter, noise, residual)
     correct(filter, noise, residual)
     detect(filter, noise)
@@ -98,7 +98,7 @@ def predict(filter, noise, residual):
     for j in range(n):
         moving |= residual.sliding[j] > 0.0
     counts[AT_REST] = 0 if moving else counts[AT_REST] + 1
-    if counts[AT_REST] >= REST_SPANS:  # a payload change is invisible
+    if counts[AT_REST] >= REST_SPANS:  # a payload change would be invisible
         for i in range(BODY):
             share = noise.prior[i] / noise.prior[0]
             P[i, i] = min(P[i, i] + noise.rest_drift * T * share * share, max(noise.prior[i] ** 2, P[i, i]))
@@ -115,7 +115,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Widen the estimate by `seconds` without a measurement, at most to the prior; the payload may change unseen."""
+    """Widen the covariance for `seconds` without measurements, at most to the prior; the payload may have changed."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:
@@ -124,7 +124,7 @@ def pause(filter, noise, seconds):
         else:
             drift = noise.friction_drift**2 if i < BODY + n else noise.offset_drift[i - BODY - n] ** 2
         P[i, i] = min(P[i, i] + drift * seconds, max(prior[i] ** 2, P[i, i]))
-    for i in range(BODY + 2 * n, len(prior)):  # the model's error in the last posture
+    for i in range(BODY + 2 * n, len(prior)):  # forget the model errors of the last posture
         filter.x[i] = 0.0
         P[i, :] = 0.0
         P[:, i] = 0.0
@@ -151,7 +151,7 @@ def _predict_joint(filter, noise, residual, j):
         P[error, error] += model**2 * (1.0 - fade * fade)
     P[error, error] += noise.reversal[j] ** 2 * noise.level[j] * residual.friction_path[j]
     most = model**2 + (2.0 * noise.reversal[j] * noise.level[j]) ** 2
-    if P[error, error] > most:  # the variance of an unknown model error: shrink correlations to it
+    if P[error, error] > most:  # at most that of an unknown model error: shrink the correlations as well
         for i in range(N):
             if i != error:
                 P[error, i] *= np.sqrt(most / P[error, error])
@@ -192,13 +192,13 @@ def correct(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def _innovation(filter, noise, residual, j):
-    """Return joint j's innovation in Nm and its variance; leave P h^T in filter.work[0]."""
+    """Return joint j's innovation in Nm and its variance; write P h^T into filter.work[0]."""
     x, P, h, n = filter.x, filter.P, filter.work[0], len(residual.y)
     friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
     of_friction, of_rate, payload = residual.friction[j], residual.rate[j], residual.payload
     R = noise.white[j] ** 2 + (noise.momentum_share[j] * of_rate) ** 2 + filter.work[1, j]
     R = filter.noise_scale[j] * R
-    if residual.sliding[j] == 0.0:  # stiction carries any torque within breakaway, uniform
+    if residual.sliding[j] == 0.0:  # stiction balances any torque within breakaway: uniform
         R += noise.breakaway[j] ** 2 / 3.0 * STICTION_S / T
     for i in range(len(x)):
         s = P[i, friction] * of_friction + P[i, offset] + P[i, error] + P[i, rate] * of_rate

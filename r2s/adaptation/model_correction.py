@@ -1,10 +1,10 @@
 """Correction of the identified model by its recordings without a payload.
 
-An identification keeps only the terms that its recording demands: a term that improves little is left out. A payload
-estimate needs smaller torques: 0.1 Nm at 0.5 m are 20 g. So every joint gets all terms named below, every link a mass
-and first moments, and every gear a compliance. Each parameter has a zero-mean prior of a
-typical size: ridge regression, the posterior mean of a linear model (Bishop 2006, 3.3). Measurements are momentum
-residuals (momentum_residual.py), which need no accelerations.
+An identification omits terms that improve the fit to its recording little. But small torques matter to a payload
+estimate: 0.1 Nm at 0.5 m are 20 g. So the correction has all terms named below for every joint, a mass and first
+moments for every link, and a compliance for every gear. Each parameter has a zero-mean prior of typical width: ridge
+regression, the posterior mean of a linear model (Bishop 2006, 3.3). Measurements are momentum residuals
+(momentum_residual.py), which need no accelerations.
 
 Behind a compliant gear, the link's angle is the motor's minus torque / K. A residual that equates the two has an
 error of M d2(torque)/dt2 / K: 0.7 Nm at 15 kNm/rad on a Panda whose torque varies by 4 Nm at 7 Hz.
@@ -21,7 +21,7 @@ from r2s.physics.newton_euler import COM, MASS
 from r2s.physics.rigid_body import regressor
 from r2s.physics.robot import Robot
 
-ROUNDS = 3  # of the fit, between estimates of the error's size
+ROUNDS = 3  # fits, each followed by an estimate of the error's size
 # terms of a joint, s the sign of its speed v: share of its friction, offset, s |gravity|, s, s sqrt v,
 # s / (1 + v / STRIBECK_SPEED), v, s sin q, s cos q, sin q, cos q
 SHARE, OFFSET, LOAD, LAW, ANGLE, CABLE, TERMS = 0, 1, 2, 3, 7, 9, 11
@@ -38,7 +38,7 @@ class ModelCorrection(NamedTuple):
 
     @staticmethod
     def none(n: int) -> "ModelCorrection":
-        """Return the correction of zero."""
+        """Return a correction that changes nothing."""
         return ModelCorrection(*map(np.zeros, ((n, 4), (n,), (n, TERMS), (n, n), (n, n))))
 
 
@@ -51,7 +51,7 @@ def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumRe
         return ModelCorrection.none(n)
     K, L = own.shape[2], 5 * n
     prior = np.concatenate([_link_prior(arm).ravel(), np.full(n, tuning.GEAR_COMPLIANCE), _joint_prior(arm).ravel()])
-    error: np.ndarray = tuning.FRICTION_SHARE * np.maximum(arm.level, 1e-6)  # Nm, of a joint's residuals
+    error: np.ndarray = tuning.FRICTION_SHARE * np.maximum(arm.level, 1e-6)  # Nm, RMS of a joint's residuals
     out: np.ndarray = np.zeros(len(prior))
     parts = []
     for j in range(n):
@@ -73,7 +73,7 @@ def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumRe
 
 
 def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
-    """Return the corrected arm; `Noise` holds the correction of inertia and latency."""
+    """Return the corrected arm, except inertia and latency, whose correction is in `Noise`."""
     links, table = arm.links.copy(), arm.table.copy()
     before, has_mass = arm.links[:, MASS, None], arm.links[:, MASS] > 0.0
     mass = np.maximum(before + correction.links[:, :1], 0.5 * before)[has_mass]
@@ -98,7 +98,7 @@ def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
 def corrected_residuals(
     robot: Robot, arm: ArmModel, correction: ModelCorrection, residuals: list[MomentumResidual]
 ) -> list[MomentumResidual]:
-    """Return the residuals of the corrected arm, with its inertia and latency, from the residuals of `arm`."""
+    """Return the residuals of the corrected arm, inertia and latency included, from the `residuals` of `arm`."""
     shared, own, y, _ = _columns(robot, arm, residuals)
     terms = own * np.concatenate([correction.joints, correction.inertia, correction.latency], 1)
     y = y - shared @ np.concatenate([correction.links.ravel(), correction.compliance]) - terms.sum(-1)

@@ -1,4 +1,4 @@
-"""Generalised momentum of an arm, and the columns of a payload's ten inertial parameters in it; compiled.
+"""Generalised momentum of an arm, and its derivatives by a payload's ten inertial parameters (columns); compiled.
 
 p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q), without accelerations (De Luca and Mattone, ICRA 2003). Let S_j
 be joint j's screw about the base origin, and h_j the momentum of all bodies beyond joint j. Then p_j = S_j . h_j and
@@ -21,8 +21,8 @@ class MomentumTerms(NamedTuple):
 
     p: np.ndarray  # (n,) Nm s
     coriolis: np.ndarray  # (n,) Nm, C^T dq
-    uncompensated: np.ndarray  # (n,) Nm, gravity of the links without what gravity compensation cancels
-    compensated: np.ndarray  # (n,) Nm, the rest of it
+    uncompensated: np.ndarray  # (n,) Nm, gravity torque of the links that gravity compensation does not cancel
+    compensated: np.ndarray  # (n,) Nm, gravity torque that it cancels
     payload_p: np.ndarray  # (n, 10), the payload's columns of p
     payload_torque: np.ndarray  # (n, 10), its columns of coriolis - uncompensated
 

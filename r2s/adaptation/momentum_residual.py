@@ -1,8 +1,8 @@
 """Momentum residual over a few milliseconds: torque that commands, friction and links do not explain; compiled.
 
 The change of momentum equals the integral of all torques, so nothing is differentiated. A residual compares two means
-one span of T s apart: y = (mean of the integrated model torque minus momentum, now minus before) / T, in Nm.
-It is linear in the unknown parameters: y = H x + noise.
+one span of T s apart: y = (m now - m before) / T, Nm, with m the mean of integrated model torque
+minus momentum. It is linear in the unknown parameters: y = H x + noise.
 
 Each mean has triangular weights over two spans, so y weighs torque by a quadratic spline over three spans. Elastic
 gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm; sampled once per span, this would alias
@@ -21,14 +21,14 @@ from r2s.physics.actuation import SLOTS, motor_torque
 from r2s.physics.newton_euler import WORK, equations
 from r2s.physics.robot import SIM_DT
 
-CYCLE, COMMAND, ENDED = range(3)  # counts: cycles of this span, commands in all, spans that have ended (3 at most)
-BEFORE, INTEGRAL = range(2)  # rows: value of the cycle before; integral over the span
+CYCLE, COMMAND, ENDED = range(3)  # counts: cycles of this span, all commands, ended spans (3 at most)
+BEFORE, INTEGRAL = range(2)  # rows: value in the previous cycle; integral over the span
 # rows of `sums`: residual Nm s, friction Nm s, momentum Nm s, q, dq, motor torque Nm
 RESIDUAL, FRICTION, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
-# triangles: the one that ends with this span, the one that begins with it, and both of the span before
+# triangles: one that ends with this span, one that begins with it; the last span's beginning and ended ones
 FALLING, RISING, LAST_RISING, LAST_WHOLE = range(4)
 RISING_SUM = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of a rising side; the falling side has SPAN - 1 to 0
-STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # of the spline: share of a step in the residual of its first spans
+STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in the first spans
 
 
 class ResidualState(NamedTuple):
@@ -36,16 +36,16 @@ class ResidualState(NamedTuple):
 
     counts: np.ndarray  # (3,): CYCLE, COMMAND, ENDED
     commands: np.ndarray  # (SLOTS, n) Nm, delay line
-    motor: np.ndarray  # (n,) Nm, behind the lag
-    motor_mean: np.ndarray  # (n,) Nm, mean motor torque in the coming step
+    motor: np.ndarray  # (n,) Nm, motor torque after the lag
+    motor_mean: np.ndarray  # (n,) Nm, mean motor torque in the coming cycle
     deflection: np.ndarray  # (n,), presliding deflection in [-1, 1]
     model: np.ndarray  # (2, n): BEFORE Nm, INTEGRAL Nm s of the model torque
-    friction: np.ndarray  # (2, n): the same of friction
-    payload: np.ndarray  # (2, n, 10): the same of the payload's columns
+    friction: np.ndarray  # (2, n): the same for friction
+    payload: np.ndarray  # (2, n, 10): the same for the payload's columns
     sums: np.ndarray  # (4, SUMS, n), triangle sums
     payload_sums: np.ndarray  # (4, n, 10)
-    motor_spans: np.ndarray  # (2, n) Nm, mean motor torque of the last span and of the one before
-    slid: np.ndarray  # (2, n), 1 if the joint slid through the last span, and through the one before
+    motor_spans: np.ndarray  # (2, n) Nm, mean motor torque of the last two spans, latest first
+    slid: np.ndarray  # (2, n), 1 if the joint slid throughout the last span, and the one before it
     terms: MomentumTerms  # of this cycle
     work: np.ndarray
 
@@ -139,7 +139,7 @@ def _integrate(arm, state, q, dq, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_to_sums(state, q, dq):
-    """Add this cycle to the triangle that ends with the span and to the one that begins."""
+    """Add this cycle to the triangle that ends with this span and to the one that begins with it."""
     rising, p, payload_p = state.counts[CYCLE] + 1, state.terms.p, state.terms.payload_p
     for k, weight in ((FALLING, SPAN - rising), (RISING, rising)):
         sums, payload_sums = state.sums[k], state.payload_sums[k]
@@ -162,7 +162,7 @@ def _close_span(arm, state, out):
     sums, slid, n = state.sums, state.slid, len(out.y)
     curvature = np.empty(n)  # Nm/s^2, second derivative of the motor torque
     for j in range(n):
-        motor = (sums[FALLING, MOTOR, j] + sums[RISING, MOTOR, j]) / whole  # both weights of a cycle add up to SPAN
+        motor = (sums[FALLING, MOTOR, j] + sums[RISING, MOTOR, j]) / whole  # a cycle's two weights add up to SPAN
         spans = state.motor_spans
         curvature[j] = (motor - 2.0 * spans[0, j] + spans[1, j]) / (SPAN * SIM_DT) ** 2
         spans[1, j], spans[0, j] = spans[0, j], motor

@@ -18,7 +18,7 @@ Prior = tuple[np.ndarray, np.ndarray]  # standard deviations of relative frictio
 
 
 def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
-    """Return the prior from posterior draws (S, P) of an identification."""
+    """Return the prior of friction and offsets, computed from posterior draws (S, P) of an identification."""
     d = space.dynamics(samples)
     sliding = np.full(space.n, tuning.LEVEL_SPEED)
     levels = 0.5 * (d.friction(sliding) - d.friction(-sliding))
@@ -62,7 +62,7 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
     """Return the residuals of all spans of a recording of commanded torque."""
     n, out = recording.n_joints, []
-    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # of the type of live signals
+    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # array types as in live signals
     for stretch in recording.stretches:
         state, r = ResidualState.fresh(n), MomentumResidual.empty(n)
         for k in range(stretch.start, stretch.stop):
@@ -79,8 +79,8 @@ def fit_noise(
     The noise comes from `other`, which should be another motion, after a correction fitted to `train` alone. Per
     joint, the model error comes from covariances at lags of 60 to 300 ms; white noise and its growth with the
     momentum rate come from the remaining variance. Then each joint's noise is scaled until the filter's innovations
-    have their predicted variance, and the noise of all joints until no odds of a payload change exceed the number of
-    spans. The initial friction and offsets, and the correction itself, come from both motions.
+    have their predicted variance, and then all noise together until the odds of a payload change stay below the
+    number of spans. The initial friction and offsets, and the correction itself, come from both motions.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)
@@ -99,7 +99,7 @@ def fit_noise(
 
 
 def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
-    """Return the noise of residuals without a payload, scaled to the filter's innovations."""
+    """Return the noise that fits residuals without a payload, scaled to the filter's innovations."""
     n = len(noise.level)
     white, momentum, model = noise.white.copy(), noise.momentum_share.copy(), noise.model.copy()
     for j in range(n):
@@ -138,7 +138,7 @@ def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: f
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
-    """Return the noise with each joint's value multiplied by scale (n,)."""
+    """Return the noise with all values of each joint multiplied by scale (n,)."""
     parts = {name: getattr(noise, name) * scale for name in ("white", "momentum_share", "model", "reversal")}
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["momentum_share"]))
 
@@ -151,14 +151,14 @@ def _with_model(prior: np.ndarray, model: np.ndarray, momentum: np.ndarray) -> n
 
 
 def _without_payload(noise: Noise) -> Noise:
-    """Return the noise of an arm whose payload is known to be none."""
+    """Return the noise of an arm that is known to carry no payload."""
     prior = noise.prior.copy()
     prior[:BODY] = 1e-6
     return noise._replace(prior=prior, rest_drift=0.0)
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Return the filter, its normalised innovations (M, n), nan where a joint rests, and log odds (M,)."""
+    """Run a filter; return it, its normalised innovations (M, n), nan where a joint rests, and log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)
@@ -169,13 +169,13 @@ def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.nd
 
 
 def _largest_odds(noise: Noise, residuals: list[MomentumResidual]) -> float:
-    """Return the largest log odds of a payload change in motion without one."""
+    """Return the largest log odds of a payload change, in motion without such a change."""
     return float(_run(noise, residuals)[2][len(residuals) // 10 :].max())
 
 
 def _innovation_scale(noise: Noise, residuals: list[MomentumResidual]) -> np.ndarray:
     """Return (n,) root mean squares of the normalised innovations, without a payload in the state."""
-    size = np.abs(_run(_without_payload(noise), residuals)[1])[len(residuals) // 10 :]  # offsets settle before
+    size = np.abs(_run(_without_payload(noise), residuals)[1])[len(residuals) // 10 :]  # offsets settle before this
     scale = np.ones(size.shape[1])
     for j in range(len(scale)):
         own = size[np.isfinite(size[:, j]), j]

@@ -5,7 +5,7 @@ without accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, 
 Here d is the mean over three spans (momentum_residual.py), and the estimate d^ follows filter_s dd^/dt = d - d^.
 Commands pass the identified delay and lag first.
 
-Stiction may carry any torque within breakaway while a joint does not slide all the time. d then lies between two
+While a joint does not slide all the time, stiction may balance any torque within breakaway. d then lies between two
 bounds, and d^ changes as little as these allow: stiction holds the arm, as in the policy's training.
 """
 
@@ -22,7 +22,7 @@ class Observer:
     """The `Adapter` that adds the whole disturbance torque, whatever its cause.
 
     Attributes:
-        held: True keeps the disturbance.
+        held: whether the estimated disturbance is frozen.
 
     Args:
         arm: identified model. filter_s: s, time constant of the low-pass.
@@ -52,12 +52,12 @@ class Observer:
 
 @njit(cache=True, error_model="numpy")
 def _observe(arm, state, residual, q, dq, tau, share, disturbance):
-    """Process a cycle; write disturbance (2, n) Nm: of the last span, and low-passed with the gain `share`."""
+    """Process a cycle; write `disturbance` (2, n) Nm: of the last span, and low-passed with the gain `share`."""
     measured, filtered = disturbance[0], disturbance[1]
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):
             measured[j] = residual.y[j]
-            if residual.sliding[j] == 0.0:  # stiction bounds the disturbance: take the nearest to `filtered`
+            if residual.sliding[j] == 0.0:  # stiction bounds the disturbance: take the value nearest to `filtered`
                 total = residual.y[j] + residual.friction[j]
                 breakaway = max(arm.breakaway[j], abs(residual.friction[j]))
                 measured[j] = min(max(filtered[j], total - breakaway), total + breakaway)

@@ -18,7 +18,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 LEAST_HZ = 200.0
-UNKNOWN_PAUSE_S = 60.0  # s, taken for a pause of unknown length: time to change what an arm carries
+UNKNOWN_PAUSE_S = 60.0  # s, assumed for a pause of unknown length: enough time to change the payload
 
 
 def fit_correction(
@@ -31,7 +31,7 @@ def fit_correction(
 
     Args:
         robot, dynamics: the identified arm.
-        posterior: space and draws of its identification: uncertainty of friction and offsets.
+        posterior: space and draws of its identification, for the uncertainty of friction and offsets.
         unloaded: two recordings of commanded torque without a payload, such as those of the identification. Without
             them the correction is zero, and the model error a tenth of the friction.
     """
@@ -47,7 +47,7 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
     """Return the recording with one row per millisecond.
 
     Raises:
-        UserError: another number of joints, another torque than the commanded one, or less than 200 Hz.
+        UserError: the number of joints differs, the torque is not the commanded one, or the rate is below 200 Hz.
     """
     if recording.n_joints != robot.n:
         raise UserError(f"data: expected {robot.n} joints of {robot.name}, got {recording.n_joints}")
@@ -62,7 +62,7 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
 def estimate_recording(
     robot: Robot, estimator: Estimator, recording: Recording, report: Callable[[Estimate], None] | None = None
 ) -> list[Estimate]:
-    """Return the estimate at the end of each span of the recording; `report` gets each one at once."""
+    """Return the estimate at the end of each span of the recording; `report` receives each one at once."""
     recording, out = at_rate(robot, recording), []
     for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         estimator.begin(pause_s)
@@ -83,7 +83,7 @@ def pauses(recording: Recording) -> list[float]:
 
 
 def table(estimates: list[Estimate]) -> pd.DataFrame:
-    """Return a row per moment: each value and its half width at 95 %."""
+    """Return a row per estimate: each value and the half width of its 95 % interval."""
     columns: dict[str, list] = {"t": [e.t for e in estimates]}
     columns |= {"mass_kg": [e.mass for e in estimates], "mass_kg_half": [e.mass_half for e in estimates]}
     for name, unit in (("centre", "m"), ("friction", ""), ("offset", "Nm")):

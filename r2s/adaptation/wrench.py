@@ -1,4 +1,4 @@
-"""External wrench of a working arm without a sensor, with a 95 % interval, and whether the arm touches something.
+"""External wrench on a working arm without a force sensor, with 95 % intervals, and detection of contacts.
 
     observer = WrenchObserver(robot, dynamics)
     for each millisecond: observer(state.q, state.dq, command)
@@ -6,11 +6,11 @@
 
 The force acts at the tip of `robot.tool`; without a tool it acts at the end effector, with a moment. wrench_filter.py
 describes the estimate. A contact is a force whose square, in units of its covariance, exceeds a threshold for 15 ms
-while a joint moves: a chi-square test of the hypothesis that no force acts. The threshold stands for one false alarm
-an hour. It is at least the threshold for independent normal errors in each cycle. If motion without contact errs
-more, its tail counts: the largest values of half seconds have an exponential tail (extreme values of a chi-square
-variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3), which is continued to an
-hour.
+while a joint moves: a chi-square test of the hypothesis that no force acts. The threshold aims at one false alarm per
+hour. It is at least the threshold for independent normal errors in each cycle. If errors in motion without contact
+are larger, their tail determines it: the maxima over half seconds have an exponential tail (extreme values of a
+chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3), which is
+extrapolated to an hour.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,18 +33,18 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 GAUSSIAN = float(chi2.isf(tuning.ALARMS_PER_HOUR * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
-BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; blocks whose tail gives a threshold
+BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; fewest blocks for a threshold
 
 
 class WrenchObserver:
-    """Wrench of one arm, cycle by cycle.
+    """Estimate of the wrench on one arm, cycle by cycle.
 
     Attributes:
-        threshold: of the squared force in variances, above which the arm is in contact.
-        tool: the robot's, or None.
+        threshold: squared force, in variances, above which the arm is in contact.
+        tool: the robot's tool, or None.
 
     Args:
-        robot, dynamics: the identified arm. threshold: None: twice that of Gaussian noise.
+        robot, dynamics: the identified arm. threshold: see above; None: twice that for Gaussian noise.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, threshold: float | None = None):
@@ -61,11 +61,11 @@ class WrenchObserver:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest, without contact, and with the payload of the model."""
+        """Begin a motion from rest, without contact, and without a payload beyond the model."""
         self._state = WrenchState.fresh(len(self._arm.level), self._components)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
-        """Process a cycle's q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether in contact.
+        """Process a cycle's q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return `in_contact`.
 
         A cycle with values that are not finite begins a motion anew.
 
@@ -83,29 +83,29 @@ class WrenchObserver:
         return self.in_contact
 
     def carry(self, payload: np.ndarray) -> None:
-        """Set the payload beyond the model's links: ten inertial parameters, payload frame (momentum.py)."""
+        """Set the payload beyond the model: ten inertial parameters in the payload frame (momentum.py)."""
         n, state = len(self._arm.level), self._state
-        state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # the momentum it already has
+        state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # the payload's current momentum
         state.payload[:] = payload
 
     @property
     def in_contact(self) -> bool:
-        """Whether the arm touches something; False once the force proves to be a payload's weight."""
+        """Whether the arm touches its surroundings; False once the force proves to be a payload's weight."""
         return bool(self._state.contact[TOUCHES] > 0.0) and not self.hangs
 
     @property
     def hangs(self) -> bool:
-        """Whether the force is the weight of a payload: it points down through 5 cm of motion."""
+        """Whether the force is the weight of a payload: it has pointed down over 5 cm of motion."""
         return bool(self._state.contact[HANGING] > tuning.WEIGHT_PATH)
 
     @property
     def wrench(self) -> np.ndarray:
-        """(3,) N with a tool, else (6,) N and Nm: on the arm at the tip, base axes."""
+        """Wrench on the arm at the tip, base axes: (3,) N with a tool, else (6,) N and Nm."""
         return self._state.x[: self._components]
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of `wrench`."""
+        """Covariance of `wrench`."""
         return self._state.P[: self._components, : self._components]
 
     @property
@@ -115,7 +115,7 @@ class WrenchObserver:
 
     @property
     def force(self) -> np.ndarray:
-        """(3,) N on the arm at the tip, base axes."""
+        """Force on the arm at the tip, (3,) N, base axes."""
         return self.wrench[:3]
 
     @property
@@ -125,22 +125,22 @@ class WrenchObserver:
 
     @property
     def tip(self) -> np.ndarray:
-        """(3,) m, where the force acts, in the base frame."""
+        """(3,) m, point in the base frame where the force acts."""
         return self._state.place
 
     @property
     def square(self) -> float:
-        """The squared force in variances, which is compared with `threshold`."""
+        """The squared force, in variances, which the test compares with `threshold`."""
         return float(self._state.contact[SQUARE])
 
     @property
     def rests(self) -> np.ndarray:
-        """(n,) whether each joint rests, where friction may hide a force."""
+        """(n,) whether each joint rests; friction of a resting joint may hide a force."""
         return self._state.joints[REST] > 0.0
 
 
 def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
-    """Return the uncertainty of an identified arm."""
+    """Return the uncertainty of an identified arm's model and sensors."""
     arm = make_arm_model(robot, dynamics)
     friction = tuning.WRENCH_FRICTION * arm.level + tuning.LEAST_FRICTION * robot.tau_max.min()
     edges = np.array(dynamics.breakaway, dtype=float)
@@ -158,11 +158,11 @@ def observe_recording(
     estimator: Estimator | None = None,
     report: Callable[[Estimate], None] | None = None,
 ) -> pd.DataFrame:
-    """Return a row per millisecond: the wrench with half widths at 95 %, contact, and where the tip is.
+    """Return a row per millisecond: wrench with half widths of 95 % intervals, contact, and position of the tip.
 
     Args:
-        estimator: estimates the payload beside it, which is subtracted; with a tool, not while it touches.
-        report: gets each estimate at once.
+        estimator: estimates the payload, whose effect is subtracted; with a tool, it is frozen in contact.
+        report: receives each estimate at once.
     """
     recording = at_rate(robot, recording)
     touch = 1 + 2 * len(observer.wrench)  # column of `in_contact`
@@ -185,7 +185,7 @@ def observe_recording(
             rows[k] = np.concatenate([[recording.t[k]], values, [touches, observer.square], observer.tip])
             if touches and not (k > stretch.start and rows[k - 1, touch]):
                 begun = k
-            if observer.hangs:  # no contact after all, from its begin
+            if observer.hangs:  # it was a weight: no contact since `begun`
                 rows[begun:k, touch] = 0.0
     names = [f"force_{c}_N" for c in "xyz"] + [f"moment_{c}_Nm" for c in "xyz"]
     columns = [c for name in names[: len(observer.wrench)] for c in (name, f"{name}_half")]
@@ -205,7 +205,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why recordings without contact give no `contact_threshold`, too slow or too short; None if they do."""
+    """Return why recordings without contact yield no `contact_threshold`: too slow or too short. None if they do."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]
@@ -215,10 +215,10 @@ def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
 
 
 def contact_threshold(robot: Robot, observer: WrenchObserver, free: Sequence[Recording]) -> float:
-    """Return the threshold for one false alarm an hour, from recordings without contact.
+    """Return the threshold for one false alarm per hour, from recordings without contact.
 
     Raises:
-        UserError: the recordings are shorter than 5 s, or of less than 200 Hz.
+        UserError: the recordings are shorter than 5 s, or their rate is below 200 Hz.
     """
     if why := unfit_for_threshold(free):
         raise UserError(f"contact threshold: {why}")

@@ -1,18 +1,18 @@
-"""Kalman filter of the external wrench, of momentum and of friction's deviation from its model; compiled.
+"""Kalman filter of the external wrench, of momentum, and of the error of modelled friction; compiled.
 
 State of n joints, N = w + 2 n: the wrench at the tip in base axes, w = 3 (force) or 6 (force and moment); per joint
-the deviation b of its friction f = f_model + b, Nm; the generalised momentum p, Nm s, which is measured every cycle
+the error b of its friction f = f_model + b, Nm; the generalised momentum p, Nm s, which every cycle measures
 (momentum.py). dp/dt = u - f + J^T wrench, with u all known torques (De Luca and Mattone, ICRA 2003; as a disturbance
 in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 
-What is known about f depends on the joint (wrench_friction.py):
-- It slides: b is the error of the identified friction, small and of short memory, and near a reversal as large as the
-  noise of the speed leaves its side unknown. Such a joint measures the wrench.
+The uncertainty of f depends on the joint (wrench_friction.py):
+- It slides: b is the error of the identified friction, small and of short memory. Near a reversal b is larger,
+  because the noisy speed leaves the direction of friction uncertain. Such a joint measures the wrench.
 - It rests: friction balances the other torques and stays within the breakaway edges. Such a joint only limits how far
   the wrench can have changed.
-The wrench changes with the motion of the tip, as a stiff environment would have it. With all joints at rest the tip
-is fixed: only a hand may change the force, and the breakaway edges hide this up to their width. A torque that has
-diffused that far may lie anywhere between the edges: variance of a uniform distribution about their middle.
+The wrench changes with the motion of the tip, as in a stiff environment. With all joints at rest the tip is fixed:
+only a hand may change the force, and friction hides changes within the breakaway edges. Once a torque's variance
+exceeds that of a uniform distribution between the edges, it is reset to this distribution.
 """
 
 import numpy as np
@@ -51,7 +51,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
 
     Args:
         arm: `ArmModel`. tip: (3,) m in the last link's frame. noise: `WrenchNoise`.
-        threshold: of the squared force in variances, for contact. q, dq: (n,) rad, rad/s, of this cycle.
+        threshold: squared force, in variances, above which there is contact. q, dq: (n,) rad, rad/s, of this cycle.
         tau: (n,) Nm without gravity, the command sent in this cycle.
     """
     joints, counts, n = state.joints, state.counts, len(q)
@@ -60,7 +60,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
         joints[ANCHOR] = q
     share, slow, fast = SIM_DT * tuning.ANGLE_RATE, SIM_DT * tuning.SLOW_RATE, SIM_DT * tuning.FAST_RATE
     speed = state.column[:n]
-    for j in range(n):  # speeds of dq at high and of q at low frequencies, without a lag
+    for j in range(n):  # speed from dq at high and from q at low frequencies, without lag
         speed[j] = dq[j] + (q[j] - joints[ANGLE, j]) * tuning.ANGLE_RATE
         joints[ANGLE, j] += share * (q[j] - joints[ANGLE, j]) + SIM_DT * dq[j]
         joints[SLOW, j] += slow * (speed[j] - joints[SLOW, j])
@@ -73,7 +73,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
     hand_kinematics(arm.links, tip, q, state.frames, state.place, state.jacobian[:3])
     for j in range(n):
         for i in range(3):
-            state.jacobian[3 + i, j] = state.work[j, i]  # joint axes, of `momentum`
+            state.jacobian[3 + i, j] = state.work[j, i]  # joint axes, from `momentum`
     if counts[CYCLE] % MASS_EVERY == 0:
         masses(arm, noise, state, q)
     resting = joints[REST].copy()
@@ -98,7 +98,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
 
 @njit(cache=True, error_model="numpy")
 def _shake(state):
-    """Update the mean square of each momentum's fast part, which gears and vibration make."""
+    """Update the mean square of each momentum's fast part, which comes from gears and vibration."""
     joints, rate = state.joints, SIM_DT * tuning.SHAKE_BAND
     for j in range(joints.shape[1]):
         if state.counts[CYCLE] == 0:
@@ -112,7 +112,7 @@ def _shake(state):
 
 @njit(cache=True, error_model="numpy")
 def _begin(noise, state):
-    """Set the first cycle's state: measured momentum, hardly any force."""
+    """Set the state of the first cycle: measured momentum, and zero force with a small variance."""
     x, P, joints = state.x, state.P, state.joints
     n = joints.shape[1]
     w = len(x) - 2 * n
@@ -134,7 +134,7 @@ def _predict(noise, state):
     decay = np.exp(-SIM_DT / tuning.FRICTION_NOISE_S)
     for j in range(n):
         m = w + n + j
-        if joints[REST, j] == 1.0:  # its momentum follows from the others'
+        if joints[REST, j] == 1.0:  # its momentum follows from that of sliding joints
             x[m] = state.terms.p[j]
             P[m] = 0.0
             P[:, m] = 0.0
@@ -170,13 +170,13 @@ def _predict(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _hidden(noise, j):
-    """Return the variance, Nm^2, of a torque anywhere between the edges of joint j."""
+    """Return the variance, Nm^2, of a torque that may lie anywhere between the breakaway edges of joint j."""
     return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 / 12.0
 
 
 @njit(cache=True, error_model="numpy")
 def _wrench_variance(noise, state):
-    """Return the variance, N^2, by which a force component may change in this cycle."""
+    """Return the process noise, N^2, of a force component in this cycle."""
     joints, J = state.joints, state.jacobian
     n = joints.shape[1]
     speed = creep = 0.0
@@ -198,7 +198,7 @@ def _wrench_variance(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _measure(state):
-    """Update with the measured momenta of sliding joints, one after the other."""
+    """Correct the state by the measured momenta of sliding joints, one after the other."""
     n, N = state.joints.shape[1], len(state.x)
     square, count = 0.0, 0
     gain = np.zeros(N)
@@ -220,7 +220,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Keep the friction of each joint at rest within its edges, and its variance within theirs."""
+    """Keep the friction of each resting joint within its edges, and its variance within that of `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)
@@ -233,13 +233,13 @@ def _keep_within_edges(noise, state):
             if variance > hidden:
                 middle = 0.5 * (noise.edges[j, 0] + noise.edges[j, 1])
                 _update(state, gain, middle - friction, hidden * variance / (variance - hidden))
-            if beyond != 0.0:  # P stays: the same edge, met again in the next cycle, tells nothing new
+            if beyond != 0.0:  # P stays: the same edge adds no information in every cycle
                 state.x[:] += tuning.EDGE_SHARE * beyond / max(variance, 1e-9) * (P @ gain)
 
 
 @njit(cache=True, error_model="numpy")
 def _update(state, gain, innovation, variance):
-    """Update with a measurement whose derivative by the state is `gain` (N,)."""
+    """Correct the state by a measurement whose derivative by the state is `gain` (N,)."""
     x, P, column = state.x, state.P, state.column
     N = len(x)
     total = variance

@@ -1,6 +1,6 @@
-"""What the wrench filter knows about friction: which joints rest, on which side the others slide; compiled.
+"""Friction in the wrench filter: which joints rest, and in which direction (side) the others slide; compiled.
 
-A joint at rest is held: its speed stays 0, so its friction balances all other torques. With A = M_rs M_ss^-1 of the
+The speed of a joint at rest stays 0, so its friction balances all other torques. With A = M_rs M_ss^-1 of the
 joints at rest (r) and the sliding ones (s), the momentum of a joint at rest follows from theirs, dp_r/dt = A (dp_s/dt
 - M'_ss dq_s) + M'_rs dq_s, and f_r = u_r + J_r^T wrench - dp_r/dt.
 """
@@ -31,7 +31,7 @@ from r2s.compiled import njit
 from r2s.physics.newton_euler import equations
 from r2s.physics.robot import SIM_DT
 
-MASS_EVERY = 20  # cycles between two mass matrices
+MASS_EVERY = 20  # cycles between two computations of the mass matrix
 
 
 @njit(cache=True, error_model="numpy")
@@ -72,7 +72,7 @@ def couple(state):
 
 @njit(cache=True, error_model="numpy")
 def known_torque(arm, noise, state, q):
-    """Decide which joints rest, and write friction models and known torques."""
+    """Decide which joints rest; write the modelled friction and the known torques."""
     joints, terms, x, P = state.joints, state.terms, state.x, state.P
     n = len(q)
     b = len(x) - 2 * n
@@ -82,7 +82,7 @@ def known_torque(arm, noise, state, q):
         if joints[REST, j] == 0.0:
             side = joints[CREEP, j]
             now = _unlagged(joints, j)
-            if side == 0.0:  # the slow speed has less noise, but reverses late
+            if side == 0.0:  # the slow speed has less noise, but changes its sign late
                 side = now if abs(now) > tuning.REVERSES * noise.speed else joints[SLOW, j]
             side = 1.0 if side > 0.0 else -1.0
             speed = side * max(side * now, 0.0)
@@ -98,7 +98,7 @@ def known_torque(arm, noise, state, q):
                 joints[FRICTION_BEFORE, j] = model
                 P[b + j, b + j] = noise.friction[j] ** 2
             joints[FRICTION, j] = model
-        elif not rested:  # friction is what balances the rest
+        elif not rested:  # friction balances all other torques: no error
             x[b + j] = 0.0
             P[b + j] = 0.0
             P[:, b + j] = 0.0
@@ -137,11 +137,11 @@ def _unlagged(joints, j):
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, of friction whose side is known through a noisy speed: 4 f^2 p (1 - p)."""
+    """Return the variance, Nm^2, of friction whose side is inferred from a noisy speed: 4 f^2 p (1 - p)."""
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # logistic for the normal distribution
-    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # of a bristle whose law is known roughly
+    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # presliding, whose law is known roughly
     return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent)
 
 

@@ -1,14 +1,14 @@
 """External force from momentum and from an identified surface together.
 
-Encoders show how deep the tip is in the surface, and its law (r2s/physics/surface.py) gives the normal force F_s. Its
-variance s^2 adds the surface's posterior, the noise of the encoders, and the errors of the law. Momentum's force F
-has other errors, so one update of a Kalman filter combines both: F' = F + P n (F_s - n . F) / (n . P n + s^2). The
-difference passes a low-pass first, because angles have noise.
+Encoders measure the penetration depth of the tip, from which the law of the surface (r2s/physics/surface.py) yields
+the normal force F_s. Its variance s^2 is the sum for the surface's posterior, encoder noise, and errors of the law.
+The force F from momentum has other errors, so one update of a Kalman filter combines both: F' = F + P n (F_s - n . F)
+/ (n . P n + s^2). The difference passes a low-pass first, because angles have noise.
 
-A surface that was never identified, has moved or is another one gives a wrong F_s. So the difference is tested: its
+A surface that was never identified, has moved or is another one yields a wrong F_s. So the difference is tested: its
 low-passed mean, in standard deviations, may not exceed REFUSED (innovation test: Bar-Shalom, Li and Kirubarajan,
-Estimation with Applications to Tracking, 2001, 5.4). A refused surface changes nothing for the rest of the motion: a
-small force would agree with any.
+Estimation with Applications to Tracking, 2001, 5.4). A refused surface is ignored for the rest of the motion, because
+a small force would agree with any surface.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface, normal_force
 
-DIFFERENCE, TESTED, TRUSTED, DEPTH, RATE, SINCE = range(6)  # `memory`
+DIFFERENCE, TESTED, TRUSTED, DEPTH, RATE, SINCE = range(6)  # indices of `memory`
 LAW_K, LAW_EXPONENT, LAW_DAMPING, LAW_POINT, LAW_NORMAL, LAW = 0, 1, 2, 3, 6, 9  # columns of `SurfaceLaw.law`
 
 
@@ -37,7 +37,7 @@ class SurfaceLaw(NamedTuple):
 
 
 def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle: float) -> SurfaceLaw:
-    """Return the numbers of a surface and of up to `tuning.SURFACE_DRAWS` draws of its posterior."""
+    """Return a surface and up to `tuning.SURFACE_DRAWS` draws of its posterior as numbers."""
     each = [surface, *draws[: tuning.SURFACE_DRAWS]]
     law = [np.concatenate([[s.coefficient, s.exponent, s.damping], s.point, s.normal]) for s in each]
     return SurfaceLaw(np.array(law, dtype=float), float(radius), float(angle))
@@ -47,7 +47,7 @@ class FusedWrench(WrenchObserver):
     """A `WrenchObserver` that also uses the law of a surface; momentum alone decides whether there is contact.
 
     Args:
-        surface, draws: identified, and its posterior (r2s/identification/contact/contact_file.py).
+        surface, draws: identified surface, and posterior draws (r2s/identification/contact/contact_file.py).
 
     Raises:
         UserError: the robot has no tool.
@@ -68,7 +68,7 @@ class FusedWrench(WrenchObserver):
         super().__init__(robot, dynamics, threshold)
 
     def begin(self) -> None:
-        """Begin a motion from rest; the surface is trusted until it errs."""
+        """Begin a motion from rest; the surface is trusted until the test refuses it."""
         super().begin()
         self._memory = np.zeros(6)
         self._memory[TRUSTED] = 1.0
@@ -90,23 +90,23 @@ class FusedWrench(WrenchObserver):
 
     @property
     def wrench(self) -> np.ndarray:
-        """(3,) N on the arm at the tip, base axes."""
+        """Fused force on the arm at the tip, (3,) N, base axes."""
         return self._fused
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of `wrench`."""
+        """Covariance of `wrench`."""
         return self._fused_covariance
 
     @property
     def trusted(self) -> bool:
-        """Whether the surface agrees with the momentum."""
+        """Whether the surface has agreed with the momentum in this motion."""
         return bool(self._memory[TRUSTED] > 0.0)
 
 
 @njit(cache=True, error_model="numpy")
 def surface_force(law, k, tip, rate):
-    """Return normal force, N, and depth, m, of the k-th surface for a tip at (3,) m and a rate of the depth, m/s."""
+    """Return normal force, N, and penetration depth, m, in surface k for a tip (3,) m and a depth rate, m/s."""
     row = law.law[k]
     depth = law.radius
     for c in range(3):
@@ -116,12 +116,12 @@ def surface_force(law, k, tip, rate):
 
 @njit(cache=True, error_model="numpy")
 def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the variance, N^2, of the surface's force: its posterior, the encoders, and what no law describes."""
+    """Return the variance, N^2, of the surface's force: from posterior, encoders, and errors of the law."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count
     normal, slope = law.law[0, LAW_NORMAL : LAW_NORMAL + 3], force * law.law[0, LAW_EXPONENT] / depth
-    smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # of the variance of white noise, behind the low-pass
+    smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # share of a white noise's variance after the low-pass
     for j in range(jacobian.shape[1]):
         lever = normal[0] * jacobian[0, j] + normal[1] * jacobian[1, j] + normal[2] * jacobian[2, j]
         square += smooth * (slope * lever * law.angle) ** 2
@@ -130,7 +130,7 @@ def surface_variance(law, force, depth, tip, rate, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance):
-    """Write the fused force (3,) N and its covariance (3, 3) N^2; memory: (6,), of `FusedWrench`."""
+    """Write the fused force (3,) N and its covariance (3, 3) N^2; `memory` (6,) is that of `FusedWrench`."""
     fused[:] = force[:3]
     fused_covariance[:] = covariance[:3, :3]
     normal = law.law[0, LAW_NORMAL : LAW_NORMAL + 3]
@@ -138,7 +138,7 @@ def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance)
     if memory[SINCE] > 0.0:
         memory[RATE] += SIM_DT * tuning.DEPTH_RATE * ((depth - memory[DEPTH]) / SIM_DT - memory[RATE])
     memory[DEPTH], memory[SINCE] = depth, 1.0
-    if pressing <= 0.0:  # the tip is away: something else may touch the arm
+    if pressing <= 0.0:  # the tip does not touch; other bodies may
         memory[DIFFERENCE] = 0.0
         return
     own = surface_variance(law, pressing, depth, tip, memory[RATE], jacobian)

@@ -1,4 +1,4 @@
-"""Memory of the wrench filter from cycle to cycle, and the uncertainty that it is given."""
+"""State of the wrench filter, which it keeps from cycle to cycle, and the uncertainty of its model."""
 
 from typing import NamedTuple
 
@@ -9,40 +9,40 @@ from r2s.physics.actuation import SLOTS
 from r2s.physics.kinematics import POSE
 from r2s.physics.newton_euler import WORK
 
-COMMAND, CYCLE = range(2)  # `WrenchState.counts`
+COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
 # `WrenchState.contact`: low-passed squared innovations per joint, in variances; squared force in variances, 0 unless
-# a joint moves; 1 in contact; cycles of the square above the threshold, and below the threshold of release; path of
-# the tip, m, through which the force was a weight
+# a joint moves; 1 in contact; cycles of the square above the threshold, and below the release threshold; path of the
+# tip, m, along which the force pointed down
 SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING = range(6)
-# rows of `joints`: filtered angle rad; slow and fast speed rad/s; 1 at rest; cycles of little speed; angle where it
-# came to rest, motion since, and creep of this cycle, rad; friction model, and that of the cycle before, Nm; known
-# torque without motor and friction of the cycle before, known torque of the cycle before, mean known torque of the
-# last cycle with friction, motor torque, and its mean in the coming cycle, Nm; variance of the momentum (Nm s)^2
+# rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; slow cycles; angle where it came to rest,
+# motion since, creep of this cycle, rad; friction model now, a cycle ago, Nm; known torque without motor or friction,
+# its mean in the last cycle with both, motor torque, its mean in the coming cycle, Nm; variance of the measured
+# momentum (Nm s)^2; presliding deflection; two low-passes of the momentum Nm s, mean square of its fast part
 ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
 MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)
 
 
 class WrenchNoise(NamedTuple):
-    """Uncertainty of n joints' friction, the sensors' noise, and the error of the force."""
+    """Uncertainty of n joints' friction, noise of the sensors, and remaining error of the force."""
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a sliding joint
-    edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway edge, of all torques but friction
+    edges: np.ndarray  # (n, 2) Nm, sum of the other torques at which a joint breaks away: negative, positive
     presliding: np.ndarray  # (n,) rad, 0: a joint sticks until it breaks away
-    inertia: float  # error of the inertia: share of a joint's net torque
+    inertia: float  # inertia error as a share of a joint's net torque
     speed: float  # rad/s, white noise of measured speeds
     angle: float  # rad, of measured angles
-    floor: float  # N, per axis: what the covariance of the force does not know
+    floor: float  # N, per axis: force error that its covariance does not include
 
 
 class WrenchState(NamedTuple):
-    """Memory from cycle to cycle."""
+    """State of the wrench filter, from cycle to cycle."""
 
     x: np.ndarray  # (N,)
     P: np.ndarray  # (N, N)
     joints: np.ndarray  # (ROWS, n)
     counts: np.ndarray  # (2,)
     contact: np.ndarray  # (6,), see SURPRISE to HANGING
-    payload: np.ndarray  # (10,), carried beside the model's links, payload frame (momentum.py)
+    payload: np.ndarray  # (10,), payload beyond the model, in the payload frame (momentum.py)
     commands: np.ndarray  # (SLOTS, n) Nm
     place: np.ndarray  # (3,) m, tip in the base frame
     jacobian: np.ndarray  # (6, n): of the tip's position, and of the rotation

@@ -1,9 +1,9 @@
 """An arm behind its driver: the only module of r2s that commands an arm.
 
 Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives the
-driver's torques, and nothing else; tests/test_command_loop.py checks that no other call exists. Every cycle asks
-r2s/arm/stop_request.py whether the motion may go on. A motion that the driver has brought to rest is over for the arm
-too: the loop stops the arm before it raises.
+driver's torques and nothing else; tests/test_command_loop.py checks that no other code commands an arm. Every cycle
+checks for a stop request (r2s/arm/stop_request.py). After the driver has brought the arm to rest, the loop also stops
+the arm, and then raises the reason.
 """
 
 import time
@@ -20,13 +20,13 @@ from r2s.arm.stop_request import begin_ending, requested, serve
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT
 
-# `CommandLoop.rest`, which damps a moving arm; the values are our choice
-REST_S = 0.5  # longest duration
-REST_RATE = 15.0  # 1/s, rate at which damping takes the speed out
+# Settings of `CommandLoop.rest`, which damps a moving arm; the values are our choice
+REST_S = 0.5  # s, longest duration
+REST_RATE = 15.0  # 1/s, decay rate of the joint speeds under damping
 REST_SHARE = 0.2  # of tau_max, limit of the damping torque
 STILL = 0.02  # rad/s, speed below which a joint counts as at rest
-SLIDING = 0.05  # rad/s, of a joint that friction does not hold; after SLIDES_S more damping would not stop it
-SLIDES_S = 0.04
+SLIDING = 0.05  # rad/s, replaces STILL after SLIDES_S: damping cannot stop a joint that friction does not hold
+SLIDES_S = 0.04  # s
 
 
 class CommandLoop:
@@ -34,14 +34,14 @@ class CommandLoop:
 
     Attributes:
         arm, driver: the arguments.
-        state: of the current cycle. sent: (n,) Nm, the last torque.
-        clock: s, perf_counter before and after the driver's last computation, and after the adapter's.
+        state: the arm's state in the current cycle. sent: (n,) Nm, the last torque command.
+        clock: s, three values of perf_counter in the last cycle: before the driver, after it, after the adapter.
 
     Args:
-        arm: the arm. driver: its settings limit the torques of these motions.
+        arm: the arm. driver: limits the torques of all motions of this loop.
         log: receives (state, torque) of every cycle before the torque is sent.
-        adapter: called once per cycle; its torque is added from the next cycle on. If it raises, the driver stops the
-            arm as after a missing command, and the exception propagates.
+        adapter: called once per cycle; its torque is added in the next cycle. If it raises, the driver stops the arm
+            as after a missing command, and then the exception propagates.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class CommandLoop:
         self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
 
     def place(self, q: np.ndarray) -> ArmState:
-        """Bring the arm to rest at q (n,) rad and begin a motion there; raises ArmStopped as `Arm.move_to`."""
+        """Move the arm to q (n,) rad and begin a motion there, at rest; raise ArmStopped as `Arm.move_to` does."""
         self._check_request()
         self._reset()
         try:
@@ -71,26 +71,26 @@ class CommandLoop:
         return self.state
 
     def begin(self) -> None:
-        """Begin a motion at the arm's current posture; raises StopRequested after a request to stop."""
+        """Begin a motion at the arm's current posture; raise StopRequested after a request to stop."""
         self._check_request()
         self._reset()
         self.state = self.arm.read()
 
     def damp(self, hold: np.ndarray) -> None:
-        """Begin a motion that only damps the arm, also after a request to stop; see `rest`."""
+        """Begin a motion that only damps the arm (see `rest`); a request to stop does not prevent it."""
         self._reset()
         self.state = self.arm.read()
         self.rest(hold)
 
     def __call__(self, command: np.ndarray | None, hold: np.ndarray | None = None) -> ArmState:
-        """Run one cycle with a command (c,) of the driver's controller, None for no new one; return the next state.
+        """Run one cycle and return the state of the next one.
 
         Args:
-            command: of this cycle. hold: (n,) Nm, part of it that the driver keeps while it brings the arm to rest.
+            command: (c,) for the control law; None: no new one. hold: (n,) Nm, part of the target that a stop keeps.
 
         Raises:
-            StopRequested: a request to stop; the driver has brought the arm to rest.
-            ArmStopped: the arm stopped itself, or the driver brought it to rest; the motion has then ended.
+            StopRequested: after a request to stop, when the driver has brought the arm to rest.
+            ArmStopped: the arm stopped itself, or the driver brought it to rest; the motion has ended.
         """
         if self.driver.stopping is None and (reason := requested()) is not None:
             self._requested = True
@@ -99,14 +99,14 @@ class CommandLoop:
         return self._cycle(command, hold)
 
     def _cycle(self, command: np.ndarray | None, hold: np.ndarray | None = None) -> ArmState:
-        """Run one cycle without asking for requests."""
+        """Run one cycle without checking for stop requests."""
         self._step(command, hold)
         if self.driver.done:
             self._raise(str(self.driver.stopping), self.driver.held)
         return self.state
 
     def _step(self, command: np.ndarray | None, hold: np.ndarray | None) -> None:
-        """Run one cycle, whether or not the driver has brought the arm to rest."""
+        """Run one cycle; unlike `_cycle`, do not raise when the driver has brought the arm to rest."""
         if self._ended:
             raise ArmStopped("the motion is over")
         began = time.perf_counter()
@@ -127,8 +127,8 @@ class CommandLoop:
     def rest(self, hold: np.ndarray | None = None) -> None:
         """Damp the arm's motion and bring its command to `hold` (n,) Nm, for at most 0.5 s.
 
-        Unless the arm reports a contact, `hold` changes against joints that go on sliding, as in the driver; without
-        it, as after a contact, the command goes to zero.
+        As in a stop by the driver, `resist` changes `hold` if joints keep sliding, unless the arm reports a contact.
+        Without `hold`, as after a contact, the command goes to zero.
         """
         inertia, robot = 1 / np.diag(self._inverse(self.state.q[None])[0]), self.arm.robot
         limit, step, most = REST_SHARE * robot.tau_max, robot.step_max, ADDED * robot.tau_max
@@ -142,18 +142,18 @@ class CommandLoop:
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:
-        """At the end of a plan: if the driver is bringing the arm to rest, wait for it and raise its reason.
+        """Complete a stop that the driver has begun by the end of a motion, and raise its reason; else do nothing.
 
         Raises:
-            StopRequested, ArmStopped: as a cycle.
+            StopRequested, ArmStopped: as `__call__`.
         """
         while self.driver.stopping is not None:
             self._cycle(None)
 
     def halt(self, reason: str) -> None:
-        """Bring the arm to rest without torque, as after a contact, then raise ArmStopped with `reason`.
+        """Bring the arm to rest and its command to zero, as after a contact, then raise ArmStopped with `reason`.
 
-        An arm that the driver is bringing to rest leaves its path because of that: then this does nothing.
+        Do nothing if the driver is already stopping the arm, because then the stop makes the arm leave its path.
         """
         if self.driver.stopping is not None:
             return
@@ -161,9 +161,9 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return the reason if the driver was bringing it to rest, else None.
+        """Stop the arm; return why the driver was stopping it, or why the arm stopped itself meanwhile, else None.
 
-        An arm that may press leaves its contact before, as in any other stop (r2s/physics/contact_stop.py).
+        With a push limit the driver first handles a contact force, as in any stop (r2s/physics/contact_stop.py).
         """
         reason = None if self._ended else self.driver.stopping
         if reason is not None:
@@ -175,7 +175,7 @@ class CommandLoop:
         return reason
 
     def _leave(self) -> str | None:
-        """Let the driver bring an arm to rest whose motion is over; return why the arm stopped itself, or None."""
+        """Let the driver stop an arm whose motion is over; return why the arm stopped itself meanwhile, or None."""
         self.driver.stop("the motion is over")
         try:
             while not self.driver.done:
@@ -186,7 +186,7 @@ class CommandLoop:
 
     def _check_request(self) -> None:
         if (reason := requested()) is not None:
-            self.state = self.arm.read()  # a runner shows the state of an episode that did not begin
+            self.state = self.arm.read()  # a runner observes it even if no motion begins
             serve()
             raise StopRequested(reason)
 
@@ -198,7 +198,7 @@ class CommandLoop:
             self._adapting, self._added = True, np.zeros(self.arm.robot.n)
 
     def _adapt(self, adapter: Adapter) -> None:
-        """Update the adapter's torque; if it raises, run without commands until the driver has stopped the arm."""
+        """Update the adapter's torque; if the adapter raises, let the driver stop the arm first, then re-raise."""
         try:
             self._added = np.asarray(adapter(self.state.q, self.state.dq, self.sent), dtype=float)
             if self._added.shape != self.sent.shape:
@@ -215,7 +215,7 @@ class CommandLoop:
             raise
 
     def _raise(self, reason: str, hold: np.ndarray) -> None:
-        """Stop the arm and raise `reason`, which stays the reason whatever stopping the arm reports."""
+        """Stop the arm and raise `reason`, even if the arm reports another reason when it is stopped."""
         kind = StopRequested if self._requested else ArmStopped
         self._block(reason)
         self._stop_arm(hold)

@@ -1,4 +1,4 @@
-"""One cycle of the driver, compiled, for m arms: what `DriverBatch` (r2s/arm/driver.py) runs once a millisecond."""
+"""One compiled cycle of the driver for m arms; `DriverBatch` (r2s/arm/driver.py) runs it once per millisecond."""
 
 from collections.abc import Callable
 from functools import cache
@@ -29,30 +29,30 @@ from r2s.physics.safety_filter import (
     limit_rate,
 )
 
-STILL = 0.02  # rad/s, below which a joint is at rest
-# rad/s: a joint that goes on sliding while it is brought to rest meets a spring of this frequency, as a change of the
-# held compensation. Our choice, half of the rate of the safety filter, which damps it.
+STILL = 0.02  # rad/s, speed below which a joint counts as at rest
+# rad/s, natural frequency of the spring that `resist` adds to a joint that keeps sliding during a stop. Our choice:
+# half of RATE of the safety filter, because the filter damps this spring.
 SPRING = 15.0
-RELEASE = 0.2  # 1/s, share of tau_max by which a held compensation falls while it pushes along a motion; our choice
-ADDED = 0.3  # share of tau_max that an adapter may add: on a Panda 1.5 kg anywhere within reach, and friction
+RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while it drives a sliding joint; our choice
+ADDED = 0.3  # share of tau_max that an adapter may add; enough for friction and 1.5 kg anywhere in a Panda's reach
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
-TOO_NEAR = 100  # and this value plus the number of a pair of `CollisionCheck`
+TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` would come too near
 
 
 class Memory(NamedTuple):
-    """State of the driver of m arms, which `drive_cycle` updates.
+    """State of the driver for m arms; `drive_cycle` updates it.
 
     Attributes:
-        command: (m, c), the last finite one. law: (m, k), memory of the control law.
-        target: (m, n) Nm, torque of the control law. filtered, effort: (m, n) Nm, see `Actuation`.
+        command: (m, c), the last finite command. law: (m, k), memory of the control law.
+        target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `Actuation`.
         sent: (m, n) Nm, the last torque command.
-        held: (m, n) Nm, last torque of the adapter, kept while the arm is brought to rest without contact.
-        share: (m,), share of the allowed speeds: 1, and falling while the arm is brought to rest.
-        cycle, silent, damped: (m,), cycles in all, since the last finite command, and of braking.
-        why: (m,), RUNS or why the arm is brought to rest. limited: (m,), cycles that the safety filter changed.
-        rests: (m,), whether the arm is at rest. commanded: (m,), whether there was a command.
-        least: (m, K) m, least distance of each pair of the fence.
-        push: (m, COLUMNS of push_limit.py), the limit of pushes and what it keeps; (m, 0): without.
+        held: (m, n) Nm, last torque of the adapter plus `Given.hold`; a stop keeps it unless there is a contact.
+        share: (m,), factor on the allowed speeds: 1, but during a stop it falls to what the stop needs.
+        cycle, silent, damped: (m,), cycles since the motion began, the last finite command came, the stop began.
+        why: (m,), stop code, RUNS: no stop. limited: (m,), cycles in which the safety filter changed the torque.
+        rests: (m,), whether the arm is at rest. commanded: (m,), whether a command has arrived.
+        least: (m, K) m, least allowed distance of each pair of the fence.
+        push: (m, COLUMNS of push_limit.py), parameters and state of the push limit; (m, 0): no push limit.
     """
 
     command: np.ndarray
@@ -75,7 +75,7 @@ class Memory(NamedTuple):
 
     @staticmethod
     def fresh(m: int, n: int, command: int, law: int, pairs: int, push: np.ndarray) -> "Memory":
-        """Return the state of m arms of n joints before their first cycle, without torque."""
+        """Return the state of m arms with n joints each before their first cycle, with zero torque."""
         own = np.zeros((m, command)), np.zeros((m, law))
         count, flags = np.zeros((5, m), dtype=np.int64), np.zeros((2, m), dtype=bool)
         least = np.full((m, pairs), -np.inf)
@@ -84,10 +84,10 @@ class Memory(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Inputs of a cycle.
+    """Inputs of one cycle.
 
-    command: (m, c) if `new`. added: (m, n) Nm of an adapter if `adds`. hold: (m, n) Nm of the target, to keep while
-    the arm is brought to rest. contact: (m,), whether the arm reports a contact.
+    command: (m, c), valid if `new`. added: (m, n) Nm, torque of the adapters, valid if `adds`. hold: (m, n) Nm, part
+    of the target that a stop keeps. contact: (m,), whether each arm reports a contact.
     """
 
     command: np.ndarray
@@ -99,10 +99,10 @@ class Given(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Limits of an arm: target and adapter torque (n,) Nm, stop limits (n,) rad and rad/s, and three numbers.
+    """Limits of target torque (`torque`) and adapter torque (`added`), (n,) Nm, and settings of the driver.
 
-    spring: (n,) Nm/rad, see `resist`. deadline: s without a command. factor: of the low-pass. fade: cycles of
-    the soft start.
+    It stops an arm beyond q_low, q_high, dq_max (n,) rad, rad/s, or without a finite command for `deadline` s.
+    spring: (n,) Nm/rad, see `resist`. factor: gain of the low-pass. fade: cycles of the soft start.
     """
 
     torque: np.ndarray
@@ -117,7 +117,7 @@ class Bounds(NamedTuple):
 
 
 class Model(NamedTuple):
-    """Model of the arm: friction (n,) Nm, links of `links_of`, rotors (n,) kg m^2, limits of `filter_limits`."""
+    """Model of the arm: friction (n,) Nm, links from `links_of`, rotors (n,) kg m^2, limits from `filter_limits`."""
 
     friction: np.ndarray
     links: np.ndarray
@@ -128,7 +128,7 @@ class Model(NamedTuple):
 
 @njit(cache=True)
 def _watch(i, q, dq, given, bounds, memory):
-    """Take the command of arm i, and decide whether the arm has to stop; return whether its state is finite."""
+    """Store a finite command of arm i, and set `why` if the arm has to stop; return whether its state is finite."""
     seen = np.isfinite(q).all() and np.isfinite(dq).all()
     helped = given.adds and np.isfinite(given.added[i]).all()
     if given.new and np.isfinite(given.command[i]).all() and helped == given.adds:
@@ -149,12 +149,12 @@ def _watch(i, q, dq, given, bounds, memory):
 
 @njit(cache=True)
 def resist(dq, spring, most, held):
-    """Move a held compensation (n,) Nm against joints at dq (n,) rad/s that should be at rest.
+    """Change the held compensation (n,) Nm so that it opposes joints that still slide at dq (n,) rad/s.
 
-    They keep sliding under an undeclared load, or if the compensation still contains friction of the motion.
+    Joints keep sliding under an undeclared load, or if the compensation still contains friction of the motion.
 
     Args:
-        spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound of the compensation.
+        spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound on the compensation.
     """
     for j in range(len(held)):
         if abs(dq[j]) > STILL:
@@ -165,14 +165,14 @@ def resist(dq, spring, most, held):
 
 @njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
-    """Add the adapter's torque to the target (n,) Nm of arm i, or the torque held while it is brought to rest."""
+    """Add the adapter's torque to the target (n,) Nm of arm i, or during a stop the held torque."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:
         resist(dq, bounds.spring, bounds.added, memory.held[i])
     for j in range(len(target)):
         most = bounds.added[j]
-        if given.contact[i]:  # what an arm pushes against must not be pushed on
+        if given.contact[i]:  # compensation must not keep pushing on an obstacle
             memory.held[i, j] = 0.0
         elif not stopping:
             held = faded * min(max(given.added[i, j], -most), most) if adds else 0.0
@@ -194,9 +194,9 @@ def _kinematics(model, q):
 
 @njit(cache=True)
 def _brake(i, seen, arm, bounds, model, memory):
-    """Set target torque and allowed speeds of arm i, which is being brought to rest from its present speed at once.
+    """Set target torque and allowed speeds of arm i in a stop; braking begins at once, from the present speed.
 
-    A stop for any cause but the arm's own place and state decides what becomes of a contact force.
+    Only a stop with code SILENT, LAW_NOT_FINITE or REQUESTED handles a contact force (`stop_torque`).
     """
     needs, why = 0.0, memory.why[i]
     memory.target[i] = 0.0
@@ -213,10 +213,10 @@ def _brake(i, seen, arm, bounds, model, memory):
 
 
 def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
-    """Return the commands (m, n) Nm of this cycle.
+    """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
-        q, dq, applied: (m, n), state and last torque. given: `Given`. control: number and parameters of the law.
+        q, dq: (m, n) rad, rad/s. applied: (m, n) Nm, last torque. given: `Given`. control: law number and parameters.
         bounds: `Bounds`. model: `Model`. memory: `Memory`, updated.
     """
     out, (m, n) = np.empty_like(memory.sent), q.shape
@@ -278,7 +278,7 @@ drive_cycle = njit(cache=True)(_drive_cycle)
 
 @cache
 def compiled_cycle(laws: tuple[Callable, ...]) -> Callable:
-    """Return `drive_cycle` with these control laws; other than built-in ones are compiled in each process."""
+    """Return `drive_cycle` for these control laws; laws that are not built in require compilation in each process."""
     if laws == BUILT_IN:
         return drive_cycle
     return njit(FunctionType(_drive_cycle.__code__, {**globals(), "control_law": chain(laws)}))

@@ -1,10 +1,10 @@
-"""The driver: once a millisecond it turns a policy's command into a torque that respects the arm's limits.
+"""The driver: once per millisecond it computes, from a policy's command, a torque that respects the arm's limits.
 
-In this order: check that the command is finite and fresh (watchdog) -> control law (r2s/physics/control_laws.py) ->
-soft start and low-pass -> torque of an adapter (r2s/adaptation/adapter.py) -> safety filter
-(r2s/physics/safety_filter.py), the same as in training -> rate limit, last, against the torque that the arm applied
-last. The driver has no clock and no arm: it is a function of states and commands, and the tests give it a million
-hostile ones.
+Each cycle has these steps: check that the command is finite and fresh (watchdog) -> control law
+(r2s/physics/control_laws.py) -> soft start and low-pass -> add an adapter's torque (r2s/adaptation/adapter.py) ->
+safety filter (r2s/physics/safety_filter.py), the same as in training -> rate limit relative to the torque that the
+arm applied in the last cycle. The driver reads no clock and calls no arm: its only inputs are states and commands, so
+the tests can pass it a million hostile ones.
 
 `DriverBatch` drives many arms in lock-step, `Driver` one.
 """
@@ -39,33 +39,33 @@ from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
 
-DEADLINE_S = 0.05  # s without a fresh finite command, or PERIODS of a slow policy: then the arm is braked and stopped
-PERIODS = 2.5  # control periods
+DEADLINE_S = 0.05  # s; without a new finite command for this time, or for PERIODS if longer, the driver stops the arm
+PERIODS = 2.5  # control periods of the policy
 DAMP_S = 0.5  # s, longest time to bring an arm to rest
-Q_INSIDE = 0.02  # rad inside the position limits, where the arm is stopped
-DQ_INSIDE = 0.95  # share of the velocity limits, where the arm is stopped
+Q_INSIDE = 0.02  # rad; the driver stops an arm that comes this close to a position limit
+DQ_INSIDE = 0.95  # share of the velocity limits above which the driver stops the arm
 
 
 def spring(robot: Robot) -> np.ndarray:
-    """Return the stiffness (n,) Nm/rad of `resist`, from the nominal inertia at home."""
+    """Return the stiffness (n,) Nm/rad that `resist` needs, computed from the nominal inertia at home."""
     return SPRING**2 / np.diag(InverseInertia(robot)(robot.q_home[None])[0])
 
 
 class DriverBatch:
-    """The last stage of every torque command of m arms.
+    """The driver of m arms: the last stage that every torque command passes.
 
     Attributes:
-        stopping: m times why the arm is being brought to rest, or None.
+        stopping: for each of the m arms, why the driver brings it to rest; None: it does not.
 
     Args:
-        robot: its limits and nominal links. torque: (n,) Nm, largest target.
-        m: arms. cutoff_hz: low-pass on the target. period_s: s between the commands of a policy.
-        soft_start_s: s over which the targets of a motion fade in; 0: not at all.
+        robot: limits and nominal links. torque: (n,) Nm, largest target torque of each joint.
+        m: number of arms. cutoff_hz: cutoff of the low-pass. period_s: s between two commands of the policy.
+        soft_start_s: s over which the target torque fades in at the start of a motion; 0: no fade.
         friction: (n,) Nm, level of each joint's friction. rotors: (n,) kg m^2, see `Dynamics.armature`; None: the
             robot's. control: control law; None: commands are torques (n,) Nm.
-        fence: the arm is stopped before it touches itself or the table; None: without.
-        speed_share: share of all allowed speeds, in (0, 1].
-        push_limit: of force and speed of contacts of the robot's tool; None: without.
+        fence: pairs of bodies; the driver stops an arm before a pair touches; None: no fence.
+        speed_share: factor on all allowed speeds, in (0, 1].
+        push_limit: limits the contact force and the approach speed of the robot's tool; None: no limit.
     """
 
     def __init__(
@@ -114,22 +114,22 @@ class DriverBatch:
         self._nothing, self._free = np.zeros(self._shape), np.zeros(m, dtype=bool)
         self.reset()
         still = np.zeros(self._shape)
-        self(np.tile(robot.q_home, (m, 1)), still, still, None)  # compile before an arm waits
+        self(np.tile(robot.q_home, (m, 1)), still, still, None)  # compile now, before an arm waits
         self.reset()
 
     def reset(self) -> None:
-        """Begin a motion, from zero torque."""
+        """Reset the driver for a new motion, which starts from zero torque."""
         self._memory = Memory.fresh(*self._shape, *self._sizes, self._push)
         self.stopping: list[str | None] = [None] * self._shape[0]
 
     @property
     def effort(self) -> np.ndarray:
-        """(m, n) Nm, the target torques after the low-pass, which policies observe."""
+        """(m, n) Nm, the target torques after the low-pass; policies observe them."""
         return self._memory.effort
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, the compensation kept while an arm is brought to rest, and the force of a stop that holds."""
+        """(m, n) Nm, the compensation that a stop keeps, plus the torque of the contact force in a 'hold' stop."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -137,7 +137,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop decides about contact (hold, release, retreat): only with a `push_limit`."""
+        """Whether a stop handles a contact force (hold, release or retreat); this needs a `push_limit`."""
         return bool(len(self._push))
 
     @property
@@ -147,7 +147,7 @@ class DriverBatch:
 
     @property
     def done(self) -> np.ndarray:
-        """(m,), whether a motion that is being stopped is at rest, or DAMP_S is over."""
+        """(m,), whether a stop is complete: the arm is at rest, or DAMP_S has passed since the stop began."""
         m = self._memory
         return (m.why != RUNS) & (m.damped > 0) & (m.rests | (m.damped * SIM_DT >= DAMP_S))
 
@@ -164,14 +164,14 @@ class DriverBatch:
         """Return the torque commands (m, n) Nm of this cycle.
 
         Args:
-            q, dq: (m, n) rad, rad/s, of this cycle; if they are not finite the torque fades out.
-            tau_J_d: (m, n) Nm, the torque that the arms applied last.
-            command: (m, c) of the controller; None: no new one.
-            added: (m, n) Nm of adapters in this cycle, clipped to ADDED of tau_max; None: no adapter. If it is not
-                finite, nothing is added, and the command of the same cycle is ignored.
-            hold: (m, n) Nm, part of the target that compensates a payload that the arm does not know. It and `added`
-                stay while an arm is brought to rest, together at most ADDED of tau_max; None: nothing.
-            contact: (m,), whether the arm reports a contact: then nothing is held. None: no contact.
+            q, dq: (m, n) rad, rad/s, of this cycle; the torque of an arm where they are not finite falls to zero.
+            tau_J_d: (m, n) Nm, the torque that the arms applied in the last cycle.
+            command: (m, c), new commands for the control law; None: no new commands in this cycle.
+            added: (m, n) Nm, torque of the adapters in this cycle, clipped to ADDED * tau_max; None: no adapter. For
+                an arm where it is not finite, nothing is added and the command of this cycle is ignored.
+            hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. A stop
+                keeps the last `hold` + `added`, clipped to ADDED * tau_max.
+            contact: (m,), whether each arm reports a contact; a stop then keeps no compensation. None: no contact.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)
@@ -187,12 +187,12 @@ class DriverBatch:
         return out
 
     def stop(self, reason: str) -> None:
-        """Bring all arms to rest, from the next cycle on; an arm that is being stopped keeps its reason."""
+        """Begin to bring all arms to rest in the next cycle; an arm that is already stopping keeps its reason."""
         self._memory.why[self._memory.why == RUNS] = REQUESTED
         self.stopping = [reason if own is None else own for own in self.stopping]
 
     def _reason(self, why: int, q: np.ndarray, dq: np.ndarray) -> str:
-        """Return in words why the arm at q, dq (n,) is being brought to rest."""
+        """Return the message for the stop code `why` of an arm at q, dq (n,) rad, rad/s."""
         bounds = self._bounds
         if why == SILENT:
             return f"no finite action for {1e3 * bounds.deadline:g} ms"
@@ -218,12 +218,12 @@ class Driver:
         self._drivers = DriverBatch(robot, torque, 1, friction=friction, **settings)
 
     def reset(self) -> None:
-        """Begin a motion, from zero torque."""
+        """Reset the driver for a new motion, which starts from zero torque."""
         self._drivers.reset()
 
     @property
     def stopping(self) -> str | None:
-        """Why the arm is being brought to rest, or None."""
+        """Why the driver brings the arm to rest; None: it does not."""
         return self._drivers.stopping[0]
 
     @property
@@ -233,12 +233,12 @@ class Driver:
 
     @property
     def held(self) -> np.ndarray:
-        """(n,) Nm, see `DriverBatch.held`; without the force of a stop that holds it is zero after a contact."""
+        """(n,) Nm, see `DriverBatch.held`; in contact it is zero, except for the contact force of a 'hold' stop."""
         return self._drivers.held[0]
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop decides what becomes of a contact; see `DriverBatch`."""
+        """Whether a stop handles a contact force; see `DriverBatch.decides_contact`."""
         return self._drivers.decides_contact
 
     @property
@@ -248,11 +248,11 @@ class Driver:
 
     @property
     def done(self) -> bool:
-        """Whether a motion that is being stopped is at rest, or DAMP_S is over."""
+        """Whether a stop is complete: the arm is at rest, or DAMP_S has passed since the stop began."""
         return self.stopping is not None and bool(self._drivers.done[0])
 
     def stop(self, reason: str) -> None:
-        """Bring the arm to rest from the next cycle on; keep the first reason."""
+        """Begin to bring the arm to rest in the next cycle; if it is already stopping, the first reason stays."""
         self._drivers.stop(reason)
 
     def __call__(
@@ -265,8 +265,8 @@ class Driver:
         """Return the torque command (n,) Nm of this cycle.
 
         Args:
-            state: of the arm. command: (c,) of the controller; None: no new one.
-            added: (n,) Nm of an adapter; None: no adapter. hold: (n,) Nm, see `DriverBatch`.
+            state: the arm's state in this cycle. command: (c,) for the control law; None: no new command.
+            added: (n,) Nm, torque of the adapter; None: no adapter. hold: (n,) Nm, see `DriverBatch.__call__`.
         """
         given, more, kept = (None if x is None else x[None] for x in (command, added, hold))
         contact = np.array([state.in_contact])

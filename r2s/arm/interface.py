@@ -17,7 +17,7 @@ from r2s.recordings.recording import SIGNALS, Recording
 
 
 class ArmStopped(RuntimeError):  # noqa: N818 (a stop is not a bug)
-    """The arm ended the motion for the reason in the message; it moves again after the next `move_to`.
+    """The motion ended for the reason in the message; the next `move_to` begins a new one.
 
     Attributes:
         recording: the rows recorded before the stop, or None if there are too few to keep.
@@ -36,22 +36,22 @@ class StopRequested(ArmStopped):
 
 @dataclass(frozen=True, slots=True)
 class ArmState:
-    """One 1 kHz sample of n joints.
+    """One 1 kHz sample of an arm with n joints.
 
     Attributes:
         t: s, since the motion began.
         q, dq: (n,) rad, rad/s, as measured by the arm.
         tau_J: (n,) Nm, link-side torque sensor: includes gravity, excludes most motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
-        tau_ext_hat_filtered: (n,) Nm, what the joints exert beyond the arm's own model: tau_J minus gravity, declared
-            load and dynamics. Here and below None means that this arm does not report it.
-        O_F_ext_hat_K: (6,) N, Nm, the same at the end effector in the base frame, positive on what the arm pushes.
-        joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,), (6,), above 0 where the external
-            torque or force exceeds the thresholds set.
+        tau_ext_hat_filtered: (n,) Nm, torque that the joints exert on the surroundings: tau_J minus the arm model's
+            gravity, declared load and dynamics. None, here and below: this arm does not report the value.
+        O_F_ext_hat_K: (6,) N, Nm, wrench that the end effector exerts on the surroundings, in the base frame.
+        joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,) for joints, (6,) for the end
+            effector; above 0 where the external torque or force exceeds the contact or collision threshold.
         control_command_success_rate: share of the last 100 commands that arrived; 0 while no motion runs.
-        O_T_EE: (16,) column by column, end effector's pose in the base frame.
-        m_ee, m_load: kg, end effector and load that the arm's gravity compensation assumes.
-        box: (6,), centre m and first axis of a box before the arm in the base frame, as a camera perceives it.
+        O_T_EE: (16,), pose matrix of the end effector in the base frame, column by column.
+        m_ee, m_load: kg, masses of end effector and load that the arm's gravity compensation assumes.
+        box: (6,), centre, m, and first axis of a box in the base frame, as a camera measures them.
     """
 
     t: float
@@ -79,7 +79,7 @@ class ArmState:
 
     @property
     def signals(self) -> np.ndarray:
-        """(sum of `signal_sizes`,), values of `SIGNALS`; nan: not reported."""
+        """(sum of `signal_sizes`,), the values of all `SIGNALS` in one array; nan: not reported."""
         sizes = signal_sizes(len(self.q)).items()
         values = ((getattr(self, name), size) for name, size in sizes)
         return np.concatenate([np.full(size, np.nan) if x is None else np.reshape(x, size) for x, size in values])
@@ -92,14 +92,14 @@ def signal_sizes(n: int) -> dict[str, int]:
 
 
 def named_signals(values: np.ndarray, n: int) -> dict[str, Any]:
-    """Return values (..., k) of `ArmState.signals` by name: (..., size), or (...) for size 1."""
+    """Return `ArmState.signals` (..., k) by name: (..., size), or (...) for size 1; all-nan signals are left out."""
     sizes = signal_sizes(n)
     parts = zip(sizes, np.split(values, np.cumsum([*sizes.values()])[:-1], axis=-1), strict=True)
     return {name: x[..., 0] if x.shape[-1] == 1 else x for name, x in parts if not np.isnan(x).all()}
 
 
 class Arm(Protocol):
-    """A torque-controlled arm. One motion is `move_to`, alternating `read` and `command`, then `stop`."""
+    """A torque-controlled arm. A motion consists of `move_to`, then alternating `read` and `command`, then `stop`."""
 
     robot: Robot
 
@@ -128,13 +128,13 @@ class Arm(Protocol):
 
 @runtime_checkable
 class Operated(Protocol):
-    """An `Arm` with an operator, who must agree before it moves again after any stop.
+    """An `Arm` with an operator, who must agree before the arm moves again after any stop.
 
     Attributes:
         operator: called with the reason of the stop, returns whether the operator agrees; None: no operator, which
-            counts as a no.
-        blocked: reason for which `move_to` asks the operator first; None: no stop is pending. Code that stops the
-            arm's motion writes its reason here.
+            counts as a refusal.
+        blocked: reason of a pending stop, for which `move_to` first asks the operator; None: no stop is pending. Code
+            that stops the arm's motion writes its reason here.
     """
 
     operator: Callable[[str], bool] | None
@@ -146,31 +146,31 @@ class Holds(Protocol):
     """An `Arm` whose `stop` damps the motion.
 
     Attributes:
-        hold: (n,) Nm, compensation that the next `stop` keeps meanwhile, such as a payload's.
+        hold: (n,) Nm, compensation, such as a payload's, that the next `stop` applies while it damps the motion.
     """
 
     hold: np.ndarray
 
 
 def speed_share(arm: Arm) -> float:
-    """Return the share of all allowed speeds that the arm's operator has set, 1 if an arm has no such setting."""
+    """Return the arm's factor on all allowed speeds, which its operator sets; 1 if the arm has no such setting."""
     return float(getattr(arm, "speed_share", 1.0))
 
 
 class Reflexes:
-    """The checks with which a simulated arm stops itself; error messages name the joint."""
+    """Checks of commands and states, like those by which a real arm stops itself; error messages name the joint."""
 
     def __init__(self, robot: Robot, dt: float = SIM_DT):
         self.robot = robot
         self._step = robot.dtau_max * dt
 
     def accepts(self, tau: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-        """Return (...), whether an arm accepts tau (..., n) Nm after the command tau_J_d (..., n) Nm."""
+        """Return (...) bool: whether the arm accepts tau (..., n) Nm after the command tau_J_d (..., n) Nm."""
         # NaN fails both comparisons
         return ((np.abs(tau) <= self.robot.tau_max) & (np.abs(tau - tau_J_d) <= self._step)).all(-1)
 
     def within_limits(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """Return (...), whether q, dq (..., n) rad, rad/s are within the arm's limits."""
+        """Return (...) bool: whether q, dq (..., n) rad, rad/s are within the arm's limits."""
         r = self.robot
         return ((r.q_min <= q) & (q <= r.q_max) & (np.abs(dq) <= r.dq_max)).all(-1)
 

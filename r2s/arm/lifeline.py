@@ -1,7 +1,7 @@
-"""The death of another process, seen at once.
+"""Detect at once that another process has died.
 
-The kernel marks a robust mutex (robust_list of futex(2)) before it unmaps the memory of the owner that died. The
-parent of a process changes only afterwards, which takes tens of ms for a process that has imported PyTorch.
+When the owner of a robust mutex dies, the kernel marks the mutex (robust_list of futex(2)) before it unmaps the
+owner's memory. Its children get a new parent only afterwards, tens of ms later if the owner has imported PyTorch.
 """
 
 import ctypes
@@ -34,14 +34,14 @@ class Lifeline:
         libc.pthread_mutexattr_setrobust(settings, ROBUST)
         libc.pthread_mutex_init(self._raw, settings)
         libc.pthread_mutex_lock(self._raw)
-        if self._raw[0] & OWNER != threading.get_native_id():  # another layout
+        if self._raw[0] & OWNER != threading.get_native_id():  # this C library has another layout
             self.release()
 
     def release(self) -> None:
-        """Release the mutex; this is no death."""
+        """Release the mutex without causing `lost` to report a death."""
         if sys.platform.startswith("linux"):
             ctypes.CDLL(None).pthread_mutex_unlock(self._raw)
 
     def lost(self) -> str | None:
-        """Return that the thread which holds the mutex has died, or None; a source of `watched`."""
+        """Return a message if the thread that held the mutex has died, else None; a source for `watched`."""
         return "the process of the policy has ended" if self._raw[0] & OWNER_DIED else None

@@ -1,4 +1,4 @@
-"""Episodes on a twin, distributed over cores: chunks of goals, each on a new twin from the same seed.
+"""Episodes on a twin, distributed over cores: each chunk of goals runs on a new twin with the same seed.
 
 The chunks, and therefore the results, do not depend on the number of cores. Each chunk has its own stream of sensor
 noise. A twin whose friction warms up begins each chunk cold.

@@ -1,7 +1,7 @@
 """A policy on an arm that waits for its commands: observe, query the policy at its rate, command the arm at 1 kHz.
 
-The arm's time stands still while the policy computes. This suits twins and the emulator in lock-step, and repeats bit
-for bit. r2s/arm/realtime_process.py runs an arm whose clock does not wait, in a process of its own.
+The arm's time stands still while the policy computes. This suits twins and the emulator in lock-step, and makes runs
+repeatable bit for bit. r2s/arm/realtime_process.py runs an arm whose clock does not wait, in a process of its own.
 """
 
 import time
@@ -24,9 +24,9 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import State, Task
 
-LOGGED_S = 1.0  # before a stop, at 1 kHz
-SMOOTHING_CYCLES = 20  # on each side; an encoder's noise then leaves 2e-4 rad/s of speed
-ATTEMPTS = 3  # to bring an arm to its start, each with the operator's consent
+LOGGED_S = 1.0  # s before a stop that are logged, at 1 kHz
+SMOOTHING_CYCLES = 20  # on each side of a cycle; encoder noise then causes a speed error of 2e-4 rad/s
+ATTEMPTS = 3  # to bring an `Operated` arm to its start; after a stop the operator must agree to the next one
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Stop:
     """Why an episode ended early.
 
     Attributes:
-        episode: its number, from 0. when: time in the episode. reason: message of the arm or of the driver.
+        episode: its number, from 0. when: time in the episode, or the way to its start. reason: of arm or driver.
         log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, command Nm.
     """
 
@@ -64,20 +64,20 @@ def episode_driver(
 
 
 class PolicyRunner:
-    """An arm behind the driver, one control period per step; implements `Arms` of `r2s.tasks.rollout`.
+    """Runs episodes on one arm through the driver, one control period per step; implements `r2s.tasks.rollout.Arms`.
 
     Attributes:
         stops: why episodes ended early. timing: see `Timing`.
         done: number of episodes for which the arm moved, or tried to move, to the start.
-        speeds: (1, T, n) rad/s after each control step of the last episode, smoothed over 1 kHz cycles.
-        halted: reason for which no further episode runs: the operator did not agree after a stop, or a request to
-            stop. None: not halted.
-        blocked: stop that ended the last episode and that no operator has agreed to yet; None: no stop is pending.
+        speeds: (1, T, n) rad/s after each control step of the last episode, see `smooth_speeds`.
+        halted: why no further episode runs: a request to stop, the operator's refusal after a stop, or too many
+            failed attempts to reach a start. None: not halted.
+        blocked: reason of the stop that ended the last episode, until the operator agrees to go on; None: no stop.
 
     Args:
         arm: an arm that waits for its commands.
-        task: rates and torque limits.
-        friction: (n,) Nm, friction that holds each joint: `Dynamics.level` of the dynamics the policy was trained on.
+        task: rates, torque limits and controller.
+        friction: (n,) Nm, friction level of each joint: `Dynamics.level` of the dynamics the policy was trained on.
         soft_start_s: s, fade-in of an episode's torque; recommended on hardware, 0 for twins.
         rotors: (n,) kg m^2, `Dynamics.armature` of the same dynamics; None: the robot's.
         adapter: adds torque to the policy's; None: no adaptation.
@@ -111,8 +111,8 @@ class PolicyRunner:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move to starts (1, n) rad and begin episode `first` there.
 
-        A stop during that move ends the episode. The operator of an `Operated` arm is then asked for another attempt;
-        without consent neither this nor any later episode begins.
+        A stop during this move ends the episode. On an `Operated` arm the operator may first agree to new attempts,
+        up to ATTEMPTS in all; without consent or success neither this nor any later episode begins.
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []
@@ -132,16 +132,16 @@ class PolicyRunner:
         return self._observe()
 
     def run(self, commands: Iterable[np.ndarray | None]) -> None:
-        """Run one 1 kHz cycle per command (c,), None for no new one, until they end or the arm stops."""
+        """Run one 1 kHz cycle per command (c,), None for no new one, until the commands end or the arm stops."""
         for command in commands:
             self._cycle(command)
             if self._stopped:
                 return
 
     def end(self) -> np.ndarray:
-        """Stop the arm; return (1,), whether the arm or the driver had already stopped the episode."""
+        """Stop the arm; return (1,) bool: whether arm, driver, a request or missed commands stopped the episode."""
         reason = self._loop.end() or requested() or self.timing.refusal(self._arm)
-        if not self._stopped and reason is not None:  # the episode ended before the driver brought the arm to rest
+        if not self._stopped and reason is not None:  # a stop that had not yet been raised when the episode ended
             self._record_stop(f"{self._loop.state.t:.2f} s", reason)
         self.halted = self.halted or requested()
         self.blocked = self._arm.blocked if isinstance(self._arm, Operated) else None
@@ -208,9 +208,9 @@ class PolicyRunner:
 
 
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
-    """Return speeds (., n) rad/s at each `every`-th cycle of the angles (n,) rad.
+    """Return smoothed speeds (., n) rad/s at every `every`-th cycle of a series of angles (n,) rad.
 
-    A parabola through SMOOTHING_CYCLES on each side (Savitzky and Golay, Analytical Chemistry 36(8), 1964).
+    Each is the slope of a parabola over SMOOTHING_CYCLES on each side (Savitzky and Golay, Anal. Chem. 36(8), 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:
@@ -220,7 +220,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Return one arm's `State`; effort (n,) Nm, stopped and limited as in `State`."""
+    """Return the `State` of one arm, a batch of one; effort (n,) Nm, stopped and limited as in `State`."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],

@@ -1,7 +1,7 @@
-"""Record presses and slides on a surface with any arm: what an identification of the surface needs.
+"""Record presses and slides on a surface with any arm, from which the surface can be identified.
 
-The arm follows paths of `task=wipe` by hybrid control with its identified model, behind the driver, while the force
-rises along one path and falls along the next. Joints in motion show the force (docs/how_to/surfaces.md).
+The arm follows paths of `task=wipe` by hybrid control with its identified model, through the driver. The force rises
+along one path and falls along the next. Joints must move: friction at rest hides force (docs/how_to/surfaces.md).
 """
 
 from collections import deque
@@ -22,19 +22,19 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 from r2s.tasks.wipe import WipeTask
 
-LOADS = 0.25, 0.9  # of the largest force of the controller: the least and the most of a path
-PAUSE_S = 2.0  # s, of the clock between two paths: longer than between slides of one press (identification/contact)
+LOADS = 0.25, 0.9  # lowest and highest force of a path, as shares of the controller's largest force
+PAUSE_S = 2.0  # s added to the clock between two paths, so that identification/contact counts them as two presses
 
 
 @dataclass(frozen=True)
 class PressPlan(WipeTask):
-    """Paths under a force that changes from one end to the other; the next path has it the other way round."""
+    """Paths along which the force changes from one end to the other: it rises on one path and falls on the next."""
 
     speed: tuple[float, float] = (0.05, 0.1)
     force: tuple[float, float] = (1.0, 2.0)  # see `press_plan`
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return goals as of `WipeTask`; every other one begins with the larger force."""
+        """Return goals as `WipeTask` does, with the plan's forces; every other goal begins with the larger force."""
         goals = super().goals(robot, rng, count)
         goals[:, 6:8] = self.force
         goals[1::2, 6:8] = self.force[::-1]
@@ -47,10 +47,10 @@ def press_plan(
     point: Sequence[float] | None = None,
     normal: Sequence[float] | None = None,
 ) -> PressPlan:
-    """Return the plan of an arm with a tool; point (3,) m and normal (3,) of the plane, roughly: 5 mm, 5 degrees.
+    """Return the plan for an arm with a tool; point (3,) m and normal (3,) of the plane, within 5 mm and 5 degrees.
 
     Raises:
-        UserError: no tool, or a wrong plane.
+        UserError: the robot has no tool, or the plane is invalid.
     """
     plan = PressPlan(point=point, normal=normal).with_model(robot, dynamics)  # type: ignore[arg-type]
     low, high = (share * float(plan.own.parameters[FORCE_MAX]) for share in LOADS)  # type: ignore[union-attr]
@@ -67,17 +67,17 @@ def record_presses(
     progress: Callable[[int, int], None] | None = None,
     timing: Timing | None = None,
 ) -> Recording:
-    """Follow `count` drawn paths on the surface; return the commands, one trajectory per path.
+    """Follow `count` random paths on the surface; return a recording with commanded torque, one trajectory per path.
 
-    Rows are as in `r2s.arm.recorder.record`; the clock pauses for PAUSE_S between paths.
+    Rows are as in `r2s.arm.recorder.record`; between two paths the recorded time advances by PAUSE_S.
 
     Args:
-        arm: moved above the first point of each path, and always stopped at the end. dynamics: its model.
+        arm: moved above the first point of each path, and always stopped at the end. dynamics: the arm's model.
         seed: of the paths. progress: called after every path with (paths done, total).
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver ended a path; the exception's `recording` holds the paths before, if any.
+        ArmStopped: the arm or the driver ended a path; the exception's `recording` holds earlier paths, if any.
         UserError: the tip does not reach the surface, or no safe path leads there.
     """
     robot, control = arm.robot, plan.control(arm.robot)
@@ -116,7 +116,7 @@ def record_presses(
 
 
 def _recording(log: deque[tuple[ArmState, np.ndarray]], ends: list[int], name: str) -> Recording:
-    """Return the rows of whole paths; path k has the rows ends[k] to ends[k + 1]."""
+    """Return the recording of the complete paths; path k has the rows ends[k] to ends[k + 1]."""
     rows = list(log)[: ends[-1]]
     path = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
     t = np.arange(len(rows)) * SIM_DT + path * PAUSE_S

@@ -1,4 +1,4 @@
-"""The paper's breakaway protocol: ramp the torque of one joint after the other, both ways, until it moves.
+"""The paper's breakaway protocol: ramp the torque of one joint after the other, in both directions, until it moves.
 
 It runs on any `Arm`; r2s/identification/breakaway.py estimates breakaway torques from the recording.
 """
@@ -23,25 +23,25 @@ from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 # The ramp
-SLOW_TAU_MAX = 40.0  # Nm: joints of at least this tau_max have a large inertia, move late, and get a slower ramp
-SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; light links reach visible motion within ms at 4 Nm/s
+SLOW_TAU_MAX = 40.0  # Nm: joints with at least this tau_max have a large inertia, move late, and get a slower ramp
+SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; at 4 Nm/s light links move visibly within ms
 MAX_SHARE = 0.2  # of tau_max, default torque at which a ramp gives up
 AFTER_MOTION = 5  # cycles recorded after the joint has moved
-STRAY = DEVIATION  # rad: a joint that moves so far ends the ramp; an arm so far from its pose is placed anew
-POSE_MARGIN = 0.15  # rad inside the position limits, which no joint crosses in one ramp
-UNFILTERED_HZ = 1e30  # cutoff of the driver's low-pass: a ramp has no steps, and resting joints need a command of 0
-# The stop after a ramp: each joint brakes with three equal real poles, then its torque is released
+STRAY = DEVIATION  # rad: a ramp ends if any joint moves so far; an arm so far from its pose is moved there again
+POSE_MARGIN = 0.15  # rad from a pose to the position limits; more than any joint moves in one ramp
+UNFILTERED_HZ = 1e30  # disables the driver's low-pass: a ramp has no steps, and resting joints need a command of 0
+# The stop after a ramp: a PID controller with three equal real poles brakes each joint, then its torque is released
 BANDWIDTH = 20.0  # rad/s, of the poles: well damped with 5 ms of delay and 3 ms of lag
-DAMPED_CYCLES = 20  # without the spring, which would slowly pull a joint back to where braking began
+DAMPED_CYCLES = 20  # of damping only; a spring would slowly pull a joint back to where braking began
 BRAKE_SHARE = 0.1  # of tau_max: small enough that the rate limit adds no delay
-BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # longest braking, and attempts before the next ramp starts anyway
-RELEASE_CYCLES = 10  # of release, of rest before a ramp, and of each mean from which a speed is computed
-# rad/s, largest mean speed: to release the torque, of the next ramp's joint, and after the release
+BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; attempts to stop before the next ramp starts anyway
+RELEASE_CYCLES = 10  # of the release, of the rest before a ramp, and of each mean angle that a speed is computed from
+# rad/s, largest mean speed: of any joint before the release, of the next ramp's joint then, of any joint afterwards
 SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return (count, n) rad: home, and postures that differ by 0.3 rad in every joint."""
+    """Return (count, n) rad: home, then postures that differ from the previous one by 0.3 rad in every joint."""
     change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
     poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
@@ -63,22 +63,22 @@ def ramp(
     progress: Callable[[int, int], None] | None = None,
     timing: Timing | None = None,
 ) -> Ramps:
-    """Ramp every joint both ways at every pose and return one trajectory per ramp.
+    """Ramp every joint in both directions at every pose and return one trajectory per ramp.
 
-    A ramp is a short rest without command, then a command of one joint that rises from 0 at `rate`, the others at 0,
-    until the joint has moved by MOVED (or the command reaches `largest`, or another joint strays). The stop after
-    each ramp is not recorded. Rows are as in `r2s.arm.recorder`: the state and the command of one cycle. If gravity
-    compensation leaves more torque than friction holds, a joint slides without command. It then rests at
-    the command that stopped it, and its ramp starts there.
+    A ramp begins with a short rest at zero command. Then the command of one joint rises from 0 at `rate`, with the
+    others at 0, until the joint has moved by MOVED (or the command reaches `largest`, or any joint moves by STRAY).
+    The stop after each ramp is not recorded. Each row has the state and the command of one cycle, as in
+    `r2s.arm.recorder`. A joint slides at zero command if gravity compensation leaves more torque than its friction
+    holds. It then rests at the command that stopped it, and its ramp starts from that command.
 
     Args:
         arm: moved to each pose, and always stopped at the end.
         poses: (P, n) rad, at least 0.15 rad inside the position limits; poses and the paths between them
             (r2s/excitation/paths.py) must be clear of table and arm, otherwise nothing moves.
-        rate: (n,) or one number, Nm/s; default 2.2 for joints of tau_max from 40 Nm, 4 below, and in proportion to
-            tau_max below 12 Nm.
+        rate: (n,) or one number, Nm/s; default: 2.2 for joints with tau_max of at least 40 Nm, 4 for weaker ones, and
+            proportionally less below 12 Nm.
         largest: (n,) or one number, Nm, at which a ramp gives up; default 20 % of tau_max.
-        progress: called after every ramp with (ramps done, total), in a cycle: it must return at once.
+        progress: called after every ramp with (ramps done, total), between two 1 kHz cycles: it must return at once.
         timing: receives the durations of the cycles.
 
     Raises:
@@ -91,10 +91,10 @@ def ramp(
     check_paths(robot, places)
     rising = _positive("rate", rate, _default_rate(robot), 0.1 * robot.dtau_max)
     limit = _positive("largest", largest, MAX_SHARE * robot.tau_max, robot.tau_max)
-    # all joints one way, then all the other way: each rests in between
+    # all joints in one direction, then in the other, so that each joint rests in between
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
-    # the ramp of a sliding joint starts at the command that holds it; friction is unknown, this bounds it
+    # a sliding joint's ramp starts at the command that holds it; 2 * most bounds the unknown friction
     most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
     timing = timing or Timing()
     how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot), "speed_share": speed_share(arm)}
@@ -131,11 +131,11 @@ def _recording(ramps: list[list], name: str) -> Recording:
 
 
 class _Drive:
-    """An arm at a pose, cycle by cycle.
+    """Drives an arm at a pose, cycle by cycle, and records the cycles.
 
     Attributes:
-        rows: t, q, dq and command of every cycle since the list was emptied.
-        base: (n,) Nm, the command at rest. held: (n,) Nm, mean command that held the arm in the last stop.
+        rows: t, q, dq and command of every cycle since the list was last emptied.
+        base: (n,) Nm, command of the resting arm. held: (n,) Nm, mean command that held the arm in the last stop.
     """
 
     def __init__(self, loop: CommandLoop, timing: Timing):
@@ -171,7 +171,7 @@ class _Drive:
             self.stop(next_joint=0)
 
     def send(self, tau: np.ndarray) -> ArmState:
-        """Run one cycle with the target tau (n,) Nm and return the state after it; `rows` gets the command sent."""
+        """Run one cycle with target torque tau (n,) Nm, append it to `rows` and return the state after it."""
         s = self.state
         after = self._loop(tau, self.base)
         self._timing.cycle(self._loop.clock, after)
@@ -179,7 +179,7 @@ class _Drive:
         return after
 
     def push(self, joint: int, rate: float, largest: float) -> list:
-        """Ramp one joint at `rate` Nm/s (signed); return all rows since the release."""
+        """Ramp one joint at `rate` Nm/s (signed); return the rows of the rest before the ramp and of the ramp."""
         tau, start, left = self.base.copy(), self.rows[0][1], AFTER_MOTION
         while left and abs(tau[joint]) < largest:
             distance = np.abs(self.send(tau).q - start)
@@ -189,7 +189,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints and release them, repeatedly if one slides on; `next_joint` must rest best."""
+        """Brake all joints and release them, repeatedly if one slides on; `next_joint` has the lowest speed limit."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -198,18 +198,18 @@ class _Drive:
             still = self.rest()
             if still.all():
                 return
-            if attempt:  # the first time it may be bristles that spring back
+            if attempt:  # the motion after the first attempt may be bristles that spring back
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:
-        """Send `base` for the first cycles of new rows; return which joints rest, (n,)."""
+        """Empty `rows`, send `base` for RELEASE_CYCLES, and return which joints rest, (n,)."""
         self.rows = []
         for _ in range(RELEASE_CYCLES):
             self.send(self.base)
         return self._speed(RELEASE_CYCLES // 2) < SLIDING
 
     def _speed(self, cycles: int) -> np.ndarray:
-        """Return (n,) rad/s, from the mean angles of the last `cycles` and of as many before."""
+        """Return the speeds (n,) rad/s between the mean angles of the last `cycles` rows and of as many before."""
         q = np.array([row[1] for row in self.rows[-2 * cycles :]]).reshape(2, cycles, -1).mean(1)
         return np.abs(q[1] - q[0]) / (cycles * SIM_DT)
 
@@ -233,7 +233,7 @@ class _Drive:
 
 
 def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.ndarray:
-    """Return (P, n) rad if every pose keeps its distance from the limits."""
+    """Return the poses (P, n) rad; raise UserError unless each is POSE_MARGIN inside the position limits."""
     try:
         places = np.atleast_2d(np.array(poses, dtype=float))
     except (TypeError, ValueError):
@@ -251,7 +251,7 @@ def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.nd
 
 
 def _positive(name: str, value, default: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Return (n,) numbers above 0 and up to `most` (n,)."""
+    """Return `value` or the default as (n,); raise UserError unless all are above 0 and at most `most` (n,)."""
     n = len(default)
     array = per_joint(f"ramp.{name}", default if value is None else value, n, f"{n} joints")
     good = (array > 0) & (array <= most)

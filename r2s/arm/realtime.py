@@ -1,4 +1,4 @@
-"""Real time: what a motion asks of the computer, and the measured timing that shows whether it got it."""
+"""Real time: settings that the computer needs during a motion, and measured timing that shows if they suffice."""
 
 import ctypes
 import gc
@@ -15,18 +15,18 @@ from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.physics.robot import SIM_DT
 
 PRIORITY = 80  # of SCHED_FIFO; libfranka's own thread has the highest, 99
-SWITCH_S = 1e-4  # longest wait for Python's lock while another thread computes; the default is 5 ms
-LOCK_ALL = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT of mlockall(2): pages stay once they were used
-LEAST_SUCCESS = 0.99  # share of the commands that an arm must get in time
-SUCCESS_CYCLES = 100  # over which the arm computes its success rate: until then a motion's rate is not complete
+SWITCH_S = 1e-4  # longest wait for Python's global lock while another thread computes; the default is 5 ms
+LOCK_ALL = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT of mlockall(2): pages stay in memory after first use
+LEAST_SUCCESS = 0.99  # share of the commands that must reach the arm in time
+SUCCESS_CYCLES = 100  # over which the arm averages its success rate; in a motion's first cycles it is incomplete
 _warned: set[str] = set()
 
 
 @contextmanager
 def realtime_section(priority: int | None = PRIORITY) -> Iterator[None]:
-    """Run a motion: no garbage collection; this thread first, under SCHED_FIFO; memory locked.
+    """Run a motion without garbage collection, with this thread under SCHED_FIFO and memory locked.
 
-    A right that is missing gives one warning in a process. The end restores everything.
+    Each missing permission causes one warning per process. At the end all settings are restored.
 
     Args:
         priority: of this thread; None: leave scheduler and memory as they are.
@@ -48,8 +48,8 @@ def realtime_section(priority: int | None = PRIORITY) -> Iterator[None]:
 
 @contextmanager
 def kept_scheduler() -> Iterator[None]:
-    """Restore this thread's scheduler afterwards: libfranka 0.21 gives the thread that connects FIFO 99, for good."""
-    thread = threading.get_native_id()  # the end may run in another thread
+    """Restore this thread's scheduler afterwards: libfranka 0.21 gives the connecting thread FIFO 99 for good."""
+    thread = threading.get_native_id()  # the code after `yield` may run in another thread
     before = os.sched_getscheduler(thread), os.sched_getparam(thread)
     try:
         yield
@@ -86,9 +86,9 @@ class Timing:
 
     Attributes:
         policy: time from a state to the policy's command, once per control step. driver: time to compute one command.
-        adapter: one update of the adapter, if there is one. period: from one command to the next.
-        robot: from one state to the next, by the arm's clock: more than 1 ms after lost cycles.
-        success: share of the last 100 commands that the arm got in time, as it reports, from a motion's 100th on.
+        adapter: time of one update of the adapter, if there is one. period: time from one command to the next.
+        robot: time from one state to the next by the arm's clock; above 1 ms if cycles were lost.
+        success: the arm's report of the share of its last 100 commands in time, from a motion's 100th cycle on.
     """
 
     policy: list[float] = field(default_factory=list)
@@ -103,7 +103,7 @@ class Timing:
         self._begun, self._last = len(self.success), (0.0, 0.0)
 
     def cycle(self, clock: tuple[float, float, float], state: ArmState, adapts: bool = False) -> None:
-        """Add a cycle of `CommandLoop`: its clock, and the state after it."""
+        """Add the timing of a cycle of `CommandLoop`, from its `clock` and the state after it."""
         began, driven, adapted = clock
         (sent_at, t), self._last = self._last, (driven, state.t)
         if not t:  # the first command starts the motion, which takes longer than a cycle
@@ -120,7 +120,7 @@ class Timing:
             self.success.append(float(rate))
 
     def refusal(self, arm: Arm) -> str | None:
-        """Return why a motion in real time does not count: too few commands came in time; None: it counts."""
+        """Return why a real-time motion is rejected (too few commands arrived in time); None: it is accepted."""
         rates = self.success[self._begun :]
         if not getattr(arm, "realtime", False) or not rates or (rate := float(np.mean(rates))) >= LEAST_SUCCESS:
             return None
@@ -133,7 +133,7 @@ class Timing:
             raise ArmStopped(reason)
 
     def table(self) -> list[dict[str, float | str]]:
-        """Return one row per duration: count, quantiles and maximum, ms; of `robot` also lost cycles and success."""
+        """Return one row per duration: count, quantiles and maximum, ms; for `robot` also lost cycles and success."""
         rows: list[dict[str, float | str]] = []
         for name in ("policy", "driver", "adapter", "period", "robot"):
             values = getattr(self, name)

@@ -1,12 +1,12 @@
 """A policy on an arm whose clock does not wait: the 1 kHz cycle runs in its own process.
 
-The arm's process continues whatever happens to the policy's process: without a new command for the driver's deadline
-it damps the arm and stops it. A thread would not suffice, because a policy that holds Python's global lock blocks
-every thread. The processes share memory without a lock, which a killed process would keep.
+The arm's process continues whatever happens to the policy's process: if no new command arrives within the driver's
+deadline, it damps the arm and stops it. A thread would not suffice, because a policy that holds Python's global lock
+blocks every thread. The processes share memory without a lock, because a killed process would never release a lock.
 
-The arm's process has a session of its own, so that no signal of the terminal reaches it. Every motion, the approach
-too, ends damped if the policy's process receives a signal or ends, or if this process receives a signal
-(r2s/arm/stop_request.py).
+The arm's process has a session of its own, so that no signal of the terminal reaches it. Every motion, including the
+approach, is damped and ended if the policy's process receives a signal or ends, or if the arm's process receives a
+signal (r2s/arm/stop_request.py).
 """
 
 import multiprocessing
@@ -35,9 +35,9 @@ from r2s.physics.robot import Robot
 from r2s.tasks.task import State, Task
 
 START_S = 240.0  # longest time for the process to import, compile and connect to its arm
-POLL_S = 2e-4  # between two looks at shared memory, a fifth of a cycle
-EXIT_S = 5.0  # longest time for the arm to come to rest at the end; twice as long ends the process by force
-READ_ATTEMPTS = 10  # of a slot that is being written; then its content counts as old
+POLL_S = 2e-4  # s between two reads of shared memory, a fifth of a cycle
+EXIT_S = 5.0  # s for the arm to come to rest at the end; after twice this time its process is ended by force
+READ_ATTEMPTS = 10  # to read a slot that is being written; then `Slot.read` returns None
 
 
 class Slot:
@@ -54,7 +54,7 @@ class Slot:
         a[0] += 1
 
     def read(self) -> tuple[int, np.ndarray] | None:
-        """Return the number of writes and the values (width,); None during a write, also an interrupted one."""
+        """Return the number of writes and the values (width,); None while a write runs or was interrupted."""
         a = np.frombuffer(self._raw)
         for _ in range(READ_ATTEMPTS):
             before = a[0]
@@ -65,10 +65,10 @@ class Slot:
 
 
 class Channel(NamedTuple):
-    """What the two processes share.
+    """Memory that the two processes share.
 
     Attributes:
-        command: (c,) of the controller, from the policy. state: from the arm, see `_publish`.
+        command: (c,) for the controller, written by the policy's process. state: by the arm's, see `_publish`.
         end: above 0 when the policy's process has ended the episode.
         signal: number of a signal that the policy's process received. lifeline: held by the policy's process.
     """
@@ -93,16 +93,16 @@ class Channel(NamedTuple):
 
 
 class RealtimeRunner:
-    """An arm behind the driver in its own process; implements `Arms` of `r2s.tasks.rollout`.
+    """Runs episodes on an arm and its driver in a process of their own; implements `Arms` of `r2s.tasks.rollout`.
 
     `with RealtimeRunner(...) as arms`: the process opens the arm, and always stops and closes it at the end.
 
     Attributes:
-        robot: the arm's. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
+        robot: the arm's model. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
         open_arm: returns the arm or a context manager of it; runs in the arm's process, so it must be picklable.
-        robot: has as many joints as the arm. task: see `PolicyRunner`.
+        robot: a model with the arm's number of joints. task, friction: see `PolicyRunner`.
         settings: further arguments of `PolicyRunner`; its adapter runs in the arm's process.
 
     Raises:
@@ -128,7 +128,7 @@ class RealtimeRunner:
     def __enter__(self) -> "RealtimeRunner":
         context = multiprocessing.get_context("spawn")  # fork would copy locks that other threads hold
         self._line, remote = context.Pipe()
-        # not a daemon: that would be killed while its arm moves, and could not start an emulator
+        # not a daemon: a daemon would be killed while its arm moves, and could not start an emulator
         self._process = context.Process(target=_serve, args=(remote, os.getpid(), *self._arguments), name="arm")
         self._signals = ExitStack()
         signal = self._channel.signal
@@ -147,7 +147,7 @@ class RealtimeRunner:
     def __exit__(self, *error: Any) -> None:
         self._channel.end.write(np.ones(1))
         self._section.close()
-        self._line.close()  # the process ends at the end of file
+        self._line.close()  # the arm's process ends when it reads the end of file
         for end in (lambda: None, self._process.terminate, self._process.kill):
             end()
             self._process.join(2 * EXIT_S)
@@ -168,13 +168,13 @@ class RealtimeRunner:
         self.done, self.halted = self._receive("placed")
         self._note_halt()
         self._due, self._last = 0, (0, 0)
-        self._section.enter_context(realtime_section(priority=None))  # a collection would make the policy late
+        self._section.enter_context(realtime_section(priority=None))  # garbage collection would make the policy late
         return self._observe()
 
     def step(self, command: np.ndarray) -> State:
         """Write the command (1, c) of the controller, and return the state at the next control period.
 
-        A command that took longer than its period applies at once; the next query is at the following period.
+        A command that arrives after its period takes effect at once; the next state is that of the following period.
         """
         self.timing.policy.append(time.perf_counter() - self._observed_at)
         self._channel.command.write(command[0])
@@ -191,7 +191,7 @@ class RealtimeRunner:
             time.sleep(POLL_S)
 
     def end(self) -> np.ndarray:
-        """Stop the arm; return (1,), whether the arm or the driver had already stopped the episode."""
+        """Stop the arm; return (1,) bool: whether arm, driver, a request or missed commands stopped the episode."""
         self._channel.end.write(np.ones(1))
         self._section.close()
         self.stops, stopped, timing, self.speeds, self.halted, self.blocked = self._receive("ended")
@@ -204,7 +204,7 @@ class RealtimeRunner:
             serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, filtered target (n,) Nm, stopped, and cycles changed by the safety filter."""
+        """Return cycle, state, filtered target (n,) Nm, stopped, and number of cycles that the filter changed."""
         while (latest := self._channel.state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")
@@ -222,7 +222,7 @@ class RealtimeRunner:
         return state
 
     def _receive(self, kind: str, timeout_s: float | None = None) -> Any:
-        """Wait for the process's message of this kind and return its content; pass its questions to the operator."""
+        """Wait for a message of this kind from the arm's process; return its content; forward operator questions."""
         try:
             while True:
                 if timeout_s is not None and not self._line.poll(timeout_s):
@@ -297,7 +297,7 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
-    """Give each cycle's command, None without a new one, from the first new one until the episode ends.
+    """Yield each cycle's command (None: no new one), from the first new command until the episode ends.
 
     Args:
         last: number of commands written in earlier episodes.

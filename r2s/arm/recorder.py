@@ -1,4 +1,4 @@
-"""Record an excitation on any arm, through the same calls and with the same precautions that hardware needs."""
+"""Record an excitation on any arm; simulated arms get the same calls and the same precautions as hardware."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -46,16 +46,16 @@ def record(
 
     Args:
         arm: moved to the excitation's first posture, and always stopped at the end.
-        excitation: on a 1 ms clock; inside the limits and clear of table and arm, otherwise nothing moves.
+        excitation: in steps of 1 ms; inside the limits and clear of table and arm, otherwise the arm does not move.
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, includes gravity).
-        progress: called every 0.5 s of motion with (cycles done, total), in a cycle: it must return at once.
-        loaded: the arm may carry an undeclared payload; it is tracked by `LoadedTrackingController`.
+        progress: called every 0.5 s of motion with (cycles done, total), between two cycles: it must return at once.
+        loaded: whether the arm may carry an undeclared payload; `LoadedTrackingController` then tracks the motion.
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver ended the motion, the arm deviated from the plan by more than its
-            `DeviationLimits`, or in real time it missed more than 1 % of the commands; the exception's `recording`
-            holds the rows so far.
+        ArmStopped: the arm or the driver ended the motion; the arm deviated from the plan by more than its
+            `DeviationLimits`; or, in real time, more than 1 % of the commands did not reach the arm in time. The
+            exception's `recording` holds the rows so far.
         UserError: the excitation is not allowed.
 
     """
@@ -96,7 +96,7 @@ def record(
 
 
 class _Rows:
-    """The rows of a recording, allocated before the motion; `filled` counts them."""
+    """The rows of a recording, allocated before the motion; `filled` of them have been written."""
 
     def __init__(self, rows: int, robot: Robot, torque: str):
         self._robot, self._torque = robot, torque
@@ -106,7 +106,7 @@ class _Rows:
         self.filled = 0
 
     def add(self, state: ArmState, sent: np.ndarray) -> None:
-        """Keep the state of the next cycle, and the command (n,) Nm sent in it."""
+        """Append a row: the state of a cycle and the command (n,) Nm sent in it."""
         k = self.filled
         self._t[k], self._q[k], self._dq[k], self._signals[k] = state.t, state.q, state.dq, state.signals
         self._tau[k] = sent if self._torque == "commanded" else state.tau_J

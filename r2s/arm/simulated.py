@@ -1,4 +1,4 @@
-"""An arm of known truth behind the arm interface: the simulator with given dynamics and sensor noise."""
+"""A simulated arm behind the arm interface: MuJoCo with known dynamics, and sensor noise."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from r2s.physics.simulator import Simulator
 
 
 class SimulatedArm:
-    """MuJoCo with the friction model of r2s/physics/friction.py, for identification against a known truth.
+    """An `Arm` in MuJoCo with the friction model of r2s/physics/friction.py, to test identification on known values.
 
     Attributes:
         external: (n,) Nm, external joint torque from the next cycle on; zero by default.
@@ -21,7 +21,7 @@ class SimulatedArm:
         robot, dynamics: the arm and its true dynamics.
         position_noise, velocity_noise: standard deviations of white noise on q, rad, and dq, rad/s.
         seed: of the noise.
-        payload: the carried body and when it is carried. declared_payload: what gravity compensation assumes of it.
+        payload: the carried body and its times. declared_payload: the payload that gravity compensation assumes.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class SimulatedArm:
         n = self.robot.n
         q = self._sim.q[0] + self._noise[0] * self._rng.normal(size=n)
         dq = self._sim.dq[0] + self._noise[1] * self._rng.normal(size=n)
-        # the simulation excludes gravity, so this tau_J only equals the command: do not record it as 'measured'
+        # the simulation excludes gravity, so this tau_J is a copy of the command: do not record it as 'measured'
         carried, declared = (
             mass_and_moment(self.robot, x) for x in (self._payload if self._carries else None, self.declared_payload)
         )

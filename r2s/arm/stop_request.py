@@ -1,7 +1,7 @@
 """Requests to end every motion of this process: a signal, or the end of the process that sends the commands.
 
 `CommandLoop` asks `requested` in every cycle. On a request the driver brings the arm to rest, and the motion ends
-with `StopRequested`. No new motion begins after a request. The request is one per process, as signals are.
+with `StopRequested`. No new motion begins after a request. A process has one request, as it has one set of signals.
 """
 
 import os
@@ -17,12 +17,12 @@ from r2s.errors import Stopped
 # a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; SIGKILL and SIGSTOP cannot be handled
 SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP)
 PARENT = "R2S_PARENT"  # environment variable: pid of the process whose end ends every motion of this one
-FOLLOW_S = 0.1  # s between two looks at the parent
-GRACE_S = 2.0  # s for a motion to end by itself: driver and `rest` take at most 0.5 s each. Then KeyboardInterrupt
+FOLLOW_S = 0.1  # s between two checks that the parent still runs
+GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s each) before a KeyboardInterrupt
 
 
 class _Request:
-    """The first stop request of this process: its reason, and whether it ends or has ended a motion."""
+    """The first stop request of this process: its reason, whether a motion is ending, and whether none runs now."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -44,18 +44,18 @@ def requested() -> str | None:
 
 
 def begin_ending() -> None:
-    """Note that a motion ends because of the request."""
+    """Mark the request as one because of which a motion is now ending."""
     _request.ending = True
 
 
 def serve() -> None:
-    """Note that no motion runs after the request; a further signal then raises KeyboardInterrupt at once."""
+    """Mark the request as served: no motion runs any more. A further signal then raises KeyboardInterrupt at once."""
     _request.ending, _request.served = False, True
 
 
 @contextmanager
 def watched(source: Callable[[], str | None]) -> Iterator[None]:
-    """Also ask `source` for a request; it returns a reason or None and must cost microseconds."""
+    """Let `requested` also call `source`, which returns a reason or None and may take only microseconds."""
     _request.sources.append(source)
     try:
         yield
@@ -64,12 +64,12 @@ def watched(source: Callable[[], str | None]) -> Iterator[None]:
 
 
 def parent_ended(parent: int) -> Callable[[], str | None]:
-    """Return a source: the process `parent`, which sends the commands, has ended."""
+    """Return a source for `watched`: it reports that the process `parent`, which sends the commands, has ended."""
     return lambda: None if os.getppid() == parent else "the process of the policy has ended"
 
 
 def pipeline() -> int | None:
-    """Return the pid in PARENT, or None; the processes that this one starts have it too, but not as their parent."""
+    """Return the pid in PARENT, or None; child processes inherit the variable, but this pid is not their parent's."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 
@@ -94,15 +94,15 @@ def _leave_terminal() -> None:
 def handled_signals(
     forward: Callable[[int], None] = lambda number: None, parent: int | None = None
 ) -> Iterator[None]:
-    """Turn SIGNALS into a request while an arm is open in this process.
+    """Convert SIGNALS to a stop request while an arm is open in this process.
 
-    If no motion has taken the request after GRACE_S, the main thread gets a KeyboardInterrupt; it leaves this context
-    as `Stopped` with the name of the signal. So does a request that no motion has taken when the block ends: what
-    follows may move the arm again. Outside the main thread Python allows no handlers; nothing changes.
+    If no motion has responded to the request after GRACE_S, the main thread gets a KeyboardInterrupt; this context
+    then raises `Stopped` with the name of the signal. It also raises `Stopped` if no motion has responded when the
+    block ends, because later code may move the arm. Outside the main thread Python allows no handlers: no effect.
 
     Args:
-        forward: called with the number of each signal, in the handler.
-        parent: pid of the parent process, whose end counts as SIGTERM; None: it does not matter.
+        forward: called by the signal handler with the number of each signal.
+        parent: pid of the parent process, whose end counts as SIGTERM; None: no process is watched.
 
     Raises:
         Stopped: a signal came while no motion ran.

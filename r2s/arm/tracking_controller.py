@@ -1,4 +1,4 @@
-"""PD tracking of a planned motion about the nominal model, with an adaptive friction and offset estimate."""
+"""PD tracking of a planned motion with nominal feedforward and an adaptive estimate of friction and offset."""
 
 import numpy as np
 
@@ -14,30 +14,30 @@ from r2s.physics.robot import SIM_DT, Robot
 CUTOFF_HZ = 100.0  # low-pass of the driver during tracking, libfranka's default
 # Gains: chosen for stability margins under a few ms of delay
 BANDWIDTH = 20.0  # rad/s, of the critically damped tracking loop
-ADAPTATION_RATE = 0.8  # 1/s, of the proportional gain; leaves half of the loop's stability margin
+ADAPTATION_RATE = 0.8  # 1/s, adaptation gain over proportional gain; leaves half of the loop's stability margin
 FRICTION_DQ = 0.03  # rad/s, width of the sign change of the friction estimate
 MASS_EVERY = 10  # cycles between two mass matrices
 # Limits
-OFFSET_SHARE = 0.1  # of tau_max, offset estimate: 1 kg at a Panda's full reach unknown to gravity compensation
-CORRECTION_SHARE = 0.3  # of tau_max, all torque in addition to the plan's
-MAX_DEVIATION = 0.2  # rad off the plan: an obstacle, or another arm than the planned one
+OFFSET_SHARE = 0.1  # of tau_max, limit of the offset estimate: enough for an undeclared 1 kg at a Panda's full reach
+CORRECTION_SHARE = 0.3  # of tau_max, limit of all torque that is added to the feedforward
+MAX_DEVIATION = 0.2  # rad off the plan; beyond it an obstacle blocks the arm, or it is not the arm of the plan
 # For an arm with an undeclared payload
 LOADED_FACTOR = 2.0  # times OFFSET_SHARE and CORRECTION_SHARE
 LOADED_DEVIATION = 0.5  # rad
 
 
 class TrackingController:
-    """PD control about the nominal model's torque plus an adaptive estimate of the missing torque.
+    """PD control with the nominal model's feedforward torque and an adaptive estimate of the missing torque.
 
     The estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max) per joint: offset, Coulomb and viscous friction,
-    adapted during the motion as in Slotine and Li (IJRR 6(3), 1987), within plausible limits. Without it, friction as
-    large as the whole PD torque would hold a light wrist, whose gains must be small.
-    Gains are the nominal mass matrix times a bandwidth. They fit any arm, including joints with nearly parallel axes,
-    which independent joint gains destabilize.
+    adapted during the motion as in Slotine and Li (IJRR 6(3), 1987), within plausible limits. A light wrist needs it:
+    its gains must be small, so friction as large as its whole PD torque could hold it.
+    The gains are the nominal mass matrix times BANDWIDTH^2 and 2 BANDWIDTH. They suit any arm, also one with nearly
+    parallel joint axes, which gains per joint would destabilize.
 
     Args:
         robot: the nominal model. excitation: the plan.
-        allowed: deviations from the plan; None: MAX_DEVIATION of each joint.
+        allowed: limits of the deviation from the plan; None: MAX_DEVIATION for each joint.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):
@@ -50,13 +50,13 @@ class TrackingController:
         self._theta = np.zeros((3, robot.n))
         friction = friction_margin(robot)
         self._theta_max = np.array([OFFSET_SHARE * robot.tau_max, friction, friction])
-        # inertia of each joint with the others free; a light posture has to adapt slowly
+        # inertia of each joint with the others free; where it is small, adaptation has to be slow
         inertia = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
-        self._gain = ADAPTATION_RATE * SIM_DT * BANDWIDTH**2 * inertia  # Nm per (rad/s + BANDWIDTH rad) of error
+        self._gain = ADAPTATION_RATE * SIM_DT * BANDWIDTH**2 * inertia  # Nm per rad/s, see `__call__`
         self._correction = CORRECTION_SHARE * robot.tau_max
 
     def __call__(self, k: int, state: ArmState) -> np.ndarray:
-        """Return the target (n,) Nm of cycle k, from the state read in it."""
+        """Return the target torque (n,) Nm of cycle k, from the state read in cycle k, and adapt the estimate."""
         e = self._plan
         error, rate = e.q[k] - state.q, e.dq[k] - state.dq
         self._theta += self._gain[k // MASS_EVERY] * (rate + 0.5 * BANDWIDTH * error) * self._regressor[k]
@@ -71,7 +71,7 @@ class TrackingController:
         return self._theta[0]
 
     def deviation(self, k: int, state: ArmState) -> str | None:
-        """Return the message for a joint that deviates too far from the plan in cycle k, or None."""
+        """Return a message if a joint deviates too far from the plan in cycle k, else None."""
         deviation = np.abs(self._plan.q[k] - state.q)
         share = self._allowed.share(k, deviation)
         total = share.sum(1)
@@ -87,10 +87,10 @@ class TrackingController:
 
 
 class LoadedTrackingController(TrackingController):
-    """Tracking for an arm that may carry an undeclared payload of a usual size, up to half its largest.
+    """Tracking controller for an arm that may carry an undeclared payload of up to half the arm's largest payload.
 
-    Its gains assume half of that, because the sag of a strong joint would otherwise swing the wrist. It allows a
-    larger deviation and a larger correction.
+    Its gains assume half of such a payload, because the sag of a strong joint would otherwise swing the wrist. It
+    allows a larger deviation and a larger correction.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):

@@ -1,4 +1,4 @@
-"""Everything that runs in a 1 kHz cycle, run once beforehand: compiling it takes up to a second, a cycle 1 ms."""
+"""Run all code of the 1 kHz cycles once before a motion: its compilation takes up to a second, a cycle has 1 ms."""
 
 import copy
 from contextlib import suppress
@@ -17,9 +17,9 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import Task
 
-CYCLES = 200  # ten spans of an estimator: at rest, and as many in motion
+CYCLES = 200  # at rest, and as many in motion: ten spans of an estimator each
 SWING_RAD, SWING_HZ = 0.05, 1.0  # up to 0.3 rad/s: every joint slides
-RAMP_NM = 0.02  # the ramps give up at once
+RAMP_NM = 0.02  # Nm, so that the ramps give up at once
 
 
 class _Puppet:
@@ -49,10 +49,10 @@ class _Puppet:
 
 
 def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = None) -> None:
-    """Compile and run once what the motions of an arm call in their cycles; change nothing.
+    """Compile and run once the code that an arm's motions call in their cycles; its results are discarded.
 
-    Call it in the process that will drive the arm, before the arm is opened. It records and ramps, and with a task
-    runs an episode with a copy of the adapter, on an arm in memory.
+    Call it in the process that will drive the arm, before the arm is opened. On an arm in memory it runs recordings
+    and ramps, and if there is a task, an episode with a copy of the adapter.
 
     Raises:
         Exception: what the adapter raises.

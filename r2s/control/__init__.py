@@ -1,1 +1,1 @@
-"""Controllers: what runs once a millisecond between a policy's action and the safety filter."""
+"""Controllers: they map a policy's action to torque every millisecond, before the safety filter."""

@@ -2,9 +2,9 @@
 
     tau = action + ID(q_r, dq_r, ddq_r) + M(q_r) (w^2 (q_d - q) + 2 w (dq_d - dq))
 
-ID is the inverse dynamics of the identified arm without gravity, friction included. q_d is the reference now, and q_r
-the reference at the time when the torque acts, so that latency does not delay the feedforward (Spong, Hutchinson and
-Vidyasagar, Robot Modeling and Control, ch. 8).
+ID is the inverse dynamics of the identified arm without gravity, friction included. q_d is the present reference, and
+q_r the reference at the time when the torque acts, so that latency does not delay the feedforward (Spong, Hutchinson
+and Vidyasagar, Robot Modeling and Control, ch. 8).
 """
 
 from dataclasses import dataclass, field
@@ -19,8 +19,8 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import SIM_DT, Robot
 
-LATENCY = 0.007  # s, assumed latency of the feedback: delay, lag and a velocity filter (docs/explanation/arms.md)
-# rad: bandwidth times latency of the loop. It leaves a phase margin of 56 deg; pi / 2 oscillates without end.
+LATENCY = 0.007  # s, assumed latency of the feedback: delay, lag and velocity filter (docs/explanation/arms.md)
+# rad: bandwidth times latency of the loop. It leaves a phase margin of 56 deg; at pi / 2 the loop oscillates forever.
 BANDWIDTH_LATENCY = 0.6
 
 
@@ -29,8 +29,8 @@ class ComputedTorque(Controller):
     """Computed torque about a task's trajectory; see `Controller`.
 
     Attributes:
-        model: the identified arm. ahead_s: s, look-ahead of the feedforward: half a control period, the low-pass, and
-            the identified delay and lag.
+        model: the identified arm. ahead_s: s, look-ahead of the feedforward: half a control period, time constant of
+            the low-pass, and identified delay and lag.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -38,7 +38,7 @@ class ComputedTorque(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Feedforward, q_d, dq_d (n each) and M (n n)."""
+        """Number of values in a setpoint: feedforward, q_d, dq_d (n each) and M (n n)."""
         n = self.action_dim
         return n * (3 + n)
 
@@ -53,7 +53,7 @@ class ComputedTorque(Controller):
         return self.model(q[None], still, still, still)[0]
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, s): feedforward Nm, q_d rad, dq_d rad/s, and M kg m^2 row by row."""
+        """Return the setpoints (m, s): feedforward Nm, q_d rad, dq_d rad/s, and M kg m^2 row by row."""
         q_d, dq_d, _ = task.trajectory(t, goals, 0.0)
         q, dq, ddq = task.trajectory(t, goals, self.ahead_s)
         mass = self.model.mass(q).reshape(len(q), -1)
@@ -74,8 +74,8 @@ def computed_torque(
     Args:
         robot, task: the arm and its task. dynamics: the identified arm.
         residual: share of the task's torque limit that an action of 1 adds.
-        bandwidth: rad/s of the critically damped feedback; None: BANDWIDTH_LATENCY over twice the loop's latency. The
-            loop's latency is a control period, the low-pass and LATENCY; its rate is the damping 2 w.
+        bandwidth: w, rad/s, of the critically damped feedback; None: 2 w times the latency is BANDWIDTH_LATENCY, as
+            the damping 2 w sets the loop's bandwidth. The latency is a control period, the low-pass and LATENCY.
         feedback_hz: rate at which the feedback is updated, at most 1000; None: the policy's.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The controller protocol: an action space, and the compiled law that turns a command into torque at 1 kHz."""
+"""The controller protocol: an action space, and the compiled law that maps a command to torque at 1 kHz."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ class ControlledTask(Protocol):
     """The part of a task that a controller uses.
 
     Attributes:
-        ctrl_hz: policy rate. cutoff_hz: low-pass on the torque.
+        ctrl_hz: policy rate, Hz. cutoff_hz: cutoff of the low-pass on the torque, Hz.
     """
 
     @property
@@ -35,12 +35,12 @@ class Controller:
     in SI units, then the setpoint that the controller derives from the task.
 
     Attributes:
-        name: of the controller.
+        name: the controller's name.
         law: compiled; see r2s/physics/control_laws.py.
         action_scale, action_offset: (a,) in `unit`. action: name of the commanded quantity, for tables and contracts.
-        parameters: (p,) of the law. memory_size: numbers that the law keeps from cycle to cycle.
+        parameters: (p,) of the law. memory_size: number of values that the law stores between cycles.
         torque_limit: (n,) Nm, the largest target torque; None: the task's.
-        cpp: body of the same law in C++17, for contract.hpp; "": a bundle has no header.
+        cpp: body of the same law in C++17, for contract.hpp; "": the bundle gets no header.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Controller:
 
     @property
     def observes_torque(self) -> bool:
-        """Whether the policy observes the torque that the law gives for an action of zero."""
+        """Whether the policy observes the torque that the law computes for an action of zero."""
         return False
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -81,7 +81,7 @@ class Controller:
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
         """Return the torque (n,) Nm that the law's model needs at rest at q (n,) rad, such as for a payload.
 
-        The driver keeps it while it brings the arm to rest.
+        The driver keeps applying this torque while it brings the arm to rest.
         """
         return np.zeros(len(q))
 
@@ -89,7 +89,7 @@ class Controller:
         """Return the commands (m, c) of the control period that begins at t (m,) s.
 
         Args:
-            action: (m, a) in [-1, 1]. task, goals: of the episodes.
+            action: (m, a) in [-1, 1]. task, goals: those of the episodes.
         """
         scaled = action * self.action_scale
         if self.action_offset.any():

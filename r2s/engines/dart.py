@@ -1,7 +1,7 @@
 """The arm in DART with the settings of Gazebo's physics plugin: second engine of Sim2Sim, engine of the rigid twin.
 
-Semi-implicit Euler, implicit joint damping, hard position limits, exact Coulomb friction. With the settings below
-DART and Gazebo's plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
+Semi-implicit Euler, implicit joint damping, hard position limits, exact Coulomb friction. With the settings of
+this module DART and Gazebo's plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
 """
 
 from collections.abc import Callable
@@ -18,15 +18,15 @@ from r2s.physics.welds import Bodies, about, make_pose
 
 
 class DartEngine:
-    """One arm without contacts. A command lasts one step and is clipped to the torque limits.
+    """One arm without contacts. A command acts for one step and is clipped to the torque limits.
 
     Args:
         robot: the arm; its MJCF defines kinematics, inertia and limits.
         gravity: False is libfranka's convention (the arm compensates it).
         masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in link
             axes; each replaces the MJCF's values of the n moving links.
-        armature: (n,) kg m^2 of the joints, replaces the MJCF's.
-        stop_margin: rad, distance of the hard stops outside the position limits.
+        armature: (n,) kg m^2, replaces the MJCF's values of the joints.
+        stop_margin: rad, distance of the hard stops beyond the position limits.
 
     The engine does not enforce velocity limits: MuJoCo has none either, and enforcing them would hide that a policy
     violates them.
@@ -87,7 +87,7 @@ class DartEngine:
         if parent is None and anchor != 0:
             raise UserError(f"robot.mjcf: link '{model.body(body).name}' has no fixed base")
         to_joint = make_pose(model.jnt_pos[i], None)
-        zero = make_pose(None, about(model.jnt_axis[i], -model.qpos0[i]))  # the MJCF's pose is at qpos0
+        zero = make_pose(None, about(model.jnt_axis[i], -model.qpos0[i]))  # the MJCF states poses at qpos0
         properties = dart.dynamics.RevoluteJointProperties()
         properties.mName = model.joint(i).name or f"joint{i + 1}"
         properties.mAxis = model.jnt_axis[i]
@@ -150,11 +150,11 @@ class DartEngine:
         return self._at(q, self._skeleton.getMassMatrix) + np.diag(self._armature)
 
     def gravity_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm that holds the arm against gravity at q (n,); the arm's state does not change."""
+        """Return the torque (n,) Nm that holds the arm against gravity at q (n,); the state does not change."""
         return self._at(q, self._skeleton.getGravityForces)
 
     def gravity_torque_there(self, q: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm that holds the arm against gravity at q (n,) rad, which becomes the state."""
+        """Return the torque (n,) Nm that holds the arm against gravity at q (n,) rad, and set the arm to q."""
         self._skeleton.setPositions(q)
         return self._skeleton.getGravityForces()
 
@@ -186,7 +186,7 @@ def _dartpy() -> ModuleType:
 
 def _as_gazebo(dart: ModuleType, world) -> None:
     """Change the settings in which dartpy 6.20 differs from Gazebo's plugin."""
-    # process-wide; by default a joint beyond its limit is pushed back at up to 10 rad/s
+    # a process-wide setting; by default DART pushes a joint beyond its limit back at up to 10 rad/s
     dart.constraint.JointConstraint.setMaxErrorReductionVelocity(0.0)
     options = dart.simulation.DeactivationOptions()
     options.mEnabled = False

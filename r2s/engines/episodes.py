@@ -1,4 +1,4 @@
-"""Episodes in another engine than the training's, one by one, with the same goals, starts and drawn arms."""
+"""Episodes in an engine other than that of training, one by one, with the same goals, starts and random arms."""
 
 from collections.abc import Callable
 
@@ -15,18 +15,18 @@ from r2s.physics.safety_filter import SafetyFilter
 from r2s.physics.simulator import single_arm
 from r2s.tasks.task import State, Task
 
-NONE = np.zeros(1, dtype=bool)  # has stopped
+NONE = np.zeros(1, dtype=bool)  # no arm has stopped
 
 
 class EngineArms:
-    """The arms of `count` episodes, one after the other; the `Arms` of `r2s.tasks.rollout.rollout`.
+    """The arms of `count` episodes, one after the other, as `Arms` for `r2s.tasks.rollout.rollout`.
 
-    Arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`, and its own stream of sensor noise.
+    Arm e has the e-th random draw, as in `r2s.learning.evaluate.make_evaluation`, and its own stream of sensor noise.
 
     Args:
-        make: the engine of an arm with given dynamics.
-        robot, task, draw: those of the training.
-        count: episodes.
+        make: returns the engine of an arm with given dynamics.
+        robot, task, draw: those of training.
+        count: number of episodes.
     """
 
     width = 1

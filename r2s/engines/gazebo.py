@@ -1,7 +1,7 @@
 """Gazebo (gz-sim) in this process and in lock-step, through its Python bindings: Harmonic, Ionic and Jetty.
 
-A millisecond is one blocking `server.run`. The world contains physics only, from the same description as in the other
-engines (r2s/physics/description.py). Gazebo is not on PyPI; OSRF's packages and conda-forge contain the bindings.
+Each millisecond is one blocking `server.run`. The world contains physics only; all engines share its description
+(r2s/physics/description.py). Gazebo is not on PyPI; OSRF's packages and conda-forge contain the bindings.
 """
 
 import importlib
@@ -27,8 +27,8 @@ PHYSICS = {"filename": "gz-sim-physics-system", "name": "gz::sim::systems::Physi
 class GazeboEngine:
     """One arm in a Gazebo server.
 
-    A command lasts one step. The bindings set positions and velocities only within an update, which integrates them.
-    Therefore `reset` stores them and the next `step` applies them with its torque: that step starts exactly at q, dq.
+    A command acts for one step. The bindings can set positions and velocities only within an update, which then
+    integrates them. So `reset` stores q, dq; the next `step` applies them with its torque and starts exactly there.
 
     Args:
         robot, dynamics: masses, centres, tensors and rotors; `FrictionTorque` adds friction.
@@ -80,7 +80,7 @@ class GazeboEngine:
             raise self._error
 
     def _guarded(self, update):
-        """Return `update` for the bindings; `_run` raises its exception, because the bindings cannot pass it on."""
+        """Return `update` as a callback; `_run` raises its exception, because the bindings cannot pass it on."""
 
         def call(info, ecm):
             try:
@@ -127,7 +127,7 @@ def gazebo(robot: Robot) -> Callable[[Dynamics], GazeboEngine]:
 
 
 def bindings() -> ModuleType:
-    """Return gz-sim's Python module of the newest installed release."""
+    """Return the Python module of the newest installed release of gz-sim."""
     for name in RELEASES:
         try:
             return importlib.import_module(name)

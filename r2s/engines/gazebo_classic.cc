@@ -47,7 +47,7 @@ class R2sLockstep : public WorldPlugin {
     if (write(this->states, state.data(), out) != out || read(this->commands, command.data(), in) != in)
       std::_Exit(0);  // r2s has closed the pipes; an orderly end takes more than 10 s
     const double *tau = &command[1], *q = tau + n, *dq = q + n;
-    if (command[0] != 0) {  // outwards, because a joint's links move with it; then the speeds of these poses
+    if (command[0] != 0) {  // from the base outwards: a joint moves the links beyond it; then the speeds
       for (std::size_t i = 0; i < n; ++i) this->joints[i]->SetPosition(0, q[i]);
       for (std::size_t i = 0; i < n; ++i) this->joints[i]->SetVelocity(0, dq[i]);
     }

@@ -1,6 +1,6 @@
 """Gazebo Classic 11 in a process of its own, in lock-step, with ODE (its default) or DART as physics engine.
 
-`gzserver` loads the world plugin gazebo_classic.cc, which waits before each step for a command over a pipe. Gazebo
+`gzserver` loads the world plugin gazebo_classic.cc, which waits for a command over a pipe before each step. Gazebo
 Classic is a package of Debian 11 and Ubuntu up to 22.04. Elsewhere it runs from a root directory that
 gazebo_classic_root.sh makes; the environment variable R2S_GAZEBO_ROOT names it. No display is needed.
 """
@@ -31,18 +31,18 @@ from r2s.physics.simulator import single_arm
 PHYSICS = ("ode", "dart")
 PLUGIN = Path(__file__).with_name("libr2s_gazebo_classic.so")
 ROOT = "R2S_GAZEBO_ROOT"  # environment variable: a root directory with Gazebo
-FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # with libraries, in Debian's folder of a processor
+FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # with libraries, within Debian's library folder of a processor
 NAME = "simulator=gazebo_classic"
 HELP = "docs/how_to/gazebo.md installs it; simulator=dart needs nothing more"
-START_S = 60.0  # s; a start takes 0.5 s
+START_S = 60.0  # s, longest wait for the server; a start takes 0.5 s
 SDF = "1.7"  # the newest that Gazebo 11 reads
 
 
 class GazeboClassicEngine:
-    """One arm in a `gzserver`, which ends with this object.
+    """One arm in a `gzserver` process, which ends with this object.
 
-    A command lasts one step. ODE keeps links together by constraints and solves them iteratively: expect differences
-    of 1e-4 m to MuJoCo after 1 s, where DART has none.
+    A command acts for one step. ODE holds the links together by constraints that it solves iteratively: expect
+    differences of 1e-4 m from MuJoCo after 1 s, where DART has none.
 
     Args:
         robot, dynamics: masses, centres, tensors and rotors; `FrictionTorque` adds friction.
@@ -55,7 +55,7 @@ class GazeboClassicEngine:
     def __init__(self, robot: Robot, dynamics: Dynamics, physics: str = "ode"):
         self._n, self._limit = robot.n, robot.tau_max
         # SDF has no rotors. For DART the file has damping A/h, and a torque cancels it (r2s/engines/dart.py). ODE's
-        # damping is not that implicit one: there the torque -A ddq acts, with MuJoCo's ddq of links and rotors.
+        # damping is not implicit like that: with ODE the torque -A ddq acts, with ddq of links and rotors by MuJoCo.
         self._rotors = None
         if physics == "ode" and dynamics.armature.any():
             self._rotors = single_arm(robot, dynamics)
@@ -92,7 +92,7 @@ class GazeboClassicEngine:
         if not loaded:
             raise UserError(f"{NAME}: gzserver did not load the plugin in {START_S:g} s: {self._last_line()}")
         self._q, self._dq = self._read()
-        self._start = False  # whether the next step begins at `reset`'s state
+        self._start = False  # whether the next step begins at the state of `reset`
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Start the next step at q, dq (n,) rad, rad/s."""
@@ -107,7 +107,7 @@ class GazeboClassicEngine:
             mujoco.mj_forward(self._rotors, data)
             force -= self._rotors.dof_armature * data.qacc
         command = np.concatenate([[self._start], force, self._q, self._dq])
-        with suppress(BrokenPipeError):  # `_read` says why
+        with suppress(BrokenPipeError):  # `_read` raises the error
             os.write(self._commands, command.tobytes())
         self._start = False
         self._q, self._dq = self._read()
@@ -139,7 +139,7 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 def gzserver() -> list[str]:
     """Return the command that starts the server.
 
-    A root directory's server starts through the loader of that directory, which needs no rights, unlike chroot.
+    The server of a root directory starts through that directory's own loader, which, unlike chroot, needs no rights.
 
     Raises:
         UserError: the server or the plugin is missing.

@@ -1,4 +1,4 @@
-"""Which physics engines are installed, in which version, and what the others need."""
+"""List of the installed physics engines with their versions, and of what missing engines need."""
 
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -8,7 +8,7 @@ from r2s.errors import UserError
 
 
 def installed() -> Iterator[tuple[str, str, str]]:
-    """Yield `simulator=`'s option, the engine with its version, and what a missing one needs ("" if installed)."""
+    """Yield the value of `simulator=`, the engine with its version, and what a missing engine needs ("" if none)."""
     engines: dict[str, Callable[[], str]] = {
         "mujoco": lambda: f"MuJoCo {_package('mujoco')}",
         "dart": lambda: f"DART {_package('dartpy')}",

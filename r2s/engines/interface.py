@@ -1,7 +1,7 @@
 """The interface of a physics engine: set joint positions and velocities, apply one torque per millisecond, read them.
 
 An engine simulates rigid bodies only. `FrictionTorque` computes friction, breakaway, offsets and the contact with a
-surface as one more joint torque per step, so that the same arm moves and touches in every engine.
+surface as an additional joint torque in each step, so that the arm moves and touches alike in every engine.
 """
 
 from typing import Protocol
@@ -17,7 +17,7 @@ from r2s.physics.simulator import single_arm
 
 
 class Engine(Protocol):
-    """One arm without gravity: as on a Franka, the arm compensates it."""
+    """One arm without gravity, which the arm compensates, as a Franka does."""
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Set q, dq (n,) rad, rad/s."""
@@ -32,14 +32,14 @@ class FrictionTorque:
     """The joint torque of r2s/physics/friction.py and contact.py, for engines whose only input is torque.
 
     This friction is implicit: with its torque P and its slope D at the present velocity, MuJoCo solves (M + h D) a =
-    tau + P - bias. An engine that solves M a = tau + F - bias gives the same with F = P - h D a, where a is the
-    result of the implicit step. Without that term real wrist joints chatter at 1 ms.
+    tau + P - bias. An engine that solves M a = tau + F - bias computes the same a with F = P - h D a, where a is
+    the result of the implicit step. Without the term h D a, real wrist joints chatter at 1 ms.
 
     Args:
         robot, dynamics: the arm.
 
     Attributes:
-        contact: (COLUMNS,) of r2s/physics/contact.py, with the force of the last step; None: no surface.
+        contact: (COLUMNS,) of r2s/physics/contact.py, with the force of the last step; None without a surface.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics):
@@ -54,7 +54,7 @@ class FrictionTorque:
             self.contact[:] = contact_columns(robot, dynamics.surface)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return F (n,) Nm to add to the torque tau (n,) Nm of the next step from q, dq (n,)."""
+        """Return F (n,) Nm, which is added to the torque tau (n,) Nm of the step that begins at q, dq (n,)."""
         m, d = self._model, self._data
         d.qpos[:], d.qvel[:], d.qfrc_applied[:] = q, dq, tau
         mujoco.mj_forward(m, d)

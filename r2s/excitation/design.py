@@ -1,7 +1,7 @@
-"""A motion of up to ten minutes that determines chosen parameters best: segments that are chosen one after the other.
+"""Design a motion of up to ten minutes that determines chosen parameters well, one segment after the other.
 
-Each segment is the series of fourier.py with the best score given those before it (sequential design: Chernoff, Ann.
-Math. Stat. 30(3), 1959). Between two segments the arm moves on a checked way at minimum jerk.
+Each segment is the Fourier series (fourier.py) with the best score, given the earlier segments (sequential design:
+Chernoff, Ann. Math. Stat. 30(3), 1959). Between two segments the arm follows a checked path at minimum jerk.
 """
 
 from collections.abc import Callable
@@ -22,19 +22,19 @@ from r2s.physics.robot import SIM_DT, Robot
 SEGMENT_S = 60.0  # s, longest segment: two minutes of a series need 1 GB
 LONGEST_S = 600.0
 PEAKS = 1.875, 5.7735  # of velocity and acceleration at minimum jerk, for 1 rad in 1 s
-SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor until the torque suffices, at most so often
-EVERY = round(1 / (COARSE_HZ * SIM_DT))  # rows of a motion that a design counts
+SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor on a duration with too high torque; most repetitions
+EVERY = round(1 / (COARSE_HZ * SIM_DT))  # step between the rows of a motion that a design evaluates
 
 
 class Design(Protocol):
-    """What a motion is chosen for."""
+    """The criterion by which motions are chosen, given the motions chosen so far."""
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the scores (B,) of motions (B, T, n) at times t (T,) s, given the motions so far."""
         ...
 
     def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
-        """Count a motion (T, n) among those so far."""
+        """Add a chosen motion (T, n) to the motions so far."""
         ...
 
 
@@ -49,17 +49,17 @@ def designed(
     effort: int,
     report: Callable[[float], None] = lambda share: None,
 ) -> Excitation:
-    """Return a motion of `seconds`, and of the ways between its segments, that passes `check_motion`.
+    """Return a motion that passes `check_motion`: segments of `seconds` in total, and the paths between them.
 
     Args:
         robot, space: limits, links and obstacles.
         design: scores motions.
-        seconds: of the segments. center: (n,) rad, centre posture, see `fourier.checked_center`.
+        seconds: total of the segments. center: (n,) rad, centre posture, see `fourier.checked_center`.
         seed: of the random draws. effort: motions tried per segment.
-        report: gets the share of the work that is done.
+        report: called with the share of the work that is done.
 
     Raises:
-        UserError: an argument is out of range, no draw is safe, or no way is free.
+        UserError: an argument is out of range, no draw is safe, or no path between two segments is free.
     """
     check_number("seconds", seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
     check_number("effort", effort, "[0, inf)", whole=True)
@@ -77,7 +77,7 @@ def designed(
 
 
 def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Excitation:
-    """Return a motion between two postures (n,) rad on a path that `approach` finds, at rest in its corners.
+    """Return a motion between two postures (n,) rad on a path from `approach`; it is at rest at each corner.
 
     Raises:
         UserError: no path is free.
@@ -100,7 +100,7 @@ def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Exc
 
 
 def joined(parts: list[Excitation]) -> Excitation:
-    """Return motions that begin where the one before ends, one after the other."""
+    """Return one motion from several, each of which begins where the previous one ends."""
 
     def all_of(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
@@ -110,7 +110,7 @@ def joined(parts: list[Excitation]) -> Excitation:
 
 
 def trajectory_yaml(motion: Excitation, joints: list[str], rate_hz: float) -> str:
-    """Return a motion as trajectory_msgs/msg/JointTrajectory (ROS 2), with every sample of `rate_hz` and the last.
+    """Return a motion as trajectory_msgs/msg/JointTrajectory (ROS 2), sampled at `rate_hz`, plus the last sample.
 
     Controllers interpolate between points with positions, velocities and accelerations by quintic polynomials.
     """

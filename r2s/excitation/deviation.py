@@ -10,10 +10,10 @@ from r2s.physics.fence import FENCE_M
 
 @dataclass(frozen=True)
 class DeviationLimits:
-    """A deviation e (n,) rad is allowed in cycle k if `weights` @ |e| <= 1 in each row.
+    """Limits of the deviation from a motion: e (n,) rad is allowed in cycle k if weights[k // every] @ |e| <= 1.
 
     Attributes:
-        weights: (R, K, n) 1/rad. every: cycles for which a set of rows holds.
+        weights: (R, K, n) 1/rad, K limits for each of R intervals. every: cycles per interval.
 
     """
 
@@ -22,27 +22,27 @@ class DeviationLimits:
 
     @classmethod
     def uniform(cls, n: int, most: float) -> "DeviationLimits":
-        """Return the limit `most` rad of each of n joints."""
+        """Return limits that allow each of n joints a deviation of `most` rad in all cycles."""
         return cls(np.eye(n)[None] / most)
 
     @classmethod
     def along(cls, space: Space, motion: Motion, most: float) -> "DeviationLimits":
-        """Return the deviation that `deviation_weights` allows at both ends of a cycle of the motion."""
+        """Return limits that allow in each interval what `deviation_weights` allows at both of its ends."""
         rows = geometry_rows(motion)
         weights = deviation_weights(space, motion.q[rows], most)
         return cls(np.maximum(weights[:-1], weights[1:]), int(rows[1] - rows[0]))
 
     def share(self, k: int, deviation: np.ndarray) -> np.ndarray:
-        """Return (K, n), the parts of each limit that the joints' deviation (n,) rad takes in cycle k; sums <= 1."""
+        """Return (K, n): share of each limit that each joint's deviation uses in cycle k; allowed: row sums <= 1."""
         return self.weights[min(k // self.every, len(self.weights) - 1)] * np.abs(deviation)
 
 
 def deviation_weights(space: Space, q: np.ndarray, most: float) -> np.ndarray:
-    """Return weights (T, K + n, n) 1/rad of the deviations that clear the fence at q (T, n) rad.
+    """Return weights (T, K + n, n) 1/rad of the deviations that stay clear of the fence at q (T, n) rad.
 
-    No joint deviates by more than `most`, and no distance shrinks to below the fence: each joint takes its lever's
-    part of what there is, to first order. A deviation of all joints by DEVIATION is allowed everywhere: an arm that
-    starts too near must be able to leave.
+    The K limits keep each distance above FENCE_M, to first order: a joint uses up distance in proportion to its
+    lever. The n limits keep each joint within `most`. A deviation of all joints by DEVIATION is allowed everywhere,
+    so that an arm that starts too near can leave.
     """
     distances, levers = space.measured(q)
     levers = levers[:, 1:]

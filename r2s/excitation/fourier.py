@@ -2,8 +2,8 @@
 
 The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
 T-RA 13(5), 1997; a prior keeps quantities that a short motion cannot identify from dominating the determinant.
-Friction curves and delay need several speeds. So the series runs at 10 % to 100 % of its speed, runs back on slow
-rungs, so that every joint reverses at low speed, and rests between rungs.
+Friction curves and delay need several speeds. So the series runs at 10 % to 100 % of its speed, on the rungs of a
+ladder, with rests between rungs. Slow rungs also run backwards, so that every joint reverses at low speed.
 """
 
 from collections.abc import Callable
@@ -40,13 +40,13 @@ LEAST_S = 5 * BLEND_S
 TOP_HZ = 1.0  # highest harmonic, in the series' own time
 DECAY = 1.5  # exponent of the amplitude over the harmonic: low ones give position range, high ones acceleration
 SHORTEST_S = 4.0  # s, minimum fundamental period
-RANGE = 0.8  # share of the distance from the centre to the nearer position limit, or of half a turn
+RANGE = 0.8  # share of the distance from the centre to the nearer position limit, or of pi rad if that is less
 SPEED = 0.65  # share of dq_max
 ACCELERATION = 0.7  # share of ddq_max
-STUCK_S = 0.12  # s, a light joint may stick so long at a reversal and then catches up at a higher speed
+STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then it catches up at a higher speed
 # Search.
 DRAWS = 12  # random series
-KEPT = 3  # of the draws become starts of the search
+KEPT = 3  # safe draws of which the best becomes the start of the search
 TRIES = 5  # candidates per step of the local search
 MIN_AMPLITUDE = 0.3  # share of a joint's amplitude; a series that needs less to be safe is dropped
 MARGIN = 0.3  # share of each clearance, and 0.03 of tau_max: reserve for motion between two samples
@@ -54,7 +54,7 @@ APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the 
 FINE = 10  # samples for limits per sample for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
 Samples = tuple[np.ndarray, ...]  # offset from the centre, velocity, acceleration
-# of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)
+# Scores (B,) of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)
 Score = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -80,7 +80,7 @@ def fourier(
         duration: s, ends included.
         seed: of the random draws.
         gravity: see `information`.
-        effort: motions tried by the local search; 0: the first safe draw.
+        effort: motions tried by the local search; 0: no search, take the first safe draw.
         q_center: (n,) rad, centre posture; default: the middle of the position range.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
@@ -104,7 +104,7 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
     """Return the centre posture (n,) rad of a motion, by default the middle of the position range.
 
     Raises:
-        UserError: it is outside the limits, or it or q_home is too near to an obstacle.
+        UserError: the centre is outside the limits, or the centre or q_home is too near to an obstacle.
     """
     center = 0.5 * np.add(*robot.q_range) if q_center is None else np.asarray(q_center, dtype=float)
     _check_center(robot, center)
@@ -113,13 +113,13 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions: coefficients x (2 H, n) of a series, and a share a (n,) of each joint's amplitude.
+    """Candidate motions: coefficients x (2 H, n) of a series, and a share a (n,) of each joint's largest amplitude.
 
-    The amplitude is the largest that the joint's limits allow, so x only determines the shape.
+    A joint's limits determine its largest amplitude, so x determines only the shape.
 
     Args:
         robot: its limits. center: (n,) rad. duration: s. space: the obstacles.
-        score: of a motion, the larger the better; see `Score`.
+        score: function that scores motions, the larger the better; see `Score`.
     """
 
     def __init__(self, robot: Robot, center: np.ndarray, duration: float, score: Score, space: Space):
@@ -134,7 +134,7 @@ class Candidates:
     def found(
         self, rng: np.random.Generator, effort: int, report: Callable[[float], None] = lambda share: None
     ) -> Excitation:
-        """Return the best motion of `effort` tries; `report` gets the share of tries that are done.
+        """Return the best motion of `effort` tries; `report` is called with the share of tries that are done.
 
         Raises:
             UserError: no draw is safe.
@@ -151,7 +151,7 @@ class Candidates:
         return motion
 
     def draw(self, rng: np.random.Generator, count: int) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """Return (score, x, a) of the best safe draw, or None if no draw is safe."""
+        """Return (score, x, a) of the best of up to `count` safe draws, or None if no draw is safe."""
         shapes = [rng.standard_normal((2 * self.harmonics, self.robot.n)) for _ in range(DRAWS)]
         full = np.ones(self.robot.n)
         if count > 1:
@@ -206,12 +206,12 @@ class Candidates:
         return Excitation(self.clock[0], self.center + offset, dq, ddq)
 
     def scores(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return the scores (B,) of several (x, a); one call for all is faster."""
+        """Return the scores (B,) of B pairs (x, a), computed together because that is faster."""
         offset, dq, ddq = (np.stack(m) for m in zip(*(self._coarse(x, a) for x, a in motions), strict=True))
         return self.score(self.t, self.center + offset, dq, ddq)
 
     def _basis(self, rows: slice) -> Samples:
-        """Return matrices (T, 2 H) that map x to the series, its velocity and its acceleration at these ms."""
+        """Return matrices (T, 2 H) that map x to the series, its velocity and its acceleration at the ms `rows`."""
         _, s, pace, slope = (c[rows, None] for c in self.clock)
         order = np.arange(1, self.harmonics + 1)
         omega = 2 * np.pi / self.period * order
@@ -236,7 +236,7 @@ class Candidates:
         return q[::FINE], dq[::FINE], ddq[::FINE]
 
     def _safety(self, offset: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return (T,) the smallest margin, negative if unsafe: distances in clearances, torques in tenths."""
+        """Return the smallest margin (T,), negative if unsafe: gap / clearance, or unused torque share / 0.1."""
         q = self.center + offset
         torque = (TORQUE_SHARE - torque_share(self.robot, q, dq, ddq)).min(1)
         return np.minimum((self.space.gaps(q) / self.space.clearance).min(1), 10 * torque)
@@ -260,7 +260,7 @@ class Candidates:
         Each round reduces the joint with the largest effect at the least safe sample.
         """
         a = a.copy()
-        for every in (5, 1):  # most rounds on few samples
+        for every in (5, 1):  # first every fifth sample, so that most rounds are fast
             while True:
                 rows = tuple(m[::every] for m in moved(a))
                 safety = self._safety(*rows)
@@ -279,7 +279,7 @@ class Candidates:
 def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return t, the series' own time s, ds/dt and d2s/dt2, each (T,); raised cosines blend the paces ds/dt."""
     t = SIM_DT * np.arange(round(duration / SIM_DT) + 1)
-    levels, shares, fixed = [0.0], [0.0], [ENDS_S]  # a level lasts fixed seconds and a share of the rest
+    levels, shares, fixed = [0.0], [0.0], [ENDS_S]  # a level lasts `fixed` s plus its share of the remaining time
     rungs = _rungs(duration)
     for k, rung in enumerate(rungs):
         levels += [*rung, 0.0]
@@ -299,7 +299,7 @@ def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def _rungs(duration: float) -> list[list[float]]:
-    """Return the paces of each rung: ladders from slow to fast, slow rungs forwards and backwards."""
+    """Return the paces of each rung: each ladder goes from slow to fast; slow rungs run forwards and backwards."""
     count = int(duration / RUNG_S + 0.5)
     if count < 2:
         return [list(SHORT)]

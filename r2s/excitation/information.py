@@ -1,4 +1,4 @@
-"""The information in a recording of a planned motion, before anything is known of the arm's noise."""
+"""The expected information in a recording of a planned motion, from assumed noise and priors."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ COARSE_HZ = 10  # samples for information and safety
 NOISE = 0.002  # share of tau_max, per sample
 FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
 DRAG_PRIOR = 0.01  # share of tau_max, torque proportional to the sine of the angle, such as a cable's
-MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, of its centre of mass
+MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, for each coordinate of its centre of mass
 SCALE_PRIOR = 0.3  # share of a link's tensor, or of its trace
 DELAY_PRIOR = 3e-3  # s
 SLOPE = 0.05  # share of dq_max, width of the sign change of friction
@@ -21,13 +21,13 @@ RESTING = 1e-3  # share of dq_max; a slower joint may stick, and its torque carr
 def information(
     robot: Robot, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool
 ) -> np.ndarray:
-    """Return (B,) nats of B motions (B, T, n) at the times t (T,): half the log det of posterior over prior.
+    """Return the information (B,) nats of motions (B, T, n) at times (T,) s: half the log det ratio of precisions.
 
-    The unknowns have independent normal priors. Per joint: offset, Coulomb friction as a tanh, its width and shift,
-    viscous friction, and angle-dependent drag. Per link: mass and centre of mass (their errors appear in gravity even
-    if the arm compensates the nominal ones). Without `gravity` (commanded torque): per link the tensor's scale, and
-    one delay. With `gravity` (link-side torque): the whole tensors. The noise is 0.2 % of tau_max at 10 samples per
-    second. Rows with a joint at rest do not count, because friction is undetermined there.
+    The ratio is posterior over prior; priors are independent and normal. Unknowns per joint: offset, Coulomb friction
+    as a tanh, its width and shift, viscous friction, and angle-dependent drag. Per link: mass and centre of mass
+    (gravity depends on their errors even if the arm compensates it). Without `gravity` (commanded torque): per link
+    the tensor's scale, and one delay. With `gravity` (link-side torque): the whole tensors. The noise is 0.2 % of
+    tau_max at 10 samples per second. A joint's rows at rest do not count, because its friction is undetermined there.
     """
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)

@@ -6,9 +6,9 @@ import numpy as np
 def minimum_jerk(
     start: np.ndarray, end: np.ndarray, seconds: float, t: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return position, velocity and acceleration from `start` to `end` (n,) rad, at rest outside 0 to `seconds`.
+    """Return position, velocity and acceleration of a motion from `start` to `end` (n,) rad in `seconds`.
 
-    Each is (n,) for a time t, s, or (T, n) for times (T, 1).
+    Each is (n,) for a time t, s, or (T, n) for times (T, 1). Before 0 and after `seconds` the motion is at rest.
     """
     s = np.clip(t / seconds, 0.0, 1.0)
     distance = end - start

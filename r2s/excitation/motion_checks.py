@@ -18,8 +18,8 @@ from r2s.physics.robot import SIM_DT, Robot
 
 TOOL_M = 0.1  # m, default minimum height of the end effector, because the MJCF contains no tool
 CLEARANCE_M = 0.03  # m, least distance between a link and the table or another link
-DEVIATION = 0.05  # rad, a deviation of all joints by this must not bring a link nearer than the driver's fence
-FAR_M = 0.1  # m, at larger distances the bounding spheres are accurate enough
+DEVIATION = 0.05  # rad, a deviation of all joints by this much must not bring a link nearer than the driver's fence
+FAR_M = 0.1  # m, at larger distances the distance of bounding spheres is accurate enough
 GEOMETRY_HZ = 100
 TORQUE_SHARE = 0.8  # share of tau_max for |gravity| + |dynamics| + friction
 FRICTION_SHARE = 0.15  # share of tau_max for friction; a Panda's joint 5 has 0.14
@@ -49,7 +49,7 @@ def check_motion(
         motion: sampled at 1 kHz.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
-        space: built from them before, also with obstacles.
+        space: a `Space` to use instead of one from robot, table and z_min; it may have obstacles.
     """
     check_shape(robot, motion)
     check_limits(robot, motion)
@@ -98,7 +98,7 @@ def check_limits(robot: Robot, motion: Motion) -> None:
 def check_derivatives(robot: Robot, motion: Motion) -> None:
     """Raise UserError unless dq and ddq are the derivatives of q, and the motion starts and ends at rest.
 
-    The tracking controller feeds all three forward, so a step in q would jerk the arm within all limits.
+    The tracking controller uses all three, so a step in q would jerk the arm although all limits are respected.
     """
     e = motion
     for name, x, slope, most, unit in (
@@ -140,17 +140,17 @@ def check_torque(robot: Robot, motion: Motion) -> None:
 def check_space(
     robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M, space: "Space | None" = None
 ) -> None:
-    """Raise UserError if a link comes too near to table, obstacles or links; paths.py checks the approach."""
+    """Raise UserError if a link comes too near to table, obstacles or another link; paths.py checks the approach."""
     space = space or Space(robot, table=table, z_min=z_min)
     rows = geometry_rows(motion)
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
 
 
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return (T, n): |gravity| + |dynamics| of the nominal model plus `friction_margin`, over tau_max.
+    """Return (T, n): the sum of |gravity|, |dynamics| of the nominal model and `friction_margin`, over tau_max.
 
-    The sum of magnitudes is conservative: the arm differs from the nominal model, and the torque limit of some arms
-    applies before gravity compensation, of others after it.
+    The sum of magnitudes is conservative: the arm differs from the nominal model, and the torque limit applies to
+    the torque without gravity compensation on some arms, and to the torque with it on others.
     """
     gravity = gravity_torque(robot, q)
     dynamics = nominal_torque(robot, q, dq, ddq) - gravity
@@ -170,19 +170,19 @@ def friction_margin(robot: Robot) -> np.ndarray:
 class Space:
     """Distances of an arm's links from table, obstacles and each other; see `collision` for the geoms that count.
 
-    An arm is not exactly where it was planned to be. If joint j deviates by e_j rad, a distance shrinks by at most
-    sum_j lever_j |e_j|, to first order. The lever is the link's motion per rad of that joint, from the Jacobian at
-    that posture. A planned posture must leave room for DEVIATION of all joints, and a plan is followed only as long
-    as the arm is within its `DeviationLimits`, which are larger where there is room. So no plan is refused for a
+    An arm is not exactly where it was planned to be. If each joint j deviates by e_j rad, a distance shrinks by at
+    most sum_j lever_j |e_j|, to first order. The lever is the link's motion per rad of joint j, from the Jacobian at
+    the posture. A planned posture must leave room for a deviation of all joints by DEVIATION. The arm follows a plan
+    only within its `DeviationLimits`, which are larger where there is more room. So no plan is refused for a
     deviation that the arm never has, and an arm that deviates stops before it comes near.
 
     Attributes:
-        clearance: (K,) m, required distances: end effector above z_min (for the search only: `gaps` does not subtract
-            it), links above the table, and between pairs of links.
+        clearance: (K,) m, required distances: end effector above z_min (a scale for the search; `gaps` requires 0 m),
+            links above the table, and between pairs of links.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
-        robot: its links. table, z_min: m, see `check_motion`. deviation: rad, the one to leave room for.
+        robot: its links. table, z_min: m, see `check_motion`. deviation: rad, of all joints, to leave room for.
         obstacles: boxes.
     """
 
@@ -218,22 +218,22 @@ class Space:
             )
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # an arm with a low home posture must be able to return to it
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
-        # more than half of the distance at home is never asked for, so that an arm may return to a low posture
+        # at most half of the distance at home is required, so that an arm may return to a low home posture
         self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
-        """Return distances minus what they have to be, (T, K) m, at postures q (T, n) rad; negative: too near."""
+        """Return distances minus required distances, (T, K) m, at postures q (T, n) rad; negative: too near."""
         distances, levers = self.measured(q)
         return distances - self._needed(levers)
 
     def _needed(self, levers: np.ndarray) -> np.ndarray:
-        """Return the required distances (T, K) m for levers (T, K, n); 0 for the end effector."""
+        """Return the required distances (T, K) m for levers (T, K, n) m/rad; 0 for the end effector."""
         need = np.clip(FENCE_M + self._deviation * levers.sum(2), self.clearance, self._most)
         need[:, 0] = 0.0
         return need
 
     def measured(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distances (T, K) m and the joints' levers on them (T, K, n) m/rad, 0 for the end effector."""
+        """Return distances (T, K) m and the joints' levers on each (T, K, n) m/rad; levers of the end effector: 0."""
         tip, apart = np.empty((len(q), 1)), np.empty((len(q), len(self.pairs)))
         places, frames = (np.empty((len(q), self.model.ngeom, k)) for k in (3, 9))
         levers = np.zeros((len(q), 1 + len(self.above) + len(self.pairs), q.shape[1]))
@@ -246,7 +246,7 @@ class Space:
         return np.hstack([tip - self.floor, self._heights(places, frames) - self.table, apart]), levers
 
     def _levers(self) -> np.ndarray:
-        """Return the most by which a rad of each joint changes each distance, (K - 1, n) m/rad, at the present q."""
+        """Return upper bounds (K - 1, n) m/rad on the change of each distance per rad of each joint, at this q."""
         d, radius, link = self.data, self.model.geom_rbound, self._link
         arm = d.geom_xpos[:, None] - d.xanchor
         moved = np.cross(d.xaxis, arm)  # (ngeom, n, 3) of each geom's centre
@@ -256,7 +256,7 @@ class Space:
         far = np.linalg.norm(moved, axis=2) + radius[:, None]
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         between = (joint >= link[a, None]) & (joint < link[b, None])
-        # at the nearest points of two links the joints between them move one link as fast as the other
+        # a joint between two links changes their distance equally, whichever link moves: the smaller bound holds
         return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
@@ -268,7 +268,7 @@ class Space:
             raise UserError(f"excitation: {self.explain(int(which), q[row], when(row))}")
 
     def explain(self, which: int, q: np.ndarray, when: str) -> str:
-        """Return the error for column `which` of `gaps` at q (n,) rad."""
+        """Return the error message for column `which` of `gaps` at q (n,) rad."""
         distances, levers = self.measured(q[None])
         seen, allowed = distances[0, which], self._needed(levers)[0, which]
         if which == 0:
@@ -327,6 +327,6 @@ class Space:
 
 
 def geometry_rows(motion: Motion) -> np.ndarray:
-    """Return row indices at GEOMETRY_HZ, with the last row."""
+    """Return the indices of the rows at GEOMETRY_HZ, and of the last row."""
     rows = np.arange(0, len(motion.t), max(1, round(1 / (GEOMETRY_HZ * SIM_DT))))
     return np.union1d(rows, [len(motion.t) - 1])

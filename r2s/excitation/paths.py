@@ -1,7 +1,7 @@
 """Joint-space paths to a posture, checked for limits and clearance before an arm moves along them.
 
-A path is a list of postures (k, n) rad, connected by straight lines in joint space, at any speed. Distances and
-clearances are those of `motion_checks`.
+A path is a list of postures (k, n) rad, connected by straight lines in joint space; speed is not part of it.
+Distances and clearances are those of `motion_checks`.
 """
 
 from collections.abc import Iterator
@@ -13,11 +13,11 @@ from r2s.excitation.motion_checks import CLEARANCE_M, Space
 from r2s.physics.robot import Robot
 
 CLOSER_M = 1e-3  # m, an arm that starts too near may come closer by this on its way out
-SAME = 1e-3  # rad, a joint so near to its target need not move
+SAME = 1e-3  # rad, a joint this close to its target need not move
 
 
 def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, space: Space) -> np.ndarray:
-    """Return the first path (k, n) rad from q_from to q_to without a `path_violation`.
+    """Return the first candidate path (k, n) rad from q_from to q_to that has no `path_violation`.
 
     The candidates are the straight line, a path through q_home, joint by joint (last or first joint first), and
     joint by joint through q_home.
@@ -25,7 +25,7 @@ def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, s
     Args:
         robot: limits and links.
         q_from, q_to: (n,) rad.
-        what: name of the path for the message. space: of the robot.
+        what: name of the path for the message. space: `Space` of the robot.
 
     Raises:
         UserError: no candidate is free; the message describes the violation on the straight line.
@@ -51,7 +51,7 @@ def _candidates(robot: Robot, a: np.ndarray, b: np.ndarray) -> Iterator[np.ndarr
 
 
 def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Return the path (k, n) from a to b (n,) that moves one joint after the other."""
+    """Return the path (k, n) from a to b (n,) that moves one joint after the other, in this order."""
     path = [a]
     for joint in order:
         if abs(b[joint] - path[-1][joint]) > SAME:
@@ -60,9 +60,9 @@ def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
-    """Return a description of the first place where a path (k, n) leaves limits or comes too near, or "".
+    """Return a description of the first place where a path (k, n) leaves limits or comes too near, else "".
 
-    The first posture is the arm's present one and may violate clearances, but those distances must not decrease.
+    The first posture, where the arm is, may violate clearances, but these distances must not decrease further.
     """
     if path.ndim != 2 or len(path) < 2 or path.shape[1] != robot.n:
         return f"expected postures of shape (2 or more, {robot.n}), got {path.shape}"

@@ -1,1 +1,1 @@
-"""A policy that travels: a bundle of files that another program runs, and the runtime of one file that does."""
+"""Export a trained policy as a bundle: files that another program can run, with a runtime in a single file."""

@@ -1,4 +1,4 @@
-"""The arm that a bundle runs on, and whether it is the one that the bundle was made for; it needs nothing of r2s."""
+"""Check that a bundle was made for the arm on which it will run. This module needs nothing of r2s."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ from r2s.export.law import BundleError, Driver, Model, per_joint
 
 @dataclass(frozen=True)
 class Arm:
-    """The arm that a bundle runs on; a bundle made for another arm is refused.
+    """Description of the arm on which a bundle will run. The runtime refuses a bundle made for another arm.
 
     Attributes:
-        joints: names, from the base on. cycle_hz: rate of its torque commands.
+        joints: names in order from the base. cycle_hz: rate of its torque commands.
         torque: "without gravity" if the arm adds its own gravity compensation, as libfranka's arms do.
         q_min, q_max: rad. dq_max: rad/s. tau_max: Nm. dtau_max: Nm/s. Limits of the arm, one per joint.
-        slows: deceleration, rad/s^2, and offset, rad/s, per joint, of an arm that allows at a distance d before a
-            position limit the speed sqrt(2 deceleration d) - offset only, as an FR3 does; None: it does not.
+        slows: deceleration, rad/s^2, and offset, rad/s, each one per joint, of an arm such as the FR3. At a distance
+            d from a position limit it allows the speed sqrt(2 deceleration d) - offset. None: no such limit.
     """
 
     joints: Sequence[str]
@@ -33,7 +33,7 @@ class Arm:
 
 
 def fits(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle was made for another arm, or exceeds the limits of this one."""
+    """Raise BundleError if a bundle was made for another arm, or allows itself more than the limits of this arm."""
     own, n = contract["joints"], len(contract["joints"])
     if len(arm.joints) != n:
         raise BundleError(f"expected {n} joints, got {len(arm.joints)} of the arm")
@@ -64,7 +64,7 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
 
 
 def _slows(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle does not slow down before position limits as the arm demands."""
+    """Raise BundleError if a bundle allows higher speeds near position limits than the arm, see `Arm.slows`."""
     law = Driver(contract["law"], Model(contract["model"]))
     deceleration, offset = np.array(arm.slows, dtype=float)
     for way in np.linspace(0.0, 1.0, 101):  # rad before the limit

@@ -39,11 +39,11 @@ from r2s.tasks.surface_task import SurfaceTask
 from r2s.tasks.task import Task
 
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
-# modules that the one file of a bundle contains beside runtime.py, in this order
+# modules that r2s_runtime.py of a bundle contains in addition to runtime.py, in this order
 HERE, PARTS = "r2s.export.", ("law", "arm", "push", "control", "inverse_dynamics", "plan", "surface", "fences")
 EXAMPLES = 4  # plans in a bundle
-PLAN = "plan.npy"  # the first of them on a surface, for the C++ loop
-SAME = 1e-4  # of action_scale, largest difference between policy.onnx and policy.pt
+PLAN = "plan.npy"  # the first example plan if plans are on a surface; the C++ loop reads it
+SAME = 1e-4  # allowed difference between the actions of policy.onnx and policy.pt, as a share of action_scale
 
 
 def write_bundle(
@@ -60,11 +60,11 @@ def write_bundle(
 
     Args:
         to: the new folder. source: the run folder of the training.
-        robot, task, dynamics, policy: of the training; dynamics of one arm, the centre of the randomization.
-        config: of the training. places: names of all simulators and arms, to list those that were not tried.
+        robot, task, policy: of the training. dynamics: of one arm, the center of the training's randomization.
+        config: of the training. places: names of all simulators and arms; the model card lists the untried ones.
 
     Raises:
-        UserError: `to` exists, or the run has no policy.onnx that equals its policy.pt.
+        UserError: `to` exists, or policy.onnx of the run is missing or does not compute the actions of policy.pt.
     """
     if to.exists():
         raise UserError(f"export: {to} exists; remove it, or choose another to=FOLDER")
@@ -109,7 +109,7 @@ def write_bundle(
 
 
 def surface_of(source: Path, robot: Robot, task: Task, dynamics: Dynamics) -> Surface | None:
-    """Return the surface that a task touches: identified, of the training's run folder, or the expected one."""
+    """Return the surface that a task touches: the identified one of the run folder, or else the nominal one."""
     if not task.touches:
         return None
     if (source / "contact.yaml").is_file():
@@ -118,7 +118,7 @@ def surface_of(source: Path, robot: Robot, task: Task, dynamics: Dynamics) -> Su
 
 
 def check_with_own_runtime(folder: Path) -> None:
-    """Raise BundleError if the bundle's own r2s_runtime.py, which has its control law, refuses its contract."""
+    """Raise BundleError if the bundle's r2s_runtime.py, which contains the control law, refuses the contract."""
     command = [sys.executable, "-B", str(folder / "r2s_runtime.py"), str(folder)]  # -B: no __pycache__ in the bundle
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -126,7 +126,7 @@ def check_with_own_runtime(folder: Path) -> None:
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
-    """Copy policy.onnx; its actions have to equal policy.pt's, and its metadata the contract."""
+    """Copy policy.onnx, and check that its actions equal those of policy.pt and its metadata equal the contract."""
     import onnx
     from onnx.reference import ReferenceEvaluator
 
@@ -174,10 +174,10 @@ def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
 
 
 def one_file(control: Controller) -> str:
-    """Return r2s_runtime.py: r2s/export/runtime.py, with its parts and the control laws in place of their imports.
+    """Return the text of r2s_runtime.py: runtime.py with the sources of PARTS and control laws instead of imports.
 
     Raises:
-        UserError: the law of the controller uses names that a bundle does not have.
+        UserError: the control law uses names that a bundle does not contain.
     """
     here = Path(export.__file__).parent
 
@@ -206,12 +206,12 @@ def one_file(control: Controller) -> str:
 
 
 def law_source(law: Any) -> tuple[str, str]:
-    """Return name and source of a control law as plain Python, without decorators.
+    """Return the name and the source of a control law as plain Python, without decorators.
 
-    A function that returns the law contains the functions and numbers that the law uses, so their names stay local.
+    If a law uses other functions or numbers, the source is a function that defines them locally and returns the law.
 
     Raises:
-        UserError: it uses names other than functions, numbers, NumPy's `np` and builtins.
+        UserError: the law uses a name that is no function, number, builtin or NumPy's `np`.
     """
     function = getattr(law, "py_func", law)
     sources: dict[str, str] = {}
@@ -225,7 +225,7 @@ def law_source(law: Any) -> tuple[str, str]:
 
 
 def _collect(function: Any, law: str, sources: dict[str, str]) -> None:
-    """Add the source of a function, and before it all that it uses, to `sources`, by name."""
+    """Add the source of a function to `sources` {name: source}, after the sources of everything that it uses."""
     node = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
     assert isinstance(node, ast.FunctionDef)
     node.decorator_list = []

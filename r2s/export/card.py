@@ -13,7 +13,7 @@ from r2s.reporting.measures import measures_of
 from r2s.reporting.tables import measure_rows
 
 NOT_SHOWN = ("_target_", "name")
-PHYSICAL = ("panda", "fr3")  # arms of conf/arm that are no simulation
+PHYSICAL = ("panda", "fr3")  # options of conf/arm that are physical arms
 NO_SDF = "arm.xml and arm.urdf have rotor inertias, which SDF cannot express; there is no arm.sdf."
 
 
@@ -25,11 +25,11 @@ def card(
     bundle: Path,
     places: Sequence[str],
 ) -> dict[str, list[Item]]:
-    """Return the sections of the card.
+    """Return the sections of the model card, {title: items}.
 
     Args:
         source, config, meta: run folder of the training, its config.yaml and meta.json. contract: of the bundle.
-        bundle: folder being written. places: names of all simulators and arms.
+        bundle: the unfinished bundle folder. places: names of all simulators and arms.
     """
     best, measures = json.loads((source / "summary.json").read_text())["best"], measures_of(source)
     rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
@@ -75,12 +75,12 @@ def card(
 
 
 def contacts(contract: Mapping[str, Any]) -> str:
-    """Return what contact the training did not have."""
+    """Return the words for the contacts that did not occur in the training."""
     return "no contact but of the tip" if contract["goal"]["kind"] == "surface" else "no contact"
 
 
 def pushing(contract: Mapping[str, Any]) -> list[str]:
-    """Return the limit of pushes in words."""
+    """Return sentences on the limits of pushing force and closing speed."""
     push, on_surface = contract["law"]["push"], contract["goal"]["kind"] == "surface"
     if push is None:
         return ["Nothing but the torque limit bounds a force: safety.force_max was null."] if on_surface else []
@@ -91,7 +91,7 @@ def pushing(contract: Mapping[str, Any]) -> list[str]:
 
 
 def not_tried(measured: Mapping[str, Any], places: Sequence[str]) -> list[Item]:
-    """Return the simulators and arms without a transfer."""
+    """Return sentences on the simulators and arms to which the policy was not transferred."""
     names = {place.split(" ")[0] for place in measured}
     missing = sorted(p for p in places if p not in names and p not in ("none", "mujoco"))
     items: list[Item] = [
@@ -105,7 +105,7 @@ def not_tried(measured: Mapping[str, Any], places: Sequence[str]) -> list[Item]:
 
 
 def plans(contract: Mapping[str, Any]) -> list[Item]:
-    """Return the text that says how to make a plan."""
+    """Return the text that explains the format of a plan and how to make one."""
     goal, n = contract["goal"], len(contract["joints"])
     rows, columns = goal["shape"]
     if goal["kind"] == "surface":
@@ -140,7 +140,7 @@ def settings(group: Mapping[str, Any]) -> str:
 
 
 def model(source: Path, config: Mapping[str, Any]) -> str:
-    """Return the origin of the training's model."""
+    """Return a line that says where the model of the training comes from."""
     path = source / "parameters.yaml"
     if not path.is_file():
         return f"model: nominal, friction {settings(config['friction'])}; not identified from a recording"
@@ -149,12 +149,12 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"place (run)": row} of a policy's finished transfers in the same root, if the row has `measure`."""
+    """Return {"place (run)": row} of a policy's ended transfers in the same root, if the row has `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:
             meta = json.loads((path.parent / "meta.json").read_text())
-            # the root may have been moved: compare the last two parts of a path
+            # the root may have been moved, so compare only the last two parts of the path
             parents = [Path(p).resolve().parts[-2:] for p in meta["parents"]]
             if meta["status"] not in ("done", "stopped") or source.resolve().parts[-2:] not in parents:
                 continue

@@ -1,8 +1,8 @@
 """contract.json: everything that a program needs to run a policy on the arm that it was trained for.
 
-It holds every number of driver and safety filter (r2s/arm/driver.py, r2s/physics/safety_filter.py), the controller,
-and the model of computed torque (r2s/physics/inverse_dynamics.py). A runtime has no numbers of its own. JSON has no
-infinity: null stands for a missing limit.
+It contains all numbers of driver and safety filter (r2s/arm/driver.py, r2s/physics/safety_filter.py), the controller,
+and the model for computed torque (r2s/physics/inverse_dynamics.py). A runtime adds no numbers of its own. JSON has no
+infinity, so null stands for a missing limit.
 """
 
 from typing import Any, Protocol, cast
@@ -33,9 +33,9 @@ from r2s.tasks.task import ObservationTerm, Task, observation_scale
 from r2s.tasks.track import TrackTask
 
 CONVENTION = "without gravity"
-# sources of observation terms; `pull` is J^T error
+# sources of observation terms for every kind of goal; `pull` is J^T error
 MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
-MORE_OF = {  # sources beside them, by the kind of goal
+MORE_OF = {  # additional sources, by the kind of goal
     "point": (),
     "plan": ("ahead", "velocity", "limited", "q_off", "dq_off", "control"),
     "surface": (
@@ -43,9 +43,9 @@ MORE_OF = {  # sources beside them, by the kind of goal
         "velocity",
     ),
 }
-NEAR_RAD = 0.05  # rad, of an arm that was moved to a start posture; half of what a move_to may be off its path
+NEAR_RAD = 0.05  # rad, allowed distance from the start posture; half of what `move_to` may be off its path
 FIRST_ROW = "at rest, at the joint angles of a plan's first row"
-RESTING = 0.1  # rad/s, of a joint at rest: five times the driver's STILL, for noise of slower sensors
+RESTING = 0.1  # rad/s, below which a joint rests: five times the driver's STILL, for noise of slower sensors
 UNITS = {"q_low": "rad", "q_high": "rad", "q_fade": "rad", "most": "rad/s", "slowing": "rad/s^2", "offset": "rad/s"}
 UNITS |= {"dq_max": "rad/s", "added": "kg m^2", "tau_max": "Nm", "step": "Nm per cycle", "friction": "Nm"}
 UNITS |= {"asked": "Nm", "q_stop_low": "rad", "q_stop_high": "rad", "dq_stop": "rad/s"}
@@ -56,19 +56,19 @@ class DescribesObservation(Protocol):
     """A task that describes the terms of its observations."""
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms of an observation, in their order."""
+        """Return the terms in the order of their numbers in an observation."""
         ...
 
 
 def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.ndarray | None = None) -> dict[str, Any]:
-    """Return the contract of a policy of this arm and task, without files, versions and seal.
+    """Return the contract of a policy for this arm and task, without the keys files, versions, trained and seal.
 
     Args:
-        robot, task: of the training. friction: (n,) Nm, see `r2s.physics.safety_filter.filter_torque`. rotors: (n,)
-            kg m^2 for the safety filter; None: the robot's.
+        robot, task: of the training. friction: (n,) Nm, see `r2s.physics.safety_filter.filter_torque`.
+        rotors: armatures (n,) kg m^2 for the safety filter; None: those of the robot.
 
     Raises:
-        UserError: the task does not describe its observations, or the runtime of a bundle cannot run it.
+        UserError: the task does not describe its observations, or the runtime of a bundle cannot run the task.
     """
     check_exportable(robot, task)
     control = task.control(robot)
@@ -118,19 +118,19 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
 
 
 def kind_of(task: Task) -> str:
-    """Return the kind of a task's goals: plan, surface (a plan on one) or point."""
+    """Return the kind of a task's goals: "plan", "surface" (a plan on a surface) or "point"."""
     return "plan" if isinstance(task, TrackTask) else "surface" if isinstance(task, SurfaceTask) else "point"
 
 
 def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
-    """Return the place of the second joint, m, from which tasks count the distance of goals."""
+    """Return the position of the second joint, m, from which tasks measure the distance of goals."""
     arm = Model(model)
     arm.place(robot.q_home)
     return listed(arm.origin[min(1, robot.n - 1)])
 
 
 def check_exportable(robot: Robot, task: Task) -> None:
-    """Raise UserError if a runtime, which takes a point, a plan of `TrackTask` or of a surface, cannot run a task."""
+    """Raise UserError if a runtime cannot run the task: it takes points, plans of `TrackTask` or on a surface."""
     control, kind = task.control(robot), kind_of(task)
     model = model_of(control, task)
     if model is not None and model.dynamics.family.name not in FRICTION:
@@ -160,14 +160,14 @@ def check_exportable(robot: Robot, task: Task) -> None:
 
 
 def model_of(control: Controller, task: Task) -> InverseDynamics | None:
-    """Return the identified arm of the setpoints of computed torque, or of the force that a task observes."""
+    """Return the arm model that computed torque or the observed contact force needs, or None."""
     if isinstance(control, ComputedTorque):
         return control.model
     return task.model if isinstance(task, SurfaceTask) else None
 
 
 def controller(control: Controller, task: Task) -> dict[str, Any]:
-    """Return the controller: action space, parameters of its law, and the model of `model_of`."""
+    """Return the entry `control`: action space, parameters of the control law, and the model of `model_of`."""
     kind, model = kind_of(task), model_of(control, task)
     return {
         "name": control.name,
@@ -183,7 +183,7 @@ def controller(control: Controller, task: Task) -> dict[str, Any]:
 
 
 def links_of(robot: Robot, dynamics: Dynamics) -> list[dict[str, Any]]:
-    """Return the links of a model: joint, mass, centre and tensor, in the link frame at angle zero."""
+    """Return per link its joint, mass, center of mass and inertia tensor, in the link frame at angle zero."""
     out = []
     for k in chain(robot, dynamics, friction=False)[0]:
         row: dict[str, Any] = {"place": k.origin[:3, 3], "frame": k.origin[:3, :3], "axis": k.axis}
@@ -193,7 +193,7 @@ def links_of(robot: Robot, dynamics: Dynamics) -> list[dict[str, Any]]:
 
 
 def observation(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the terms of an observation: name, unit, source and slice."""
+    """Return the entry `observation`: name, unit, source and slice of each term."""
     if not hasattr(task, "observation_terms"):
         raise UserError(
             f"export: {type(task).__name__} does not describe its observations; it needs a method "
@@ -222,14 +222,14 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
 
 
 def width(of: str, joints: int, preview: int) -> int:
-    """Return the size of an observation term."""
+    """Return how many numbers an observation term with the source `of` has."""
     own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
     own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
     return {**own, "above_target": 1}.get(of, joints)
 
 
 def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the format of a goal that is a point, and the region of the training's goals."""
+    """Return the entry `goal` for goals that are points: their format, and the region of the training's goals."""
     out: dict[str, Any] = {"kind": "point", "shape": [3], "unit": "m", "frame": "the arm's base"}
     if hasattr(task, "region"):
         low, high = task.region(robot)
@@ -240,7 +240,7 @@ def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
 
 
 def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the format of a goal that is a plan, and the family of the training's plans."""
+    """Return the entry `goal` for goals that are plans: their format, and the ranges of the training's plans."""
     ends = np.cumsum([0, 3, 3, robot.n, robot.n, robot.n]).tolist()
     low, high = task.region(robot)
     trained = {"kinds": list(task.kinds), "size_m": list(task.size), "fastest_m_per_s": list(task.speed)}
@@ -260,7 +260,7 @@ def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, A
 
 
 def start(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the posture at which motions begin, at rest, and how far from it an arm may be."""
+    """Return the entry `start`: the posture in which motions begin at rest, and how far from it the arm may be."""
     rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
         return {"words": FIRST_ROW} | rest
@@ -286,7 +286,7 @@ WORDS = {
 
 
 def identified(arm: InverseDynamics, ahead_s: float, kind: str) -> dict[str, Any]:
-    """Return the model of the identified arm, what it is for, and its numbers."""
+    """Return the entry `control.model`: the numbers of the arm model, and the formula in which they are used."""
     robot, d = arm.robot, arm.dynamics
     names = FRICTION[d.family.name]
     phi = dict(zip(d.family.names, d.phi.T, strict=False))
@@ -310,7 +310,7 @@ def identified(arm: InverseDynamics, ahead_s: float, kind: str) -> dict[str, Any
 
 
 def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[Any]]:
-    """Return the numbers of the safety filter and driver that differ from joint to joint."""
+    """Return the numbers of safety filter and driver that each joint has of its own, {name of UNITS: n numbers}."""
     matrix = law.filter_limits(robot, task.torque_limit(robot))
     values = [matrix[:, k] for k in range(law.COLUMNS)]
     values += [friction, task.torque_limit(robot), robot.q_min + driver.Q_INSIDE, robot.q_max - driver.Q_INSIDE]
@@ -320,7 +320,7 @@ def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[
 
 
 def numbers(task: Task) -> dict[str, float]:
-    """Return the numbers of the safety filter and driver that all joints share."""
+    """Return the numbers of safety filter and driver that all joints share."""
     deadline = max(driver.DEADLINE_S, driver.PERIODS / task.ctrl_hz)
     own = {"cycle_s": SIM_DT, "low_pass": low_pass_factor(task.cutoff_hz), "brake_s": law.BRAKE_S, "rate": law.RATE}
     own |= {"approach": law.APPROACH, "allowed": law.ALLOWED, "nothing": law.FADED, "exact": law.TOLERANCE}
@@ -329,7 +329,7 @@ def numbers(task: Task) -> dict[str, float]:
 
 
 def listed(values: Any) -> Any:
-    """Return numbers for JSON; null if they are not finite."""
+    """Return a number or an array as JSON can express it; numbers that are not finite become null."""
     if np.ndim(values) == 0:
         return float(values) if np.isfinite(values) else None
     return [listed(v) for v in values]

@@ -1,7 +1,7 @@
-"""Control laws in a bundle: the compiled laws of r2s, run here as plain Python.
+"""Control laws in a bundle: the laws that r2s compiles, run here as plain Python.
 
-`r2s export` copies the source of the control law into the one file of a bundle. So a bundle needs nothing of r2s, and
-runs the same function as training did.
+`r2s export` copies the source of the control law into r2s_runtime.py of the bundle. So a bundle needs nothing of r2s,
+and runs the same function as the training did.
 """
 
 from collections.abc import Callable
@@ -15,10 +15,10 @@ LAWS: dict[str, Callable] = {"torque": torque_law, "computed_torque": computed_t
 
 
 class Control:
-    """The controller of a contract: from the policy's action to target torques, once per cycle.
+    """The controller of a contract. It maps the policy's command and the state to target torques, once per cycle.
 
     Args:
-        contract: whose `control` it is.
+        contract: its entry `control` describes the controller.
     """
 
     def __init__(self, contract: dict[str, Any]):
@@ -30,17 +30,17 @@ class Control:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a motion."""
+        """Clear the memory of the control law, before a motion."""
         self._memory = np.zeros(self._memory_size)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Return the target torque (n,) Nm of this cycle."""
+        """Return the target torque (n,) Nm of this cycle; the command is the action, then the setpoint."""
         out = np.zeros(self._n)
         self._law(q, dq, command, self._parameters, self._memory, out)
         return out
 
     def at_rest(self, q: np.ndarray, dq: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm of an action of zero, in the first cycle of a command."""
+        """Return the torque (n,) Nm of the control law for the action zero and a cleared memory."""
         out = np.zeros(self._n)
         command = np.concatenate([np.zeros(self.action_dim), setpoint])
         self._law(q, dq, command, self._parameters, np.zeros(self._memory_size), out)

@@ -1,6 +1,6 @@
-"""What a bundle refuses before a motion, as stage=transfer does, and what ends one damped; it needs nothing of r2s.
+"""Checks of start, goal and plan before a motion, and signals that bring the arm to rest; needs nothing of r2s.
 
-A policy runs in a thread of its own if the arm's clock does not wait: a cycle takes its newest action.
+If the arm's clock does not wait, the policy runs in its own thread and each cycle uses the newest action.
 """
 
 import signal
@@ -16,13 +16,13 @@ import numpy as np
 from r2s.export.law import BundleError, Model
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")  # Ctrl-C, kill, a closed terminal, Ctrl-\, Ctrl-Z
-POLL_S = 1e-4  # between two looks of the policy's thread at its mailbox, a tenth of a cycle
-ROUNDING_M = 1e-6  # of a goal on the border of its region
-AGREE_M = 1e-3  # between a plan's positions and those of its joint angles
+POLL_S = 1e-4  # s, between two reads of the mailbox by the policy's thread: a tenth of a cycle
+ROUNDING_M = 1e-6  # m, by which a goal on the border of its region may be outside
+AGREE_M = 1e-3  # m, allowed distance between a plan's position and that of its joint angles
 
 
 def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
-    """Return why a goal (3,) m is outside the region of the training's goals; None: it is inside."""
+    """Return why a goal (3,) m is outside the region of the training's goals, or None if it is inside."""
     if not np.isfinite(point).all():
         return "the goal is not finite"
     away, azimuth = np.linalg.norm(point - np.array(trained["shoulder_m"])), abs(np.arctan2(point[1], point[0]))
@@ -37,7 +37,7 @@ def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
 
 
 def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.ndarray) -> None:
-    """Raise BundleError unless the arm rests where motions of the training began, at home (n,) rad."""
+    """Raise BundleError unless the arm is at rest near the start posture `home` (n,) rad, as in the training."""
     if not (np.isfinite(q).all() and np.isfinite(dq).all()):
         raise BundleError("the arm's state is not finite")
     if start["within_rad"] is not None and (far := np.abs(q - home)).max() > start["within_rad"]:
@@ -51,7 +51,7 @@ def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.n
 
 
 def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError for a plan out of the arm's limits or the training's region, or of another arm."""
+    """Raise BundleError if a plan leaves the arm's limits or the training's region, or was made for another arm."""
     at, own = contract["goal"]["columns"], contract["law"]["joint"]
     place, q, dq = (plan[:, slice(*at[name])] for name in ("place", "q", "dq"))
     low, high, most = (np.array([s if v is None else v for v in own[k]]) for k, s in BOUNDS.items())
@@ -69,28 +69,28 @@ def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None
             raise BundleError(f"row {row} of the plan is {1e3 * off:.1f} mm from where its joint angles take the arm")
 
 
-BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # rows of the law, and what null means
+BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # keys of the law, and what null means
 
 
 class PolicyThread:
-    """A policy beside the cycle. Observations and actions go through mailboxes of one place, without a lock.
+    """A policy in a thread beside the 1 kHz cycle. Two mailboxes for one item each exchange data without a lock.
 
     Args:
-        act: from an observation to an action.
+        act: maps an observation to an action.
     """
 
     def __init__(self, act: Callable[[np.ndarray], np.ndarray]):
         self._act = act
-        self._seen: deque[tuple] = deque(maxlen=1)  # an append to a full one drops the older; both are atomic
+        self._seen: deque[tuple] = deque(maxlen=1)  # if full, append drops the old item; all is atomic
         self._made: deque[tuple] = deque(maxlen=1)
         threading.Thread(target=self._run, daemon=True).start()
 
     def give(self, motion: int, seen: np.ndarray, setpoint: np.ndarray) -> None:
-        """Give an observation of a motion."""
+        """Pass an observation of motion number `motion`, with its setpoint, to the policy."""
         self._seen.append((motion, seen, setpoint))
 
     def newest(self, motion: int) -> np.ndarray | None:
-        """Return this motion's newest command, None if it was taken already."""
+        """Return the newest command, or None if it was taken already or belongs to another motion than `motion`."""
         try:
             of, command = self._made.pop()
         except IndexError:
@@ -112,7 +112,7 @@ class PolicyThread:
 
 @contextmanager
 def stopped_by_signals(runtime: Any) -> Iterator[None]:
-    """Let `SIGNALS` bring the arm to rest instead of ending the program; in the main thread."""
+    """Let `SIGNALS` bring the arm to rest instead of ending the program. Call this in the main thread."""
 
     def stop(number: int, frame: Any) -> None:
         runtime.stop(signal.Signals(number).name)

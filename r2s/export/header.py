@@ -10,15 +10,15 @@ from r2s.export.inverse_dynamics import FRICTION
 from r2s.export.law import LINK
 from r2s.export.push import PUSH_NUMBER, PUSH_VECTOR, STOPS
 
-LOWEST = ("q_low", "q_stop_low")  # where null is minus infinity
-PARAMETERS = 7  # of friction, the most that a family has
+LOWEST = ("q_low", "q_stop_low")  # lower limits, in which null stands for minus infinity
+PARAMETERS = 7  # of the friction family with the most parameters
 
 
 def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
     """Return a C++17 header: model, safety filter, control law and observation.
 
     Args:
-        contract: see contract.py. policy_sha256: of policy.onnx. law: body of the control law, `Controller.cpp`.
+        contract: see contract.py. policy_sha256: of policy.onnx. law: C++ body of the control law, `Controller.cpp`.
     """
     model, filter_, seen, rates, control = (contract[k] for k in ("model", "law", "observation", "rates", "control"))
     joints = ", ".join(json.dumps(name) for name in contract["joints"])
@@ -63,7 +63,7 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
 
 
 def _push(push: Mapping[str, Any] | None) -> list[str]:
-    """Return the constants of the limit of pushes, zeros without one, and the thresholds of a Franka's reflexes."""
+    """Return the constants of the push limit, zeros if there is none, and the thresholds of a Franka's reflexes."""
     own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
         PUSH_VECTOR, [0.0] * 3
     )
@@ -80,7 +80,7 @@ def _push(push: Mapping[str, Any] | None) -> list[str]:
 
 
 def _surface(contract: Mapping[str, Any]) -> list[str]:
-    """Return the constants of plans on a surface, and of the model of the force that the policy observes."""
+    """Return the constants of plans on a surface, and of the model that estimates the observed contact force."""
     goal, model = contract["goal"], contract["control"]["model"]
     trained, family = goal["trained"], model["friction"]["family"]
     names, given = FRICTION[family], model["friction"]["parameters"]
@@ -111,7 +111,7 @@ OWN = {"own_offset": "offset_Nm", "load": "load", "drag_sin": "drag_sin_Nm", "dr
 
 
 def _fences(contract: Mapping[str, Any]) -> list[str]:
-    """Return the constants of where motions begin and goals lie; without limits for a task that has none."""
+    """Return the constants of the allowed start and the region of goals; infinite limits where a task has none."""
     start, trained = contract["start"], contract["goal"].get("trained") or {}
     near, far = trained.get("shoulder_distance_m", (0.0, None))
     numbers = {"start_within": start["within_rad"], "start_fastest": start["fastest_rad_per_s"], "goal_nearest": near}
@@ -122,7 +122,7 @@ def _fences(contract: Mapping[str, Any]) -> list[str]:
 
 
 def _rows(name: str, values: list[Any], before: str = "") -> str:
-    """Return the constant of what each link has; a matrix is one row, of a tensor six numbers are."""
+    """Return a constant with one row per link: nine numbers for a frame, six for an inertia tensor."""
     if name == "frame":
         values = [[x for row in frame for x in row] for frame in values]
     elif name == "tensor":

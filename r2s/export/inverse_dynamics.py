@@ -1,7 +1,7 @@
 """Inverse dynamics of the identified arm in NumPy: a second implementation of r2s/physics/inverse_dynamics.py.
 
-It computes the setpoints of control=computed_torque. It needs nothing of r2s; `r2s export` puts it into the one file
-of a bundle.
+It serves the setpoints of control=computed_torque and the estimate of contact force. It needs nothing of r2s:
+`r2s export` copies it into r2s_runtime.py of a bundle.
 """
 
 from typing import Any
@@ -21,10 +21,10 @@ FRICTION = {
 
 
 class InverseDynamics:
-    """Inverse dynamics of the identified arm, and the setpoints that a plan gives.
+    """Inverse dynamics of the identified arm, and the setpoints that follow from a plan.
 
     Args:
-        contract: `control.model` is the identified arm, `model` the one that the arm's own compensation uses.
+        contract: `control.model` is the identified arm, `model` the one of the arm's own gravity compensation.
     """
 
     def __init__(self, contract: dict[str, Any]):
@@ -43,15 +43,15 @@ class InverseDynamics:
         self._sign, self._slides = number["sign_rad_per_s"], number["load_sign_rad_per_s"]
 
     def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
-        """Return the setpoints (rows, 3 n + n n) of the first rows of a plan's joints (T, n) at hz.
+        """Return the setpoints (rows, 3 n + n n) for the first `rows` rows of a joint motion (T, n) sampled at `hz`.
 
-        Feedforward Nm, q_d, dq_d and the mass matrix row by row. A cycle of 1 ms has no time for it.
+        A setpoint is feedforward, Nm, q_d, dq_d, and the mass matrix row by row. A cycle of 1 ms is too short for it.
         """
         n = q.shape[1]
         out = np.empty((rows, 3 * n + n * n))
         whole, last = int(self._ahead * hz), len(q) - 1
         h = self._ahead - whole / hz
-        for row in range(rows):  # the plan when the torque acts; its acceleration is linear between rows
+        for row in range(rows):  # evaluate the plan when the torque acts, with acceleration linear between rows
             a, b = min(row + whole, last), min(row + whole + 1, last)
             jerk = (ddq[b] - ddq[a]) * hz
             to = q[a] + h * (dq[a] + h * (ddq[a] / 2 + h * jerk / 6))
@@ -61,7 +61,7 @@ class InverseDynamics:
         return out
 
     def equations(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mass matrix (n, n) kg m^2, and a motion's torque (n,) Nm beyond the arm's own compensation."""
+        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm of a motion, less the arm's gravity compensation."""
         self._own.place(q)
         self._nominal.place(q)
         mass, bias = self._own.equations(dq)
@@ -71,7 +71,7 @@ class InverseDynamics:
         return mass, out + self._load * np.abs(held) * np.tanh(dq / self._slides)
 
     def friction(self, v: np.ndarray) -> np.ndarray:
-        """Return friction (n,) Nm at v (n,) rad/s, as r2s/physics/friction.py does."""
+        """Return the friction torque (n,) Nm at the speeds v (n,) rad/s, as r2s/physics/friction.py does."""
         p, sign = self._friction, np.tanh(v / self._sign)
         if self._family == "sigmoid":
             return p[0] * (_logistic(p[1] * (v + p[2])) - _logistic(p[1] * p[2])) + p[3] * v

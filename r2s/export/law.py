@@ -1,6 +1,6 @@
 """Driver and safety filter in NumPy for the arm of a contract; the original is r2s/physics/safety_filter.py.
 
-It needs nothing of r2s. `r2s export` puts it and runtime.py together into r2s_runtime.py, the one file of a bundle.
+This module needs nothing of r2s. `r2s export` joins it and others with runtime.py to r2s_runtime.py of a bundle.
 """
 
 from collections.abc import Sequence
@@ -10,15 +10,15 @@ import numpy as np
 
 LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
 
-OVER = 3  # phase of a stop that has left the surface, see push.py
+OVER = 3  # last phase of a stop: nothing is left to do about the contact, see push.py
 
 
 class BundleError(ValueError):
-    """A bundle that does not run here; its message is one line."""
+    """A bundle that cannot run here, or a wrong call of its runtime; the message is one line."""
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
-    """Return a list of a contract as (n,); null becomes `none`, because JSON has no infinity."""
+    """Return a list of a contract as an array (n,). null becomes `none`, because JSON has no infinity."""
     return np.array([none if v is None else v for v in values], dtype=float)
 
 
@@ -48,7 +48,7 @@ class Model:
         self._before = np.tril(np.ones((self.n, self.n)))[:, :, None]  # whether joint j moves link k: j <= k
 
     def place(self, q: np.ndarray) -> None:
-        """Take the arm to q (n,) rad."""
+        """Move the model to the joint angles q (n,) rad."""
         rotation = self._constant + np.sin(q)[:, None, None] * self._odd + np.cos(q)[:, None, None] * self._even
         self.frame, self.origin = np.empty((self.n, 3, 3)), np.empty((self.n, 3))
         R, p = np.eye(3), np.zeros(3)
@@ -59,18 +59,18 @@ class Model:
         self.axis = (self.frame @ self._axis[:, :, None])[..., 0]
 
     def hand(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the end effector (3,) m and its Jacobian (3, n) m/rad."""
+        """Return the position of the end effector (3,) m and its Jacobian (3, n) m/rad."""
         return self.point(self._hand)
 
     def point(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a point of the last link (3,) m, which its frame has at `own`, and its Jacobian (3, n) m/rad."""
+        """Return position (3,) m and Jacobian (3, n) m/rad of the point at `own` (3,) m in the last link's frame."""
         place = self.frame[-1] @ own + self.origin[-1]
         return place, cross(self.axis, place - self.origin).T
 
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
 
-        Newton and Euler's for the torque; the sum of J_k^T (m, I)_k J_k over the links k for the matrix.
+        The torque is by Newton-Euler; the matrix is the sum of J_k^T (m, I)_k J_k over the links k.
         """
         R, p, z, n = self.frame, self.origin, self.axis, self.n
         spin = z * dq[:, None]
@@ -99,7 +99,7 @@ class Model:
         return mass + self._rotors, bias
 
     def weight(self, gravity: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that holds the arm still against gravity (3,) m/s^2 in the base frame."""
+        """Return the gravity torque (n,) Nm that holds the arm at rest; gravity (3,) m/s^2 is in the base frame."""
         centre = self.origin + (self.frame @ self._com[:, :, None])[..., 0]
         force = -self._mass[:, None] * gravity
         moment = cross(centre, force)
@@ -108,14 +108,14 @@ class Model:
 
 
 class Driver:
-    """The driver, once per cycle: control law, low-pass and safety filter. Its torque respects the arm's limits.
+    """Control law, low-pass and safety filter, called once per cycle. The torque obeys the arm's limits.
 
     Attributes:
-        effort: (n,) Nm, the target torque after the low-pass. stopping: why the arm is brought to rest, or None.
-        limited: number of cycles of the motion in which the safety filter changed the command.
+        effort: (n,) Nm, the target torque after the low-pass. stopping: why the arm is being stopped, or None.
+        limited: number of cycles of this motion in which the safety filter changed the torque.
 
     Args:
-        law: of a contract. model: of the same. soft_start_s: s over which the torque of a motion fades in.
+        law: of a contract. model: of the same contract. soft_start_s: time over which the torque fades in, s.
         control: `Control` of the contract; None: commands are torques. push: `PushLimit` of the contract, or None.
     """
 
@@ -129,11 +129,11 @@ class Driver:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a motion, from zero torque."""
+        """Clear the state of the driver, so that the next motion begins from zero torque."""
         n = self._model.n
         self.effort, self._target, self._filtered, self._sent, self._held = np.zeros((5, n))
         self.stopping: str | None = None
-        self._brakes_alone = False  # whether a stop is for the arm's own place or state, and so brakes alone
+        self._brakes_alone = False  # a limit or an invalid state caused the stop: brake, whatever the contact
         self._share, self._cycle, self._silent, self._damped, self._rests = 1.0, 0, 0, 0, False
         self.limited = 0
         self._command: np.ndarray | None = None
@@ -143,7 +143,7 @@ class Driver:
 
     @property
     def done(self) -> bool:
-        """Whether a motion that is being stopped is at rest, or its time is over."""
+        """Whether a stop has ended: the arm is at rest, or the time for the stop is over."""
         over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
         return self.stopping is not None and self._damped > 0 and (self._rests or over)
 
@@ -154,7 +154,7 @@ class Driver:
 
         Args:
             q, dq: (n,) rad, rad/s, of this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            command: (c,) of the controller; None: no new one. placed: whether the model is at q already.
+            command: (c,) for the controller; None: no new one. placed: whether the model is at q already.
         """
         j, c = self._j, self._number
         seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
@@ -182,7 +182,7 @@ class Driver:
                 self._target = np.clip(target, -j["asked"], j["asked"])
                 self._rests = self._rests and self._push.phase == OVER
             self._share = max(needs, self._share - c["cycle_s"] / c["brake_s"])
-            if seen and self._share == 0.0:  # a spring against joints that a load or a friction estimate moves on
+            if seen and self._share == 0.0:  # a spring against joints that a load or wrong friction still moves
                 slides = np.abs(dq) > c["still"]
                 along = np.where(slides & (dq * self._held > 0), np.minimum(j["release"], np.abs(self._held)), 0.0)
                 turned = self._held - along * np.sign(dq) - c["cycle_s"] * j["spring"] * np.where(slides, dq, 0.0)
@@ -228,9 +228,9 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to the effort within the bounds of joints and pushes.
+        """Return the torque (n,) Nm within the joint bounds and the push limit that is nearest to the effort.
 
-        And whether it is another one than the effort.
+        The second value is whether the safety filter changed the effort.
         """
         j, c = self._j, self._number
         near = max(
@@ -252,9 +252,9 @@ class Driver:
     def _bounded(
         self, tau: np.ndarray, dq: np.ndarray, ddq: np.ndarray, bounds: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to tau, which causes ddq, under which no joint is beyond its bounds.
+        """Return the torque (n,) Nm nearest to tau that keeps accelerations within bounds, and whether it differs.
 
-        And whether it is another one. bounds: inverse of the mass matrix, low and high (n,) rad/s^2.
+        ddq: (n,) rad/s^2 caused by tau. bounds: inverse of the mass matrix, low and high (n,) rad/s^2.
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():
@@ -269,11 +269,11 @@ class Driver:
         return tau + self._stops(mobility, ddq, low, high), True
 
     def fastest(self, q: np.ndarray, up: bool) -> np.ndarray:
-        """Return the speeds (n,) rad/s that the safety filter allows at q (n,) rad, in one direction."""
+        """Return the speeds (n,) rad/s that the safety filter allows at q (n,) rad, upwards or downwards."""
         return self._allowed(self._j["q_high"] - q if up else q - self._j["q_low"])
 
     def _allowed(self, way: np.ndarray) -> np.ndarray:
-        """Return (n,) rad/s, how fast joints may go that have `way` (n,) rad left."""
+        """Return the speeds (n,) rad/s that are allowed at the distances `way` (n,) rad before the limits."""
         j, c = self._j, self._number
         speed = np.minimum(self._share * j["most"], c["approach"] * way)
         slows = (way > 0.0) & np.isfinite(j["slowing"])
@@ -285,7 +285,7 @@ class Driver:
         return speed
 
     def _stops(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the torques (n,) Nm that stops at the joints would add: block principal pivoting."""
+        """Return the torques (n,) Nm that mechanical stops at the bounds would add: block principal pivoting."""
         c = self._number
         side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))
         push = np.zeros_like(ddq)
@@ -295,7 +295,7 @@ class Driver:
             push[at] = np.linalg.solve(mobility[np.ix_(at, at)], np.where(side > 0, high, low)[at] - ddq[at])
             reached = ddq + mobility @ push
             free = np.where(reached > high + c["exact"], 1, np.where(reached < low - c["exact"], -1, 0))
-            other = np.where(side == 0, free, np.where(side * push > 0.0, 0, side))  # none pulls outwards
+            other = np.where(side == 0, free, np.where(side * push > 0.0, 0, side))  # a bound only pushes inwards
             changed = np.flatnonzero(other != side)
             if not len(changed):
                 break

@@ -1,7 +1,7 @@
 """Plans of a policy that tracks a trajectory, in NumPy: a second implementation of r2s/tasks/track.py.
 
 A plan is a timed path with a row per control step: position and velocity of the end effector, and angles, speeds and
-accelerations of the joints. It needs nothing of r2s; `r2s export` puts it into the one file of a bundle.
+accelerations of the joints. It needs nothing of r2s: `r2s export` copies it into r2s_runtime.py of a bundle.
 """
 
 from typing import Any
@@ -12,12 +12,12 @@ from r2s.export.control import Control
 from r2s.export.inverse_dynamics import InverseDynamics
 from r2s.export.law import BundleError, Model
 
-COLUMNS = ("place", "velocity", "q", "dq", "ddq")  # of a plan
+COLUMNS = ("place", "velocity", "q", "dq", "ddq")  # groups of columns of a plan, in this order
 NO_PLAN = "the policy of this bundle follows plans: pass one to `reset`"
 
 
 def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a plan; raise BundleError if it is missing, of another shape, or not finite."""
+    """Return a plan as an array; raise BundleError if it is missing, has another shape, or is not finite."""
     if plan is None:
         raise BundleError(NO_PLAN)
     plan = np.array(plan, dtype=float)
@@ -30,10 +30,10 @@ def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Follower:
-    """Position in a plan: what the policy observes of it, and the setpoints of the controller.
+    """Follow a plan: return what the policy observes of it and the setpoint of the controller, step by step.
 
     Args:
-        contract: with plans as goals. control, model: of the contract.
+        contract: its goals are plans. control, model: made from the contract; `model` is not used.
     """
 
     def __init__(self, contract: dict[str, Any], control: Control, model: Model | None = None):
@@ -46,7 +46,7 @@ class Follower:
         self._shape, self._plan = tuple(goal["shape"]), np.zeros(0)
 
     def take(self, plan: Any) -> None:
-        """Take the plan of the next motion; raise BundleError if it is missing, of another size, or not finite."""
+        """Store the next motion's plan; raise BundleError if it is missing, has another shape, or is not finite."""
         plan = finite_plan(plan, self._shape)
         if self._dynamics is not None:
             q, dq, ddq = (plan[:, self._at[k]] for k in ("q", "dq", "ddq"))
@@ -55,18 +55,18 @@ class Follower:
 
     @property
     def start(self) -> np.ndarray:
-        """(n,) rad, where the plan begins."""
+        """Joint angles (n,) rad at which the plan begins."""
         if not self._plan.size:
             raise BundleError(NO_PLAN)
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return the observation sources of a control step, and `setpoint`; `goal` is the reference position.
+        """Return the observation sources of a control step and the `setpoint`; `goal` is the reference position.
 
-        After the last step the reference stays at the end of the plan.
+        After the last step the reference stays at the end of the path.
 
         Args:
-            step: from 0. seen: q, dq (n,) rad, rad/s, and the end effector `ee` (3,) m.
+            step: number of the control step, from 0. seen: q, dq (n,) rad, rad/s, and the end effector `ee` (3,) m.
             limited: share of the last control period in which the safety filter changed the command.
         """
         row, at, plan = min(step, self._steps), self._at, self._plan
@@ -81,7 +81,7 @@ class Follower:
 
 
 def plan_of(model: Model, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return the plan (rows, 6 + 3 n) of joint motions (rows, n) rad, rad/s, rad/s^2."""
+    """Return the plan (rows, 6 + 3 n) of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2."""
     hands = np.empty((len(q), 6))
     for k in range(len(q)):
         model.place(q[k])

@@ -1,7 +1,7 @@
-"""Limit of pushes in NumPy, and what a stop does with a force; it needs nothing of r2s.
+"""Limit of contact force and closing speed in NumPy, and the stop of an arm whose tip presses on a surface.
 
-The originals are r2s/physics/push_limit.py, which derives it, and r2s/physics/contact_stop.py. `r2s export` puts it
-into the one file of a bundle.
+The originals are r2s/physics/push_limit.py, with the derivation, and r2s/physics/contact_stop.py. This module needs
+nothing of r2s, because `r2s export` copies it into r2s_runtime.py of a bundle.
 """
 
 from collections.abc import Callable
@@ -21,10 +21,10 @@ BEGINS, PRESSES, CLEAR = range(3)  # phases of a stop, before OVER
 
 
 class PushLimit:
-    """The limit of pushes of an arm, cycle by cycle: `see`, then `stop` while it is stopped, then `limit`.
+    """The push limit of one arm. Call in every cycle `see`, then `stop` while the arm is being stopped, then `limit`.
 
     Args:
-        law: of a contract. model: at the joint angles of the cycle.
+        law: of a contract. model: of the arm; the caller moves it to the joint angles of every cycle.
     """
 
     def __init__(self, law: dict[str, Any], model: Model):
@@ -35,13 +35,13 @@ class PushLimit:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a motion."""
+        """Forget the estimated force and the phase of a stop, before a motion."""
         self._resisted, self._speed = 0.0, 0.0
-        self._before: float | None = None  # the speed of the cycle before
+        self._before: float | None = None  # closing speed one cycle ago, m/s; None: the tip was far
         self.phase, self._felt, self._from, self._pull = BEGINS, 0.0, 0.0, 0.0
 
     def see(self, dq: np.ndarray, mass: np.ndarray, bias: np.ndarray) -> None:
-        """Take the motion of the tip at dq (n,) rad/s: mass matrix (n, n) kg m^2, Coriolis torque (n,) Nm."""
+        """Compute the tip's motion from dq (n,) rad/s, mass (n, n) kg m^2 and Coriolis torque `bias` (n,) Nm."""
         m, p = self._model, self._p
         place, jacobian = m.point(self._tip)
         off = place - self._point
@@ -62,7 +62,7 @@ class PushLimit:
         self._dq, self._mass, self._bias = dq, mass, bias
 
     def _bound(self, last: np.ndarray) -> float:
-        """Return how large an inward acceleration, m/s^2, a torque may cause after the torque `last` (n,) Nm."""
+        """Return the bound, m/s^2, of the inward acceleration lever @ torque, given the previous torque (n,) Nm."""
         p, c, mobility = self._p, self._c, self._mobility
         if self._height > p["near_m"]:
             self._resisted, self._before = 0.0, None
@@ -83,9 +83,9 @@ class PushLimit:
         return most - own
 
     def limit(self, effort: np.ndarray, last: np.ndarray, bounded: Callable[..., Any]) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to the effort (n,) Nm within all bounds, and whether it is another one.
+        """Return the torque (n,) Nm within all bounds nearest to the effort (n,) Nm, and whether they differ.
 
-        bounded: from a torque and the bias of an arm that touches, (n,) Nm, to what the joints' bounds leave of it.
+        bounded: maps a torque and a bias that includes the contact, (n,) Nm, to the torque within joint bounds.
         """
         bound, p, row = self._bound(last), self._p, self._row
         bias = self._bias + max(self._resisted, 0.0) * row
@@ -111,10 +111,10 @@ class PushLimit:
         return out, True
 
     def stop(self, held: np.ndarray, cycles: int) -> tuple[np.ndarray, float]:
-        """Return the target (n,) Nm of a stop, and the share of the allowed speeds that it needs.
+        """Return the target torque (n,) Nm of a cycle of a stop, and the share of the allowed speeds that it needs.
 
         Args:
-            held: (n,) Nm, which come on top. cycles: of the stop so far.
+            held: (n,) Nm, torque that the driver adds to the target. cycles: number of cycles of the stop so far.
         """
         p, row, lever, mobility = self._p, self._row, self._lever, self._mobility
         if cycles * self._c["cycle_s"] > p["leaves_s"]:

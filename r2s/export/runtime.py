@@ -8,8 +8,8 @@
         while not runtime.done:          # every millisecond
             tau = runtime(q, dq, tau_J_d, goal)
 
-A policy that follows plans takes its plan in `reset`, and no goal in a cycle; `plan` makes one of joint angles. The
-requirements of the bundle are in its contract.json. A mismatch raises a BundleError of one line.
+If the policy follows plans, pass the plan to `reset` and no goal in a cycle. `Runtime.plan` makes a plan from joint
+motion. The bundle's requirements are in its contract.json. A mismatch raises BundleError with a message of one line.
 """
 
 import hashlib
@@ -32,16 +32,16 @@ FORMAT = 6
 
 
 def seal_of(contract: dict[str, Any]) -> str:
-    """Return the digest of a contract without its seal."""
+    """Return the SHA-256 digest of a contract without its key `seal`."""
     sealed = {k: v for k, v in contract.items() if k != "seal"}
     return hashlib.sha256(json.dumps(sealed, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def load(folder: str | Path) -> dict[str, Any]:
-    """Return the contract of a bundle that is whole.
+    """Return the contract of a bundle, after a check that the bundle is complete and unchanged.
 
     Raises:
-        BundleError: a file is missing or was changed, or this runtime lacks its control law.
+        BundleError: a file is missing or was changed, or this runtime does not have the bundle's control law.
     """
     path = Path(folder) / "contract.json"
     try:
@@ -73,14 +73,14 @@ def load(folder: str | Path) -> dict[str, Any]:
 
 
 class Runtime:
-    """A policy with its controller and driver: joint states in, the torque of each cycle out.
+    """A policy with its controller and driver. It maps the joint state to the torque command, cycle by cycle.
 
     Attributes:
-        contract: of the bundle. driver: see `Driver`.
+        contract: content of contract.json. driver: see `Driver`.
 
     Args:
-        folder: the bundle. arm: the arm that it runs on. soft_start_s: s over which the torque of a motion fades in.
-        live: whether the arm's clock does not wait: then the policy runs in a thread of its own.
+        folder: the bundle. arm: the arm that it runs on. soft_start_s: time over which the torque fades in, s.
+        live: whether the arm's clock runs on during computations; if so, the policy runs in its own thread.
 
     Raises:
         BundleError: the bundle is damaged or made for another arm.
@@ -92,7 +92,7 @@ class Runtime:
         self.contract = contract = load(folder)
         fits(contract, arm)
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # no waiting for other threads
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # do not wait for other threads
         try:
             self._policy = onnxruntime.InferenceSession(Path(folder) / "policy.onnx", options)
         except Exception as error:  # of many kinds
@@ -112,15 +112,15 @@ class Runtime:
         self._goal: np.ndarray | None = None
 
     def reset(self, plan: np.ndarray | None = None) -> None:
-        """Begin a motion, from rest and zero torque.
+        """Prepare the next motion, which begins at rest with zero torque.
 
         Args:
-            plan: (rows, columns) as of `goal` of the contract, where the policy follows plans; the arm is at the
-                angles of its first row. The setpoints of computed torque take a tenth of a second.
+            plan: (rows, columns) as `goal` of the contract describes, if the policy follows plans. The arm has to be
+                at the joint angles of the first row. Setpoints for computed torque take a tenth of a second.
 
         Raises:
-            BundleError: the plan is missing, of another size or not finite, beyond the arm's limits or the region of
-                the training's plans, or the policy takes points.
+            BundleError: the plan is missing, has another shape, is not finite, or exceeds the arm's limits or the
+                region of the training's plans; or the policy takes points and a plan was passed.
         """
         if self._follower is not None:
             self._follower.take(plan)
@@ -134,7 +134,7 @@ class Runtime:
         self._motion += 1
 
     def stop(self, why: str = "asked for") -> None:
-        """Bring the arm to rest, from the next cycle on; `driver.stopping` keeps the first reason."""
+        """Bring the arm to rest, from the next cycle on. `driver.stopping` is the first reason that was given."""
         self.driver.stopping = self.driver.stopping or why
 
     @property
@@ -149,14 +149,14 @@ class Runtime:
 
         Args:
             q, dq: (n,) rad, rad/s, as measured. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            goal: (3,) m in the base frame, finite; None if the policy follows a plan, whose time is the number of
-                cycles since `reset`.
+            goal: (3,) m in the base frame, finite; None if the policy follows a plan. The time in the plan is the
+                number of cycles since `reset`.
 
-        A goal outside the region of the training's goals brings a moving arm to rest.
+        During a motion, a goal outside the region of the training's goals brings the arm to rest.
 
         Raises:
-            BundleError: an argument has another size, there is no plan, or the motion is over. In its first cycle
-                also: the goal is outside the training's region, or the arm is not at rest where motions begin.
+            BundleError: an argument has another shape, there is no plan, or the motion is over. In the first cycle
+                also: the goal is outside the training's region, or the arm is not at rest at the start posture.
         """
         if self.done:
             raise BundleError(f"the motion is over, {self.driver.stopping}: call reset before the next one")
@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Refuse a start or goal outside the training's region; during a motion, stop at such a goal."""
+        """Raise BundleError if start or goal is outside the training's region; during a motion, stop instead."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)
@@ -207,7 +207,7 @@ class Runtime:
     def _look(
         self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray | None
     ) -> dict[str, np.ndarray]:
-        """Return the observation sources of this control step; the model is at q already."""
+        """Return the sources of the observation in this control step; the model must be at q already."""
         ee, jacobian = self._model.hand()
         made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort, "tau_J_d": tau_J_d}
         if self._follower is not None:
@@ -221,23 +221,23 @@ class Runtime:
         return made | {"pull": jacobian.T @ made["error"]}
 
     def observe(self, made: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the observation (d,) float32 of the sources of `_look`."""
+        """Return the observation (d,) float32, computed from the sources that `_look` returns."""
         scaled = [made[of] if by is None else made[of] / by for of, by, _ in self._entries]
         parts = [np.tanh(x) if tanh else x for x, (_, _, tanh) in zip(scaled, self._entries, strict=True)]
         return np.concatenate(parts).astype(np.float32)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action (a,) in SI units at an observation (d,)."""
+        """Return the policy's action (a,) in SI units for an observation (d,)."""
         return self._policy.run(None, {"observation": observation[None]})[0][0].astype(float)
 
     def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the plan that goes through joint angles q, dq, ddq (rows, n) rad, rad/s, rad/s^2; between motions.
+        """Return the plan of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2. Call it between motions.
 
-        Rows are a control step apart. It begins and ends at rest: the first row and `steps` others are the path, and
-        as many as the preview come after.
+        Rows are one control step apart. The motion has to begin and end at rest: the first row and `steps` others are
+        the path, and as many rows follow as the policy previews.
 
         Raises:
-            BundleError: goals are points or plans on a surface, or the motion is of another size.
+            BundleError: goals are points or plans on a surface, or the motion has another shape.
         """
         if self.contract["goal"]["kind"] != "plan":
             kinds = {"point": "points", "surface": "plans on a surface"}[self.contract["goal"]["kind"]]

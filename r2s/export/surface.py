@@ -1,8 +1,8 @@
 """Plans on a surface for policies that press and wipe, in NumPy: a second implementation of tasks/surface_task.py.
 
 A plan has a row per control step: the point of the path on the nominal plane, the plane's normal, the depth of the
-target below the point, the force asked for, the path's velocity, the start posture, and the controller's setpoint. It
-needs nothing of r2s; `r2s export` puts it into the one file of a bundle.
+target below the point, the desired force, the path's velocity, the start posture, and the controller's setpoint. This
+module needs nothing of r2s: `r2s export` copies it into r2s_runtime.py of a bundle.
 """
 
 from typing import Any
@@ -15,19 +15,19 @@ from r2s.export.law import BundleError, Model
 from r2s.export.plan import NO_PLAN, finite_plan
 
 WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
-NEAR_M = 1e-3  # between the tip at the start posture and its place in the plan
-ROUNDING = 1e-6  # m, N, of a plan on the border of what the training had
+NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and its position in the plan
+ROUNDING = 1e-6  # m, N, by which a plan at the border of the training's ranges may be beyond it
 
 
 def columns_of(n: int, setpoints: int) -> dict[str, list[int]]:
-    """Return the first column and the one behind the last of each part of a plan."""
+    """Return {name: [first column, column after the last]} of each group of columns of a plan."""
     widths = {**WIDTHS, "q": n, "setpoint": setpoints}
     ends = np.cumsum([0, *widths.values()]).tolist()
     return {name: [begin, end] for name, begin, end in zip(widths, ends[:-1], ends[1:], strict=True)}
 
 
 def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError for a plan that the training did not have: off its plane, too hard, or a start elsewhere."""
+    """Raise BundleError if a plan is outside the training's plane, area or force, or its start does not fit it."""
     goal = contract["goal"]
     at, own, trained = goal["columns"], contract["law"]["joint"], goal["trained"]
     place, normal, depth, force, q = (plan[:, slice(*at[k])] for k in ("place", "normal", "depth", "force", "q"))
@@ -58,14 +58,14 @@ def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray)
         raise BundleError(f"the tip is {1e3 * apart:.1f} mm from where the plan begins")
 
 
-LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # rows of the law, and what null means
+LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # keys of the law, and what null means
 
 
 class SurfaceFollower:
-    """Position in a plan on a surface: what the policy observes of it, and the setpoints of the controller.
+    """Follow a plan on a surface: return what the policy observes of it and the setpoint of the controller.
 
     Args:
-        contract: with plans on a surface as goals. control, model: of the contract.
+        contract: its goals are plans on a surface. control, model: made from the contract; `control` is not used.
     """
 
     def __init__(self, contract: dict[str, Any], control: Control, model: Model):
@@ -77,23 +77,23 @@ class SurfaceFollower:
         self._plan = np.zeros((0, self._shape[1]))
 
     def take(self, plan: Any) -> None:
-        """Take the plan of the next motion; raise BundleError if it is missing, of another size, or not finite."""
+        """Store the next motion's plan; raise BundleError if it is missing, has another shape, or is not finite."""
         self._plan = finite_plan(plan, self._shape)
 
     @property
     def start(self) -> np.ndarray:
-        """(n,) rad, where the plan begins."""
+        """Joint angles (n,) rad at which the plan begins."""
         if not len(self._plan):
             raise BundleError(NO_PLAN)
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return the observation sources of a control step, and `setpoint`.
+        """Return the observation sources of a control step and the `setpoint`.
 
         After the last step the target stays at the end of the plan.
 
         Args:
-            step: from 0. seen: q, dq (n,) rad, rad/s, and tau_J_d (n,) Nm. The model is at q already.
+            step: control step, from 0. seen: q, dq (n,) rad, rad/s, and tau_J_d (n,) Nm; the model must be at q.
             limited: share of the last control period in which the safety filter changed the command.
         """
         now = self._plan[min(step, self._steps)]

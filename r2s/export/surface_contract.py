@@ -1,4 +1,4 @@
-"""Contract of a policy that presses or wipes: its plans on a surface, and the limit of its pushes."""
+"""Entries of the contract of a policy that presses or wipes: its plans on a surface, and its push limit."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from r2s.tasks.surface_task import REGULAR, START, SurfaceTask
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
-    """Return the plans (k, steps + 1, columns) of goals (k, ...) of the task."""
+    """Return the plans (k, steps + 1, columns) for k goals (k, ...) of the task."""
     control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
     none, starts, out = np.zeros((len(t), 3)), np.zeros((len(t), robot.n)), []
     for goal in goals:
@@ -30,7 +30,7 @@ def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndar
 
 
 def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return the format of a goal that is a plan on a surface, and what the training had of it."""
+    """Return the entry `goal` for plans on a surface: their format, and the ranges of the training's plans."""
     columns = columns_of(robot.n, task.control(robot).setpoint_size)
     point, normal = task.plane(robot)
     trained = {"point_m": point.tolist(), "normal": normal.tolist(), "spread_m": task.spread}
@@ -52,9 +52,9 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
 
 
 def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return the start of the first example, rad, and how far each joint may be from the start of a plan.
+    """Return the start posture of the first example plan, rad, and how far each joint may be from a plan's start.
 
-    The tip then is above the surface for sure.
+    The distance is so small that the tip is certainly above the surface.
     """
     q = task.goals(robot, np.random.default_rng(0), 1)[0, START : START + robot.n]
     lever = np.abs(task.plane(robot)[1] @ Tip(robot)(q)[1]).sum()
@@ -62,7 +62,7 @@ def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
 
 
 def pushes(robot: Robot, limit: law.PushLimit | None) -> dict[str, Any] | None:
-    """Return the numbers of a limit of pushes and of what a stop does with a force; None: without limit."""
+    """Return the numbers of the push limit and of a stop in contact, or None without a limit."""
     if limit is None:
         return None
     columns = limit.columns(robot)
@@ -74,7 +74,7 @@ def pushes(robot: Robot, limit: law.PushLimit | None) -> dict[str, Any] | None:
         out[name] = columns[at : at + 3].tolist()
     out |= {"stop": limit.stop, "collision_torque_Nm": None, "collision_force_N": None}
     assert limit.stop in STOPS
-    if robot.n == 7:  # of a Franka arm, for libfranka's setCollisionBehavior; null: its cautious ones
+    if robot.n == 7:  # a Franka arm; thresholds for libfranka's setCollisionBehavior; null: cautious ones
         try:
             own = thresholds_of(robot, limit)
         except UserError as error:

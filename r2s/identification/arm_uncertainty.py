@@ -1,4 +1,4 @@
-"""An identified arm, and its uncertainty as changes of a torque residual."""
+"""An identified arm, and the changes of a torque residual that its uncertainty causes."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.robot import Robot
 
 GAIN = 0.05  # standard deviation of a sensor's gain, the prior of conf/identify
-MASSES = 0.1  # standard deviation of an error that all masses of a file share
+MASSES = 0.1  # standard deviation of a relative error that all masses in a robot's file share
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An identified arm: its parameters' space and values (P,), and draws of their posterior (S, P) or None."""
+    """An identified arm: its parameter space, values x (P,), and `samples` (S, P) of their posterior or None."""
 
     space: ParameterSpace
     x: np.ndarray
@@ -30,27 +30,27 @@ class Arm:
 
 
 def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,), the factor of the arm's torque per joint that is more likely its masses' than its gains', and its
-    standard deviation.
+    """Return a correction factor (n,) for a payload's torque in each joint, and its standard deviation (n,).
 
-    The torque of an unloaded arm shows a gain times the masses. An identification that estimates gains with the
-    masses of the file gives the error of these to the gains, and what the arm carries would be off by as much. The
-    gains of joints are independent, an error of all masses is one: its likely value is that for which both, from
-    N(0, GAIN) and N(0, MASSES), are least in squares.
+    The factor corrects for errors in the masses of the robot's file that were attributed to sensor gains. The torque
+    of an unloaded arm shows only the product of gain and masses. If gains are estimated with the file's masses, they
+    take up the masses' error, and the torque of a payload would be wrong by as much. Gains of joints are independent,
+    but all masses share one error. Its likely value minimizes the sum of squares of gains and error, with standard
+    deviations GAIN and MASSES.
     """
     space, n = arm.space, arm.robot.n
     if "gain" not in space.blocks or LINK[0] in space.blocks:
         return np.ones(n), np.zeros(n)
     at = space.where("gain")
     gain, sd = arm.x[at], np.zeros(n) if arm.samples is None else arm.samples[:, at].std(0)
-    seen = sd < 0.5 * GAIN  # the gain of another joint is its prior's
+    seen = sd < 0.5 * GAIN  # the other joints' gains are those of their prior
     information = seen.sum() / GAIN**2 + 1.0 / MASSES**2
     shift = -gain[seen].sum() / GAIN**2 / information
     return np.where(seen, 1.0 + shift / (1.0 + gain), 1.0), np.where(seen, information**-0.5 / (1.0 + gain), 0.0)
 
 
 def sliding_sign(torque: TorqueResidual) -> np.ndarray:
-    """Return (F, n): the sign of friction at the instants of a residual's motion, smooth where a joint may rest."""
+    """Return the sign of friction (F, n) at the instants of a residual's motion; it is smooth if joints may rest."""
     dq = torque.motion.friction_dq
     return np.sign(dq) if isinstance(torque.motion, SlidingMotion) else np.tanh(dq / WIDTH_DQ)
 
@@ -58,12 +58,12 @@ def sliding_sign(torque: TorqueResidual) -> np.ndarray:
 def arm_directions(
     torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
 ) -> np.ndarray:
-    """Return (T, n, r) Nm: changes of the residual along independent directions of an arm's uncertainty.
+    """Return (T, n, r) Nm: changes of the residual by one standard deviation along r independent directions.
 
     Args:
         torque: the residual. x: (P,) parameters of the arm. samples: (S, P), draws of their posterior, or None.
-        friction_drift: share of its friction, and offset_drift: (n,) Nm, standard deviations of what has changed in
-            each joint since the calibration.
+        friction_drift: share of each joint's friction; offset_drift: (n,) Nm. Both are standard deviations of the
+            change since the calibration.
     """
     d, n = torque.space.dynamics(x), torque.space.n
     friction = torque.motion.filtered(d.friction(torque.motion.friction_dq, sliding_sign(torque)))

@@ -1,18 +1,18 @@
-"""Blocks of a recording whose errors count as independent: the clusters of a posterior's covariance.
+"""Blocks of a recording whose errors count as independent; they are the clusters of a posterior's covariance.
 
-A misfit that is not noise lasts, torque ripple at low speed for seconds, and the same motion repeats it. So a block
-lasts several correlation times of the residual, and repetitions of a motion are one block where residuals repeat.
+Model error lasts longer than noise: torque ripple at low speed lasts seconds, and recurs when motion is repeated. So
+a block lasts several correlation times of the residual. If residuals recur, repetitions of a motion are one block.
 """
 
 import numpy as np
 
 BLOCK_S = 0.5  # s, shortest block
-BLOCKS = 20, 400  # fewest and most in a recording: with fewer their scatter is unknown, and more cost time
-LENGTH = 5.0  # correlation times in a block: its sum then has nine tenths of the variance of a long one
-WINDOW = 5.0  # correlation times, after which the autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
-LONGEST_S = 60.0  # s, lags of the autocorrelation
-REPEATED = 0.3  # growth of the variance by repetition, from which repetitions are one block
-SAME = 0.1  # distance of two repetitions' mean angle, in standard deviations of the motion
+BLOCKS = 20, 400  # fewest and most blocks in a recording: the scatter of fewer is uncertain, and more cost time
+LENGTH = 5.0  # correlation times in a block: its sum has nine tenths of the variance per length of a long block
+WINDOW = 5.0  # correlation times; beyond this lag, autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
+LONGEST_S = 60.0  # s, longest lag of the autocorrelation
+REPEATED = 0.3  # relative growth of the variance by repetition, above which repetitions are one block
+SAME = 0.1  # distance of a repetition's mean angle from the usual one, in standard deviations of the motion
 
 
 def blocks_of(
@@ -22,13 +22,13 @@ def blocks_of(
     residual: np.ndarray | None = None,
     shortest_s: float = BLOCK_S,
 ) -> np.ndarray:
-    """Return the block (T,) of each moment, 0 to B - 1.
+    """Return the block (T,) of each moment, numbered from 0 to B - 1.
 
     Args:
         t: (T,) s, rising within a trajectory. q: (T, n) rad. period: s, of the motion; None: it does not repeat.
-        residual: (T, n) of a fit; without one, blocks last `shortest_s` and repetitions are blocks of their own.
+        residual: (T, n) of a fit; None: blocks last `shortest_s`, and each repetition has its own blocks.
     """
-    run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # the clock restarts
+    run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of times that the clock has restarted
     steps = np.diff(t)[np.diff(run) == 0]
     step = float(np.median(steps)) if len(steps) else shortest_s
     seconds, visit, at = step * len(t), run, run
@@ -46,7 +46,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return blocks (T,) of phase in all repetitions `visit` (T,); other motion q (T, n) has blocks of its own."""
+    """Return blocks (T,) of phase that all repetitions `visit` (T,) share, except where their q (T, n) differs."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -56,9 +56,9 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
-    """Return the longest correlation time of the residual (T, n) at t (T,), in rows: the integral of its square.
+    """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,).
 
-    The square bounds the correlation of a score, residual times slope, also where the residual oscillates.
+    It is the integral of squared autocorrelation, a bound for scores (residual times slope) even if they oscillate.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))
@@ -74,7 +74,7 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether residuals (T, n) of one phase, `at` (T,), are alike in several repetitions `visit` (T,)."""
+    """Return whether residuals (T, n) at equal phase, `at` (T,), are similar in the repetitions `visit` (T,)."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]
@@ -84,7 +84,7 @@ def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
     for x in (residual - residual.mean(0)).T:
         mean = np.bincount(cell, x) / count
         square = np.bincount(phase, mean**2)[more > 1]
-        between = np.bincount(phase, mean)[more > 1] ** 2 - square  # sum over pairs, twice
+        between = np.bincount(phase, mean)[more > 1] ** 2 - square  # twice the sum over pairs of repetitions
         growth = between.sum() / max(square.sum(), 1e-300)  # (often - 1) times the correlation of two repetitions
         if growth > max(REPEATED, 2.0 / np.sqrt(len(square) / often)):
             return True
@@ -92,7 +92,7 @@ def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
 
 
 def _labels(*keys: np.ndarray) -> np.ndarray:
-    """Return (T,) the index of each moment's combination of keys (T,)."""
+    """Return (T,) the number of each moment's combination of keys (T,)."""
     out = np.zeros(len(keys[0]), dtype=int)
     for key in keys:
         index = np.unique(key, return_inverse=True)[1]

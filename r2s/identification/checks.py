@@ -1,4 +1,4 @@
-"""Checks of a recording before a fit: joints, limits, enough motion, damaged rows, units."""
+"""Checks of a recording before a fit: number of joints, limits, enough motion, damaged rows, units."""
 
 import numpy as np
 
@@ -9,18 +9,18 @@ from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-SPIKE = 5.0  # times the largest speed and torque: above the noise of any sensor
-NONSENSE = 1e9  # times those: no unit is so far off, and larger squares would overflow
-JUMP = 0.05  # rad, that an encoder may jump
+SPIKE = 5.0  # times the limits of speed and torque: more than any sensor noise
+NONSENSE = 1e9  # times the same limits: no wrong unit reaches this factor, and larger squares would overflow
+JUMP = 0.05  # rad, an allowed jump of an encoder
 MARGIN = 0.05  # rad beyond the position limits: logs of arms at their limits do occur
-LEAST_S = 1.0  # s of motion
+LEAST_S = 1.0  # s, least duration of a recording
 
 
 def check_recording(robot: Robot, recording: Recording) -> Judged | None:
-    """Return what `check_units` measured.
+    """Check a user's recording, and return what `check_units` measured.
 
     Raises:
-        UserError: a user's recording does not fit the arm (`check_motion`), is damaged or has wrong units.
+        UserError: the recording does not fit the arm (`check_motion`), is damaged or has wrong units.
     """
     check_motion(robot, recording)
     _check_spikes(robot, recording, NONSENSE)
@@ -30,7 +30,7 @@ def check_recording(robot: Robot, recording: Recording) -> Judged | None:
 
 
 def check_rate(cutoff_hz: float, recording: Recording) -> None:
-    """Raise UserError unless a cutoff is below the recording's Nyquist rate."""
+    """Raise UserError unless a cutoff is below the recording's Nyquist frequency."""
     if cutoff_hz >= 0.499 * recording.rate_hz:  # the clock of a log jitters
         raise UserError(
             f"identify.cutoff_hz: expected less than {0.5 * recording.rate_hz:.4g} Hz, half the rate of "
@@ -50,7 +50,7 @@ def check_motion(robot: Robot, recording: Recording) -> None:
 
 
 def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
-    """Raise UserError if a row exceeds `most` times the limits of the arm, as in a damaged file."""
+    """Raise UserError if a row exceeds the arm's limits by more than the factor `most`, as in a damaged file."""
     r = recording
     steps = np.diff(r.t)
     steps[np.diff(r.trajectory) != 0] = np.inf

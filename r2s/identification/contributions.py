@@ -1,8 +1,8 @@
 """What each of several recordings adds to an identification, and whether one contradicts the others.
 
-For each recording there are two more fits: one without it, and one to it alone. Both take a few steps on torque from
-the fit to all. The residual of a recording's own fit weights its rows, because a fit to contradicting recordings
-leaves more than noise.
+For each recording there are two further fits: one without it, and one to it alone. Both take a few steps of least
+squares on torque, starting at the fit to all recordings. A recording's rows are weighted by the residual of the fit
+to it alone, because the residual of a fit to contradicting recordings is more than noise.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,26 +19,26 @@ from r2s.identification.search.levenberg_marquardt import minimize, normal_equat
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CONTRADICTS = 2.0  # the sum of squares of all recordings, over that if one of them has parameters of its own
-WORSE = 4.0  # RMSE of a recording alone over the others', from which the model does not fit it
-CARRIED = 0.5  # share of a contradiction's square that a body on the last link must explain to be named
-LEAST_MASS = 0.01  # of the arm's, of such a body
+CONTRADICTS = 2.0  # ratio of two sums of squares: one fit to all recordings, over one recording fitted apart
+WORSE = 4.0  # ratio of a recording's RMSE, fitted alone, to the others'; above it the model does not fit
+CARRIED = 0.5  # share of the left-out error's square that a body on the last link must explain to be reported
+LEAST_MASS = 0.01  # of the arm's mass: least mass of such a body
 ROUNDS = 3  # reweighted fits of each recording alone
-STEPS, FTOL = 10, 1e-3  # Jacobians of a fit, and its relative gain at the end
-USED_S, RATE_HZ = 120.0, 50.0  # s of a longer recording, and rows per second, that are compared
+STEPS, FTOL = 10, 1e-3  # largest number of Jacobians in a fit, and relative gain of a step at which it ends
+USED_S, RATE_HZ = 120.0, 50.0  # s of a longer recording that are compared, and rows per second
 
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """One recording beside a fit.
+    """Contribution of one recording to a fit; errors are torque RMSE on this recording.
 
     Attributes:
-        label, torque, seconds, use: of the recording; training or validation.
-        rmse: (n,) Nm of the fit to all recordings.
-        left_out: (n,) Nm of a fit to the others. narrower: (P,) width of each 95 % interval without this recording,
-            over that with it. None: of validation.
-        alone: (n,) Nm of a fit to this recording alone. contradiction: see CONTRADICTS; 1 for the only recording.
-        body_kg: mass that it carries more on the last link than the others, if that explains it; nan: it does not.
+        label, torque, seconds: of the recording. use: "training" or "validation".
+        rmse: (n,) Nm, error of the fit to all recordings.
+        left_out: (n,) Nm, error of a fit to the others. narrower: (P,) ratio of 95 % interval widths: without this
+            recording over with it. Both are None for validation.
+        alone: (n,) Nm, error of a fit to this recording alone. contradiction: see CONTRADICTS; 1 for a single one.
+        body_kg: additional mass on the last link that explains its contradiction; nan if none does.
     """
 
     label: str
@@ -56,10 +56,10 @@ class Contribution:
 def contributions(
     found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
 ) -> list[Contribution]:
-    """Return what each of the recordings {label: recording}, all of one kind of torque, adds to the fit `found`."""
+    """Return the contribution of each {label: recording}, all with one kind of torque, to the fit `found`."""
     space, u = found.space, found.space.to_unit(found.x)
     r0, slope = found.prior_rows
-    flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # a flat prior has no row
+    flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # a flat prior has no row of its own
     prior = np.concatenate([r0, np.zeros(len(u))]), np.concatenate([slope, flat])
     parts = [_torque(space, spread(r, USED_S), cutoff_hz) for r in recordings.values()]
     parts = [p.reweighted(found.x, fitted=True) for p in parts]
@@ -67,7 +67,7 @@ def contributions(
     for _ in range(ROUNDS):
         alone = [_fitted([p], u, prior) for p in parts]
         parts = [p.reweighted(space.from_unit(v), fitted=True) for p, v in zip(parts, alone, strict=True)]
-    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # the rest has as much information
+    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # unused parts have as much information
     information = [k * normal_equations(p.linearize(u))[1] for k, p in zip(more, parts, strict=True)]
     total = sum(information) + prior[1].T @ prior[1]
     width, square = np.sqrt(np.diag(np.linalg.inv(total))), _square(parts, _fitted(parts, u, prior))
@@ -91,7 +91,7 @@ def contributions(
 def validated(
     found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
 ) -> list[Contribution]:
-    """Return the errors of recordings {label: recording} that the fit did not use."""
+    """Return the contributions of validation recordings {label: recording}, which the fit did not use."""
     out = []
     for label, r in recordings.items():
         data = _torque(found.space, r, cutoff_hz)
@@ -105,12 +105,12 @@ def _torque(space: ParameterSpace, recording: Recording, cutoff_hz: float) -> To
 
 
 def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
-    """Return the sum of squares at u (P,)."""
+    """Return the sum of squares of all parts at u (P,)."""
     return sum(float((p(p.space.from_unit(u)[None]) ** 2).sum()) for p in parts)
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return (P,), the fit to some recordings from u (P,), where `prior` are rows (B,) and their Jacobian (B, P)."""
+    """Return the fit (P,) to the recordings `parts`, from u (P,); prior: rows (B,) at u and their Jacobian (B, P)."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:
@@ -126,13 +126,13 @@ def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndar
 
 
 def _rmse(error: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return (n,) Nm over the rows that count; nan for a joint without one."""
+    """Return the RMSE (n,) Nm over the rows that count, `seen`; nan for a joint without such rows."""
     square = np.where(seen, error**2, 0.0).sum(0)
     return np.sqrt(square / np.where(seen.any(0), seen.sum(0), np.nan))
 
 
 def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
-    """Return the mass, kg, on the last link that explains an error (T, n) Nm, or nan."""
+    """Return the additional mass on the last link, kg, that explains an error (T, n) Nm, or nan if none does."""
     some = data.seen.ravel()
     y = data.rigid_body_of_last_link()
     rows, tau = y.reshape(-1, y.shape[-1])[some], -error.ravel()[some]
@@ -142,7 +142,7 @@ def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
 
 
 def contradictions(parts: Sequence[Contribution]) -> list[str]:
-    """Return a line about the recording that contradicts the others most, or that the model fits far worse."""
+    """Return a message about a recording that contradicts the others or that the model fits far worse, or []."""
     trained = [p for p in parts if p.left_out is not None and p.alone is not None]
     if len(trained) < 2:
         return []

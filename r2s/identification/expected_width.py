@@ -1,8 +1,8 @@
-"""The 95 % widths that an identification of a recording will have, before it runs.
+"""Predicted widths of the 95 % intervals that an identification of a recording will have, before it runs.
 
-A few steps of least squares on torque with all terms give the noise and the point at which the model is linearized.
-The identification's own posterior at this point gives the widths. The slow parts of an identification are left out:
-families, selection of terms, convergence, replays, breakaway.
+A few least-squares steps on torque with all terms estimate the noise and a point at which to linearize the model. The
+widths come from the same posterior as in an identification, at this point. The slow parts of an identification are
+left out: comparison of families, selection of terms, convergence, replays, breakaway.
 """
 
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-STEPS, FTOL = 6, 1e-2  # Jacobians between two reweightings of the fit, and its relative gain at the end
+STEPS, FTOL = 6, 1e-2  # most Jacobians between two reweightings, and relative gain of a step at which a fit ends
 USED_S = 120.0  # s of a longer recording that are used
 
 
 @dataclass(frozen=True)
 class ExpectedWidths:
-    """Widths to expect.
+    """Expected widths of the 95 % intervals.
 
     Attributes:
-        space: the parameters. width: (P,) SI units, of the 95 % interval. share: (P,) of the prior's that is left.
-        identifiable: (P,) whether the data determine the value, by the rule of the identification's result.
-        late: s, by which measured tau is late against the motion, or the motion against commands, and its standard
-            deviation.
+        space: the parameters. width: (P,) SI units. share: (P,) ratio of posterior to prior standard deviation.
+        identifiable: (P,) whether the data will determine the value, by the same rule as in `conclude`.
+        late: s, lateness and its standard deviation: of measured or motor torque behind the motion, or of the motion
+            behind commands.
     """
 
     space: ParameterSpace
@@ -46,9 +46,9 @@ class ExpectedWidths:
 
 
 def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> Problem:
-    """Return the torque problem of an identification of these settings, with all of their terms.
+    """Return the torque problem that an identification with these settings solves, with all of their terms.
 
-    family=auto stands for the family of the nominal arm.
+    For family=auto the family of the nominal arm is used.
     """
     if settings.family != "auto":
         nominal = with_family(nominal, settings.family)
@@ -58,7 +58,7 @@ def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settin
 
 
 def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> ExpectedWidths:
-    """Return the widths to expect of a recording.
+    """Return the widths to expect from an identification of this recording.
 
     Raises:
         UserError: no trajectory is long enough, or a setting does not fit the arm.
@@ -71,7 +71,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
     sure = posterior(problem, u, settings.seed)
     found = conclude(problem, space, sure._asdict(), history=pd.DataFrame(), families={}).found
     share = np.minimum(sure.steps.std(0) / problem.prior_width, 1.0)
-    # the rows that are left out have as much information as those that are used
+    # rows that are left out are taken to have as much information as those that are used
     more = recording.duration / used.duration
     less = 1.0 / np.sqrt(share**2 + more * (1.0 - share**2))
     seen = found.identifiable | ((more > 1.0) & (Z_95 * less * share < 1.0 / SHARPER))
@@ -84,7 +84,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
 
 
 def _lateness(problem: Problem, u: np.ndarray) -> tuple[float, float]:
-    """Return by how much tau is late, s, beyond what the parameters explain, and its standard deviation."""
+    """Return the lateness of tau, s, that the parameters do not explain, and its standard deviation."""
     data = problem.torque_data
     r, j = data(problem.space.from_unit(u[None]))[0], data.jacobian(u)
     change = (data.motion.command(0.0, 0.0) - data.motion.command(SIM_DT, 0.0)) / SIM_DT

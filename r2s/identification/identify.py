@@ -1,7 +1,7 @@
 """Real2Sim: estimate the parameters with which the simulated arm reproduces a recording.
 
-`identify` runs STEPS in order; each is a function from one immutable `State` to the next. The paper's algorithm is
-search=ga on the residual of eq. (8).
+`identify` runs STEPS in order. Each step maps an immutable `State` to the next one. The paper's algorithm corresponds
+to search=ga on the replay residual of its eq. (8).
 """
 
 import json
@@ -46,29 +46,29 @@ from r2s.recordings.parts import give_back, spread
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-STANDSTILL = 0.02  # rad/s, below which friction of a commanded arm is not a function of velocity
-CLEAR = 1.5  # times dq_min, below which a replayed joint may stick
+STANDSTILL = 0.02  # rad/s; for commanded torque, friction below this speed is not a function of velocity
+CLEAR = 1.5  # times dq_min: below this speed a replayed joint may stick
 MAX_BATCH = 64  # candidates replayed at once
-SELECTED_S = 240.0  # s of a longer recording in which terms are selected
-REWEIGHTS = 2  # further fits of a local search, each with weights from the residual before
+SELECTED_S = 240.0  # s of a longer recording that the selection of family and terms uses
+REWEIGHTS = 2  # further fits of a local search, each with weights from the residual of the previous fit
 ALIKE = 0.2  # relative error of the number of independent rows
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
 
 class History:
-    """Progress rows, stored with the arrays of each step so that a resumed run repeats them."""
+    """Rows of progress. They are stored with the arrays of each step, so that a resumed run has them again."""
 
     def __init__(self, report: Report, memo: Memo):
         self.rows: list[dict] = []
         self._report, self._memo, self._began = report, memo, time.perf_counter()
 
     def add(self, row: dict) -> None:
-        """Keep and report a row."""
+        """Append a row, with the seconds since the start, and report it."""
         self.rows.append(row | {"seconds": time.perf_counter() - self._began})
         self._report(row)
 
     def step(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays of `make`, or the stored ones of an interrupted run."""
+        """Return the arrays that `make` computes, or those that an interrupted run has stored under `name`."""
         before = len(self.rows)
         done = self._memo(name, lambda: make() | {"history": json.dumps(self.rows[before:])})
         if len(self.rows) == before:
@@ -82,13 +82,13 @@ class State:
 
     Attributes:
         robot to ramps: the arguments of `identify`; `select_family` changes the friction family of `nominal`.
-        prior: standard deviations in SI units. terms: estimated beside friction.
-        families: error of held-out torque by family; empty if the family was given.
-        space: parameters and nominal values, with breakaway and stiction once they are estimated.
-        problem, u: least-squares problem and its solution (P,) on the unit cube.
-        edges, static_friction: breakaway commands from ramps, and friction at the onset of sliding (Stribeck
-            families).
-        refused: whether r2s discarded replays. dynamics: the arm with its breakaway torques.
+        prior: {parameter: standard deviation, SI units}. terms: model terms that are estimated besides friction.
+        families: {family: error of held-out torque}; empty if the user chose the family.
+        space: parameters and nominal values; they include breakaway and stiction once these are estimated.
+        problem, u: the least-squares problem and its solution (P,) on the unit cube.
+        edges: breakaway commands from ramps. static_friction: residual of friction at the onset of sliding (only
+            Stribeck families).
+        refused: whether r2s discarded the replays. dynamics: the fitted arm with its breakaway torques.
     """
 
     robot: Robot
@@ -111,26 +111,26 @@ class State:
 
     @property
     def commanded(self) -> bool:
-        """Whether the torque is a command, which can be replayed and shows delay and breakaway."""
+        """Whether the recorded torque is a command. Only commands can be replayed and show delay and breakaway."""
         return self.recording.torque == "commanded"
 
     @property
     def slowest(self) -> float:
-        """rad/s, velocity above which torque rows count."""
+        """rad/s, the speed above which a joint's torque rows count."""
         return STANDSTILL if self.commanded else 0.0
 
     @property
     def cross_validation(self) -> CrossValidation:
-        """Data and settings of the selection steps."""
+        """Data and settings for the steps that select family and terms."""
         s, data = self.settings, (self.robot, self.nominal, spread(self.recording, SELECTED_S))
         return CrossValidation(*data, s.bounds, self.prior, s.folds, s.cutoff_hz, self.history.add, s.stated)
 
     def fitted(self) -> Dynamics:
-        """Return the dynamics of u."""
+        """Return the dynamics at the solution u."""
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Return the motion after breakaway; None without a Stribeck rise, or with bristles."""
+        """Return an arm's sliding after breakaway; None if its friction has no Stribeck rise, or has bristles."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)
@@ -150,13 +150,13 @@ def identify(
     """Estimate the parameters of an arm, with intervals.
 
     Args:
-        robot, nominal: the arm; start of the searches, and values of all other parameters.
-        recording: training motion; its torque level decides the residual.
-        searches: at least one; each starts where the one before ended.
+        robot: the arm. nominal: start of the searches, and values of the parameters that are not estimated.
+        recording: the training motion; the kind of its torque decides which residuals are possible.
+        searches: at least one; each starts at the solution of the previous one.
         settings: parameters, bounds, prior, and how residuals are computed.
-        ramps: of the breakaway protocol; without them breakaway is scanned for in the recording.
+        ramps: of the breakaway protocol; without them the breakaway torques are found by a scan on the recording.
         report: called with a row of progress after every step or generation.
-        memo: called with the name of a step and a function that computes its arrays; it may return stored ones.
+        memo: called with the name of a step and a function that computes its arrays; it may return stored arrays.
 
     Raises:
         UserError: the recording does not fit the arm or hardly moves.
@@ -174,7 +174,7 @@ def identify(
 
 
 def select_family(s: State) -> State:
-    """Set the friction family: the given one, or with family=auto the one with the least error of held-out torque."""
+    """Set the friction family: the user's, or with family=auto the one that cross-validation chooses."""
     family, families = s.settings.family, {}
     if family == "auto":
         found = s.history.step("family", lambda: compare_families(s.cross_validation, s.terms, s.slowest))
@@ -185,7 +185,7 @@ def select_family(s: State) -> State:
 
 
 def settle_lateness(s: State) -> State:
-    """Choose which lateness of link-side torque and of dq is corrected; a delay that is not stays at 0."""
+    """Choose whether to correct the lateness of link-side torque and of dq; without correction a delay stays 0."""
     nominal = replace(s.nominal, late_alike=False)
     if s.recording.torque != "measured" or DELAY in s.settings.stated:
         return replace(s, nominal=nominal)
@@ -220,13 +220,13 @@ def prune_terms(s: State) -> State:
 def formulate(s: State) -> State:
     """Set up the parameter space, the residuals and the problem."""
     how, memory = s.settings, s.nominal.family.has_memory
-    settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # at 0, see `settle_lateness`
+    settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # stays at 0, see `settle_lateness`
     space = search_space(s.robot, s.nominal, how.bounds, [*s.terms, *settled], s.recording, how.stated)
     s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # repetitions are one block
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
     edges = estimate_breakaway(s.ramps) if s.commanded and s.ramps is not None else None
-    # replays start from unknown bristle deflections, which would spoil a good torque fit of a family with memory
+    # for a family with memory, replays start from unknown bristle deflections and would spoil a good torque fit
     if s.commanded and not all(map(fits_torque, s.searches)) and not (memory and fits_torque(s.searches[0])):
         slowest = 0.0 if memory else CLEAR * s.nominal.dq_min  # bristles have no dead zone
         released = None
@@ -248,7 +248,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the prior of a space's values: stated by the user, or else from an earlier identification."""
+    """Return the prior knowledge of a space's values: as the user states, else from an earlier identification."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated
@@ -257,7 +257,7 @@ def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, Array
 
 
 def fit(s: State) -> State:
-    """Run the searches in turn; discard replays that disagree with the torque of moving joints."""
+    """Run the searches one after the other; discard a replay fit that contradicts the torque of moving joints."""
     problem, u = s.problem, s.u
     for k, search in enumerate(s.searches):
         v, problem = _run(s, f"search {k + 1}", search, problem, u)
@@ -267,13 +267,13 @@ def fit(s: State) -> State:
         if k and fits_torque(s.searches[0]) and problem.uses_replays and worse_on_torque(problem, u, v):
             return replace(s, problem=replace(problem, data=problem.torque_data), u=u, refused=True)
         u = v
-        # the residual of a first search contains model error, so weights come from the last one
+        # only the last search, or one on torque, counts as fitted: an earlier residual contains model error
         problem = problem.reweighted(u, fitted=k == len(s.searches) - 1 or fits_torque(search))
     return replace(s, problem=problem, u=u)
 
 
 def reread_ramps(s: State) -> State:
-    """Estimate breakaway again with the fitted sliding motion, delay and lag."""
+    """Estimate the breakaway commands again, now with the fitted delay, lag and motion after release."""
     arm = s.fitted()
     if s.ramps is None or (slide := s.slide(arm)) is None:
         return s
@@ -284,7 +284,7 @@ def reread_ramps(s: State) -> State:
 
 
 def fit_presliding(s: State) -> State:
-    """Estimate the presliding distance from replays, for a family with memory that was fitted to torque."""
+    """Estimate the presliding distance from replays if a friction family with memory was fitted to torque."""
     if s.problem.uses_replays or not s.commanded or PRESLIDING not in s.space.blocks:
         return s
     how, torque_data = s.settings, s.problem.torque_data
@@ -298,7 +298,7 @@ def fit_presliding(s: State) -> State:
 
 
 def reweight(s: State) -> State:
-    """Repeat a local search with weights from its residual; the last one decides whether a lag is needed."""
+    """Repeat a local search with weights from its own residual; the last repetition decides if a lag is needed."""
     search = s.searches[-1]
     if not search.local:
         return s
@@ -318,18 +318,18 @@ def reweight(s: State) -> State:
 
 
 def fit_breakaway(s: State) -> State:
-    """Set the breakaway torques from ramps, by the fitted arm."""
+    """Set the breakaway torques from the ramps, with the offset and other torques of the fitted arm."""
     arm, space = s.fitted(), s.space
     if not s.commanded or s.ramps is None:
         return replace(s, dynamics=arm)
     edges = estimate_breakaway(s.ramps, delay=float(arm.delay), lag=float(arm.lag), slide=s.slide(arm))
-    # without a release the torque is at least the largest command that the joint held against
+    # without a release, the breakaway torque is at least the largest command at which the joint stayed at rest
     beyond = np.abs(edges.held + arm.offset[:, None]) > np.abs(arm.breakaway)
     command = np.where(np.isnan(edges.command) & beyond & (edges.held != 0), edges.held, edges.command)
     arm = replace(space, breakaway_command=command).dynamics(space.from_unit(s.u))
     breakaway = StaticFriction(s.robot, s.ramps, edges).breakaway(arm)
-    # a direction without a usable ramp, such as of a joint that slid before its command rose: stiction is about alike
-    # in both directions
+    # a direction may lack a usable ramp, for example if the joint slid before its command rose. Stiction is similar
+    # in both directions, so the other direction's value is used
     blind = (edges.count == 0) & (edges.held == 0) & (edges.count[:, ::-1] > 0)
     breakaway = np.where(blind, -breakaway[:, ::-1], breakaway)
     command = np.where((edges.count > 0) | blind, breakaway - arm.offset[:, None], command)
@@ -338,7 +338,7 @@ def fit_breakaway(s: State) -> State:
 
 
 def fit_stiction(s: State) -> State:
-    """Choose the stiction model, and without ramps scan for the breakaway torques."""
+    """Choose the stiction model; without ramps, also scan for the breakaway torques."""
     how, ramped = s.settings, s.ramps is not None
     if not s.commanded or s.nominal.family.has_memory or not (ramped or how.breakaway):
         return s
@@ -359,16 +359,16 @@ STEPS: tuple[Callable[[State], State], ...] = (
 def _run(
     s: State, name: str, search: Search, problem: Problem, u: np.ndarray, report: Report | None = None
 ) -> tuple[np.ndarray, Problem]:
-    """Return the solution of a search, and the problem with its weights if the search reweights torque."""
+    """Return the solution of a search, and the problem; a search on torque also updates the torque weights."""
     v = np.asarray(s.history.step(name, lambda: {"u": search(problem, u, report or s.history.add)})["u"])
     return v, problem.torque_reweighted(v) if fits_torque(search) else problem
 
 
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
-    """Return whether v (P,) explains torque clearly worse than u (P,), the fit to torque.
+    """Return whether v (P,) explains the torque clearly worse than u (P,), which was fitted to it.
 
-    Two estimates of the same parameters differ by their errors, which raises the sum of squares by about P. The sum
-    itself has the relative error ALIKE, because the number of independent rows is uncertain.
+    Two correct estimates differ by their estimation errors, and this alone raises the sum of squares by about P. The
+    sum itself has the relative error ALIKE, because the number of independent rows is uncertain.
     """
     fitted = problem.on_torque.cost(u)
     rise = problem.on_torque.cost(v) - fitted
@@ -376,11 +376,11 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return u (P,) of a local search without the lag `at`, or with it if the data clearly need it.
+    """Return the solution u (P,) of a local search without the lag, index `at`, or with it if the data need it.
 
-    With slow torques a short lag acts like a delay. The data need it if it lowers the cost by more than the logarithm
-    of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The block that favours it most does not count,
-    because rows of a block are correlated.
+    If torque changes slowly, a short lag acts like a delay. The data need a lag that lowers the cost by more than the
+    logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The block that favours the lag most
+    does not count, because the rows of one block are correlated.
     """
     having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
     u = start.copy()
@@ -388,7 +388,7 @@ def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray,
     u = search(fixed, u, report)
     if fits_torque(search):
         fixed = fixed.torque_reweighted(u)
-    u[at] = problem.start[at]  # exactly: `reweight` recognizes a fixed value by that
+    u[at] = problem.start[at]  # exactly the start value: `reweight` recognizes a fixed lag by this equality
     without, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
     most = np.bincount(problem.clusters, (without - having)[:rows]).max()
     needed = without.sum() - having.sum() - most > np.log(rows)

@@ -1,9 +1,9 @@
-"""What is known of an arm's parameters before its data: a normal distribution of named values.
+"""Prior knowledge of an arm's parameters: a normal distribution of named values.
 
 It comes from an earlier identification, from recordings of another kind of torque, or from the user (stated.py).
-Between two dates friction and offsets drift: x_now = x_then + w with w ~ N(0, drift^2), so the drift widens the
-earlier posterior before it becomes a prior (the prediction of a Kalman filter; Kalman 1960). The reported drift is w
-given the data of both dates.
+Between two dates, friction and offsets drift: x_now = x_then + w with w ~ N(0, drift^2). So the earlier posterior is
+widened by the drift before it becomes a prior (the prediction step of a Kalman filter; Kalman 1960). The reported
+drift is the estimate of w from the data of both dates.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -16,19 +16,19 @@ from r2s.identification.link_inertia import PAYLOAD
 from r2s.identification.parameters import OF_LINKS, ParameterSpace, logarithmic, units
 from r2s.identification.posterior import Z_95
 
-BODY = (*OF_LINKS, *PAYLOAD)  # what every kind of torque shares; friction, offsets and gains are of each kind
-DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # beside the friction law
-FLOOR = 1e-4  # of the usual deviation among arms: least deviation of a value, if draws are clipped at a bound
-FAR = 5.0  # standard deviations of the largest of some thirty directions, beyond which knowledge and data disagree
+BODY = (*OF_LINKS, *PAYLOAD)  # shared by all kinds of torque; friction, offsets and gains differ between kinds
+DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # parameters that drift besides those of the friction law
+FLOOR = 1e-4  # times `ParameterSpace.usual`: least standard deviation, as draws may all be clipped at a bound
+FAR = 5.0  # standard deviations in the worst of some thirty directions, beyond which knowledge and data disagree
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A normal distribution of named values; an `ExtraResidual` of a problem.
+    """A normal distribution of named values, which serves a problem as an `ExtraResidual`.
 
     Attributes:
-        names: K names such as coulomb[2]. mean: (K,) SI units, logarithms of logarithmic parameters.
-        covariance: (K, K), drift included. drift: (K,) standard deviations of what changed since; 0: nothing.
+        names: K names such as coulomb[2]. mean: (K,) in SI units; of logarithmic parameters, their logarithm.
+        covariance: (K, K), drift included. drift: (K,) standard deviation of the change since then; 0: none.
     """
 
     names: tuple[str, ...]
@@ -38,10 +38,10 @@ class Known:
 
     @staticmethod
     def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
-        """Return the result of an identification: values x (P,) and draws (S, P) of its posterior.
+        """Return the knowledge from an identification with values x (P,) and posterior draws (S, P).
 
-        drift: standard deviation of the change since of friction, relative; of offsets and of what may be 0, relative
-            to the deviation among arms, if the value is smaller.
+        drift: standard deviation of the change of friction, offsets and drag since then, relative to the value or to
+            its deviation among arms (`ParameterSpace.usual`), whichever is larger.
         """
         names, usual = space.names, space.usual
         mean, least = coordinates(names, x), np.where(np.isfinite(usual), usual, 0.0)
@@ -54,13 +54,13 @@ class Known:
         return Known(tuple(names), mean, covariance + np.diag(change**2), change)
 
     def where(self, kept: Callable[[str], bool]) -> "Known":
-        """Return the marginal distribution of the names that are `kept`."""
+        """Return the marginal distribution of the values for whose name `kept` is true."""
         at = [k for k, name in enumerate(self.names) if kept(name)]
         covariance = self.covariance[np.ix_(at, at)]
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return this and another, independent distribution, which replaces values that both have."""
+        """Return this distribution joined with an independent one; values in both are taken from `other`."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)
@@ -71,16 +71,16 @@ class Known:
         return Known((*own.names, *other.names), mean, covariance, drift)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return (C, K), in standard deviations, for x (C, P)."""
+        """Return the whitened deviation from the mean, (C, K) in standard deviations, of candidates x (C, P)."""
         at = [space.names.index(name) for name in self.names]
         off = coordinates(self.names, x[:, at]) - self.mean
         return np.linalg.solve(np.linalg.cholesky(self.covariance), off.T).T
 
 
 def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[float, str]:
-    """Return by how many standard deviations x (P,) contradicts the prior, and the name of the worst value.
+    """Return by how many standard deviations x (P,) contradicts the prior, and the value that contributes most.
 
-    This is the largest deviation along a principal axis of the prior's correlation matrix.
+    The number is the largest deviation along a principal axis of the prior's correlation matrix.
     """
     known = known.where(lambda name: name in space.names and name not in space.fixed)
     if not known.names:
@@ -94,31 +94,31 @@ def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[fl
 
 
 def block_of(name: str) -> str:
-    """Return the parameter of a name, coulomb of coulomb[2]."""
+    """Return the parameter in a value's name, such as coulomb in coulomb[2]."""
     return name.split("[")[0]
 
 
 def is_logarithmic(names: Iterable[str]) -> np.ndarray:
-    """Return (K,) whether each name has a logarithmic coordinate."""
+    """Return (K,) bool, whether each named value has a logarithmic coordinate."""
     log = logarithmic()
     return np.array([block_of(name) in log for name in names], dtype=bool)
 
 
 def coordinates(names: Sequence[str], x: np.ndarray) -> np.ndarray:
-    """Return x (..., K) with logarithms of logarithmic parameters."""
+    """Return x (..., K) with logarithmic parameters replaced by their logarithms."""
     log = is_logarithmic(names)
     return np.where(log, np.log(np.where(log, x, 1.0)), x)
 
 
 def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.ndarray) -> pd.DataFrame:
-    """Return a row per value that may drift: then, now, and the difference with its 95 % interval, SI units.
+    """Return a row per value that may drift: then, now, and the difference with its 95 % interval, in SI units.
 
-    The difference is w in x_now = x_then + w, given the data of both dates. With then ~ N(m, P), Q = diag(drift^2), S
-    = P + Q, and now ~ N(x, V) after the data: w ~ N(G (x - m), G V G^T + P - P S^-1 P), G = Q S^-1 (the
-    Rauch-Tung-Striebel smoother, AIAA Journal 3(8), 1965).
+    The difference is w in x_now = x_then + w, given the data of both dates. Let then ~ N(m, P), Q = diag(drift^2),
+    S = P + Q, and now ~ N(x, V) after the new data. Then w ~ N(G (x - m), G V G^T + P - P S^-1 P) with G = Q S^-1
+    (the Rauch-Tung-Striebel smoother, AIAA Journal 3(8), 1965).
 
     Args:
-        known: prior of the new identification. space, x, samples: its parameters, values (P,), draws (S, P).
+        known: prior of the new identification. space, x, samples: its parameters, values (P,) and draws (S, P).
     """
     known = known.where(lambda name: name in space.names and name not in space.fixed)
     at = [space.names.index(name) for name in known.names]

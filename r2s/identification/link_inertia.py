@@ -1,6 +1,6 @@
-"""Mass, centre of mass and inertia tensor of links by ten parameters that are physical at every value.
+"""Mass, centre of mass and inertia tensor of a link as ten parameters; all their values are physically consistent.
 
-Log-Cholesky parameters of the pseudo-inertia J relative to the nominal link (Rucker and Wensing, IEEE RA-L 7(2),
+Log-Cholesky parameters describe the pseudo-inertia J relative to the nominal link (Rucker and Wensing, RA-L 7(2),
 2022): J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
 """
 
@@ -17,8 +17,8 @@ PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z")
 def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     """Return (..., 4, 4) [[Sigma, h], [h^T, m]] about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
 
-    Sigma is the second moment of mass. It is positive definite if and only if the tensor's principal moments are
-    positive and satisfy the triangle inequality. Other tensors become the nearest flat one with a little thickness.
+    Sigma is the second moment of mass. About the centre of mass it is positive definite if and only if the tensor's
+    principal moments are positive and satisfy the triangle inequality. If not, eigenvalues are raised to a minimum.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)
@@ -38,7 +38,7 @@ def _upper(j: np.ndarray) -> np.ndarray:
 
 
 def links(robot: Robot, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass (..., n) kg, com (..., n, 3) m and central tensor (..., n, 3, 3) kg m^2 for theta (..., n, 10)."""
+    """Return mass (..., n) kg, com (..., n, 3) m and tensor about it (..., n, 3, 3) kg m^2 of theta (..., n, 10)."""
     v = np.zeros((*theta.shape[:-1], 4, 4))
     for i in range(3):
         v[..., i, i] = np.exp(theta[..., 1 + i])
@@ -65,13 +65,13 @@ def log_cholesky(robot: Robot, dynamics: Dynamics) -> np.ndarray:
 def add_point_mass(
     mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, payload: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass (..., n) kg, com (..., n, 3) m and tensor (..., n, 3, 3) of links, the last with a point mass.
+    """Return mass (..., n) kg, com (..., n, 3) m, tensor (..., n, 3, 3) with a point mass added to the last link.
 
-    A point suffices: the tensor of a gripper about its own centre is small against m r^2.
+    A point mass suffices, because a gripper's tensor about its own centre is small compared with m r^2.
 
     Args:
         mass, com, inertia: of the links without the point mass.
-        payload: (...) kg, at least 0. place: (..., 3) m, its position in the last link's frame.
+        payload: (...) kg, the point mass, at least 0. place: (..., 3) m, its position in the last link's frame.
     """
     lead = np.broadcast_shapes(mass.shape[:-1], np.shape(payload))
     out = [np.broadcast_to(a, (*lead, *a.shape[k:])).copy() for a, k in ((mass, -1), (com, -2), (inertia, -3))]
@@ -85,5 +85,5 @@ def add_point_mass(
 
 
 def inertia_scale(inertia: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-    """Return (..., n): the scale of tensors (..., n, 3, 3) over the nominal ones, by their traces."""
+    """Return the ratio (..., n) of the traces of inertia tensors (..., n, 3, 3) to those of the nominal ones."""
     return np.trace(inertia, axis1=-2, axis2=-1) / np.trace(nominal, axis1=-2, axis2=-1)

@@ -27,7 +27,7 @@ from r2s.recordings.speed_noise import MAX_NOISE
 
 SIDES = ("negative", "positive")
 FIXED = ("phi", "offset", "inertia", "mass", "com", "armature", "load", "drag", "gain", "speed_noise")
-# limits of a plausible file, beyond those of any arm: friction and offsets, Nm; a link's centre from its joint, m
+# limits that no arm exceeds: friction and offsets, Nm; distance of a link's centre of mass from its joint, m
 MOST_NM, FARTHEST_M = 1e4, 10.0
 
 
@@ -41,9 +41,9 @@ def save_parameters(
     """Write parameters.yaml (value, unit, nominal, bounds, 95 % interval and identifiability) and posterior.npz.
 
     Args:
-        path: of parameters.yaml; the draws of the posterior go beside it, for dr=identified.
+        path: of parameters.yaml; posterior.npz is written to the same folder, for dr=identified.
         space, found: the parameters and their estimate.
-        source: origin of the estimate (recording, search, run). note: further entries.
+        source: origin of the estimate (recording, search, run). note: further entries of parameters.yaml.
     """
     robot, fixed = space.robot, space.nominal
 
@@ -77,13 +77,13 @@ def save_parameters(
 def load_parameters(
     folder: str | Path, robot: Robot, trust: Sequence[str] = (), option: str = "calibration"
 ) -> tuple[ParameterSpace, np.ndarray]:
-    """Return space and values x of `calibration=RUN_FOLDER` (or of a parameters.yaml); see `ParameterSpace.dynamics`.
+    """Return the space and the values x (P,) in a run folder (or parameters.yaml), for `ParameterSpace.dynamics`.
 
-    trust: modules from which a friction family may be imported, beside those that were imported before. option: that
-    names the folder, for errors.
+    trust: modules from which a friction family may be imported, besides those that are imported already. option: the
+    option that names the folder, for error messages.
 
     Raises:
-        UserError: no such run or file, parameters of another robot, a foreign friction family, or a damaged file.
+        UserError: no such run or file, another robot's parameters, an untrusted friction family, or a damaged file.
     """
     if Path(folder).is_dir() and not (Path(folder) / "parameters.yaml").is_file():
         raise UserError(f"{option}: {folder} has no parameters.yaml; is it a finished identification?")
@@ -126,7 +126,7 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
 
 
 def _check_physical(d: Dynamics) -> None:
-    """Raise ValueError for dynamics that no arm can have."""
+    """Raise ValueError if no arm can have these dynamics."""
     for name in ("dq_min", "delay", "lag"):
         check_number(name, float(getattr(d, name)), "[0, 10]" if name == "dq_min" else "[0, 1]")
     fast = np.ones(d.phi.shape[:-1])
@@ -145,10 +145,10 @@ def _check_physical(d: Dynamics) -> None:
 
 
 def load_posterior(folder: str | Path, space: ParameterSpace, option: str = "dr=identified") -> np.ndarray:
-    """Return the posterior draws (S, P) that `save_parameters` wrote beside the values of `space`.
+    """Return the posterior draws (S, P) of the parameters in `space` from posterior.npz beside parameters.yaml.
 
     Raises:
-        UserError: no posterior.npz, one of other parameters, or a damaged file.
+        UserError: there is no posterior.npz, it has other parameters, or it is damaged.
     """
     path = Path(folder)
     path = (path if path.is_dir() else path.parent) / "posterior.npz"

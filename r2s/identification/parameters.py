@@ -1,10 +1,9 @@
-"""The parameter vector of an identification: blocks, bounds, unit cube, and the dynamics that it describes.
+"""The parameter vector of an identification: its blocks, bounds and unit cube, and the dynamics that it describes.
 
-A block has one value per joint or link (friction of one family, offset, inertia) or one for the whole arm (delay,
-lag, payload). Searches work on the unit cube; positive parameters that span decades have logarithmic coordinates.
-
-Inertia has two parametrizations: `inertia_scale`, one scale per link as in the paper (Table III NEW is a multiple of
-OLD), and `link_...`, the ten log-Cholesky parameters of a link (link_inertia.py).
+A block is one parameter. It has a value per joint or link (a friction coefficient, offset, inertia) or one for the
+whole arm (delay, lag, payload). Searches work on the unit cube, with logarithms of positive parameters that span
+decades. Inertia has two parametrizations: `inertia_scale`, one factor per link as in the paper (Table III NEW is a
+multiple of OLD), and `link_...`, the ten log-Cholesky parameters of a link (link_inertia.py).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +25,7 @@ OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s", "signal_delay": "s"}
 OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
 TIMING = ("delay", "lag", "signal_delay")
-# standard deviation of a parameter among arms by its unit, of torque-like ones per Nm of tau_max; 1 of a logarithm
+# standard deviation of a parameter among arms, by its unit; torque-like: per Nm of tau_max; of any logarithm: 1
 USUAL = {"Nm": 0.02, "Nm s/rad": 0.02, "kg m^2": 0.002, "kg": 0.02, "1": 0.1, "rad/s": 0.03, "m": 0.1, "s": 2e-3}
 WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
@@ -34,23 +33,23 @@ PER_JOINT = ("offset", "armature", "load", "gain")  # blocks that are fields of 
 
 
 def units() -> dict[str, str]:
-    """Return {parameter: unit} of all parameters, including those of every known friction family."""
+    """Return {parameter: unit} for all parameters, including those of every known friction family."""
     friction = (zip(f.names, f.units, strict=True) for f in known_families())
     return {name: unit for pairs in friction for name, unit in pairs} | OTHER_UNITS
 
 
 def logarithmic() -> set[str]:
-    """Return the parameters with a logarithmic coordinate; they are positive."""
+    """Return the parameters whose coordinate on the unit cube is logarithmic; they are positive."""
     return {"inertia_scale"}.union(*(f.logarithmic for f in known_families()))
 
 
 def torque_like() -> set[str]:
-    """Return the parameters per joint that scale with an arm: those in Nm and Nm s/rad, and the rotors."""
+    """Return the parameters per joint that grow with the size of an arm: those in Nm and Nm s/rad, and armature."""
     return {name for name, unit in units().items() if unit.startswith("Nm")} | {"armature"}
 
 
 def sizes(largest: np.ndarray) -> dict[str, Any]:
-    """Return {torque-like parameter: the largest torque (n,) Nm of its joint, or of the arm for a payload}."""
+    """Return {torque-like parameter: `largest`, (n,) Nm of each joint; payload mass: its maximum over the joints}."""
     return dict.fromkeys(torque_like(), largest) | {PAYLOAD[0]: largest.max()}
 
 
@@ -59,14 +58,14 @@ class ParameterSpace:
     """The estimated vector x (P,).
 
     Attributes:
-        blocks: names in order; each has n values, or one for the whole arm.
+        blocks: parameter names in the order of x; each has n values, or one for the whole arm.
         n: number of joints.
         lower, upper: (P,) bounds in SI units.
-        nominal: start values of a search, and values of all parameters that are not in x.
+        nominal: start values of a search, and the values of all parameters that are not in x.
         robot: the arm; inertia blocks are relative to its links.
-        breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. The breakaway torques
-            then follow the offset (torque = command + offset). NaN or None: the nominal torque.
-        fixed: names of values that the user fixed, in bounds that leave nothing to search (stated.py).
+        breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. Breakaway torques are
+            then these commands plus the offset. Where it is NaN or None, they are nominal.
+        fixed: names of values that the user fixed; their bounds are too narrow for a search (stated.py).
     """
 
     blocks: tuple[str, ...]
@@ -84,12 +83,12 @@ class ParameterSpace:
 
     @property
     def names(self) -> list[str]:
-        """P names such as phi1[3] (joints count from 1)."""
+        """The P names of the values, such as phi1[3] (joints count from 1)."""
         return [b if b in WHOLE_ARM else f"{b}[{j + 1}]" for b in self.blocks for j in range(self.size(b))]
 
     @property
     def start(self) -> np.ndarray:
-        """(P,) the nominal dynamics as a vector, clipped into the bounds."""
+        """(P,) the nominal dynamics as a parameter vector, clipped to the bounds."""
         d = self.nominal
         values = dict(zip(d.family.names, d.phi.T, strict=False)) | {name: getattr(d, name) for name in PER_JOINT}
         values |= {"drag_sin": d.drag[:, 0], "drag_cos": d.drag[:, 1]}
@@ -112,7 +111,7 @@ class ParameterSpace:
         return np.arange(at, at + self.size(name))
 
     def expand(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
-        """Return (P,) with the given value of each block, one or per joint (n,); other blocks get `default`."""
+        """Return (P,) from {block: one value or one per joint (n,)}; blocks that `values` lacks get `default`."""
         return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
     @cached_property
@@ -125,19 +124,19 @@ class ParameterSpace:
         return (self._warp(x) - low) / (high - low)
 
     def from_unit(self, u: np.ndarray) -> np.ndarray:
-        """Map points u (..., P) of the unit cube to SI units; points outside are clipped."""
+        """Map points u (..., P) of the unit cube to SI units; coordinates outside [0, 1] are clipped."""
         low, high = self._warp(self.lower), self._warp(self.upper)
         w = low + np.clip(u, 0.0, 1.0) * (high - low)
         return np.where(self._log, np.exp(np.where(self._log, w, 0.0)), w)
 
     @property
     def width(self) -> np.ndarray:
-        """(P,) width of the bounds in SI units, or of their logarithm for logarithmic coordinates."""
+        """(P,) upper minus lower bound in SI units; for logarithmic coordinates, difference of the logarithms."""
         return self._warp(self.upper) - self._warp(self.lower)
 
     @property
     def usual(self) -> np.ndarray:
-        """(P,) standard deviation of each value among arms, like `width`; inf for a unit without one."""
+        """(P,) standard deviation of each value among arms, in the units of `width`; inf if USUAL lacks its unit."""
         unit, size = units(), sizes(self.robot.tau_max)
         usual = {b: USUAL.get(unit[b], np.inf) * size.get(b, 1.0) for b in self.blocks}
         return np.where(self._log, 1.0, self.expand(usual, np.inf))
@@ -146,7 +145,7 @@ class ParameterSpace:
         return np.where(self._log, np.log(np.where(self._log, x, 1.0)), x)
 
     def dynamics(self, x: np.ndarray) -> Dynamics:
-        """Return the dynamics of x (..., P)."""
+        """Return the dynamics that x (..., P) describes."""
         d, blocks = self.nominal, set(self.blocks)
 
         def value(name: str, nominal: np.ndarray) -> np.ndarray:
@@ -169,7 +168,7 @@ class ParameterSpace:
         return self._with_links(replace(d, **own), x)
 
     def _with_links(self, d: Dynamics, x: np.ndarray) -> Dynamics:
-        """Return d with the link and payload blocks of x (..., P)."""
+        """Return d with the links and the payload that x (..., P) describes."""
         blocks, lead = set(self.blocks), x.shape[:-1]
         if "inertia_scale" in blocks:
             d = replace(d, inertia=self.robot.inertia * self.block(x, "inertia_scale")[..., None, None])
@@ -192,7 +191,7 @@ class ParameterSpace:
 
 
 def check_parameters(where: str, names: Iterable[str]) -> None:
-    """Raise UserError for a name that is no parameter."""
+    """Raise UserError if a name is not a parameter."""
     known = units()
     for name in names:
         if name not in known:
@@ -200,7 +199,7 @@ def check_parameters(where: str, names: Iterable[str]) -> None:
 
 
 def check_bounds(where: str, bounds: Mapping[str, Sequence[ArrayLike]]) -> None:
-    """Raise UserError for an unknown parameter, or bounds that do not rise (or are not positive if logarithmic)."""
+    """Raise UserError for an unknown parameter, for low >= high, or for low <= 0 of a logarithmic parameter."""
     check_parameters(where, bounds)
     for name, pair in bounds.items():
         words = isinstance(pair, str) or any(isinstance(end, str) for end in pair)
@@ -210,11 +209,11 @@ def check_bounds(where: str, bounds: Mapping[str, Sequence[ArrayLike]]) -> None:
 
 
 def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequence[ArrayLike]]) -> ParameterSpace:
-    """Return the space of the parameters in `bounds`, {"phi1": [low, high], ...}; an end is a number or (n,).
+    """Return the space of the parameters in `bounds`, {"phi1": [low, high], ...}; a bound is a number or (n,).
 
     Raises:
-        UserError: no block, an unknown one, one of another friction family, both parametrizations of inertia, or
-            bounds that are not two rising numbers.
+        UserError: there is no parameter, an unknown one, or one of another friction family; both parametrizations of
+            inertia are named; or low is not less than high.
     """
     family = nominal.family
     if clash := [name for name in family.names if name in OTHER_UNITS]:
@@ -235,10 +234,11 @@ def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequen
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """Estimate of a parameter vector; arrays are (P,), `samples` (S, P) are draws of the posterior.
+    """Estimate of a parameter vector; arrays are (P,), in SI units.
 
     Attributes:
-        x: values, SI units. low, high: 95 % interval. identifiable: whether the data determine the value.
+        x: values. low, high: 95 % interval. identifiable: whether the data determine each value. samples: (S, P),
+            draws of the posterior.
     """
 
     x: np.ndarray

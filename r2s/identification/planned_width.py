@@ -1,6 +1,6 @@
-"""The 95 % widths that a recording of a planned motion will give, for choosing the motion.
+"""Expected 95 % interval widths from a recording of a planned motion, for choosing the motion.
 
-Parameters, bounds and prior are the same as in an identification, linearized at the nominal arm.
+Parameters, bounds and prior are those of the later identification. The torque is linearized at the nominal arm.
 """
 
 from collections.abc import Sequence
@@ -21,24 +21,24 @@ from r2s.physics.dynamics import Dynamics, with_family
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-MOST_ROWS = 200  # samples of a motion in a search: with more of them, the order of two motions hardly changes
+MOST_ROWS = 200  # samples of a motion in a search; more of them hardly change the ranking of motions
 
 
 class PlannedWidths:
-    """Expected widths of planned motions.
+    """Expected 95 % interval widths from planned motions.
 
     Attributes:
-        space: the parameters. information: (P, P) on the unit cube, of the motions so far (`add`).
+        space: the parameters. information: (P, P) on the unit cube, sum over the motions so far (see `add`).
 
     Args:
-        robot, nominal: the arm, and where the identification will start.
-        settings: of the identification; family=auto stands for the family of the nominal arm.
+        robot, nominal: the arm, and the dynamics at which the identification will start.
+        settings: of the identification; for family=auto the family of the nominal arm is used.
         torque: kind of torque that will be recorded.
-        noise: standard deviation of an independent sample, of tau_max, at COARSE_HZ.
-        chosen: parameters such as "offset" or "offset[3]", whose widths count; none: all.
+        noise: torque noise, standard deviation of independent samples at COARSE_HZ, relative to tau_max.
+        chosen: parameters such as "offset" or "offset[3]" whose widths `score` counts; empty: all.
 
     Raises:
-        UserError: an unknown parameter in `chosen`.
+        UserError: `chosen` contains an unknown parameter.
     """
 
     def __init__(
@@ -90,33 +90,33 @@ class PlannedWidths:
         return (j.transpose(0, 2, 1) @ j) * ((t[-1] - t[0]) * COARSE_HZ / len(t))
 
     def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
-        """Count a motion (T, n) at times t (T,) among those so far."""
+        """Add the information of a motion (T, n) at times t (T,) to that of the motions so far."""
         self.information = self.information + self.of(t, q[None], dq[None], ddq[None])[0]
 
     def half(self, information: np.ndarray) -> np.ndarray:
-        """Return half widths (..., P) on the unit cube, of the information (..., P, P)."""
+        """Return half the 95 % widths (..., P) on the unit cube that information (..., P, P) and prior give."""
         covariance = np.linalg.inv(information + self._prior)
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return (B,) minus the mean logarithm of the chosen widths, after the motions so far and each of B more."""
+        """Return the score (B,) of B motions, each added to those so far: minus the mean log of chosen widths."""
         some = slice(None, None, 1 + len(t) // MOST_ROWS)
         information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
         return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)
 
     @property
     def width(self) -> np.ndarray:
-        """(P,) SI units, expected 95 % widths after the motions so far."""
+        """(P,) expected 95 % widths after the motions so far, in SI units."""
         h = np.where(self._u > 0.5, -STEP, STEP)
         slope = (self.space.from_unit(self._u + h) - self.space.from_unit(self._u)) / h
         return 2 * self.half(self.information) * slope
 
     @property
     def share(self) -> np.ndarray:
-        """(P,) of the prior's width that is left after the motions so far."""
+        """(P,) ratio of expected to prior width after the motions so far, at most 1."""
         return np.minimum(self.half(self.information) / (Z_95 * self._problem.prior_width), 1.0)
 
     @property
     def identifiable(self) -> np.ndarray:
-        """(P,) whether the motions so far will determine the value, as in the identification's result."""
+        """(P,) whether the motions so far will determine each value, by the rule of an identification's result."""
         return Z_95 * self.share < 1.0 / SHARPER

@@ -1,4 +1,4 @@
-"""Posterior of an identification: a normal approximation about the fit, drawn inside the bounds."""
+"""Posterior of an identification: a normal approximation about the fit, with draws inside the bounds."""
 
 from collections.abc import Iterable
 from typing import NamedTuple, Protocol
@@ -7,14 +7,14 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student
 
-DRAWS = 512  # of the joint distribution
-Z_95 = 1.96  # standard deviations of half a 95 % interval
-FLAT = 12.0  # information of a flat prior on the unit cube: its bounds leave a variance of 1/12
-LEAST_LEFT = 0.1  # lower limit of the share of information in a direction that all other blocks hold
+DRAWS = 512  # number of samples from the joint distribution
+Z_95 = 1.96  # half the width of a 95 % interval, in standard deviations
+FLAT = 12.0  # information of a flat prior on the unit cube, whose uniform distribution has a variance of 1/12
+LEAST_LEFT = 0.1  # lower limit of 1 minus a block's share of the information in a direction
 
 
 class Linearized(Protocol):
-    """A least-squares problem on the unit cube, such as `Problem`; see there."""
+    """What `posterior` needs of a least-squares problem on the unit cube, such as `Problem`."""
 
     @property
     def clusters(self) -> np.ndarray:
@@ -22,12 +22,12 @@ class Linearized(Protocol):
         ...
 
     def linearize(self, u: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray]]:
-        """Yield residual and Jacobian at u (P,) in parts: first R rows of data, then the rows of the prior."""
+        """Yield residual and Jacobian at u (P,), part by part: the R rows of data first, then the prior's rows."""
         ...
 
 
 class Posterior(NamedTuple):
-    """u (P,) the fit on the unit cube, draws about it as steps (S, P), and the data's information (P, P)."""
+    """The fit u (P,) on the unit cube, S draws minus u (`steps`, (S, P)), and the data's information (P, P)."""
 
     u: np.ndarray
     steps: np.ndarray
@@ -35,16 +35,16 @@ class Posterior(NamedTuple):
 
 
 def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
-    """Return draws of the joint distribution about the fit u (P,), normal with a cluster-robust covariance.
+    """Return draws about the fit u (P,) from a normal distribution with a cluster-robust covariance.
 
-    Errors within a block are correlated, so the scatter of block scores s, a block's part of the gradient, sets the
-    covariance H^-1 (sum of s s^T + prior) H^-1 (White, Econometrica 48(4), 1980; clusters: Liang and Zeger,
-    Biometrika 73(1), 1986). With few blocks the fit follows each one, so a block's residual is smaller than its
-    error, by its share of the information (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002), and their
-    scatter widens the draws as in Student's t. The mean score, which is not 0 at a bound, is removed. Few blocks
-    underestimate the covariance where single blocks decide, so it never falls below the one for independent rows, in
-    any direction. A bootstrap over blocks would sometimes draw an H with hardly any information on a value that few
-    blocks determine; such tails describe no arm.
+    Errors within a block are correlated. So the covariance is H^-1 (sum of s s^T + prior) H^-1, with the score s, a
+    block's part of the gradient (White, Econometrica 48(4), 1980; clusters: Liang and Zeger, Biometrika 73(1), 1986).
+    The mean score, which is not 0 at a bound, is removed. With few blocks the fit follows each of them, so a block's
+    residual is smaller than its error; its share of the information corrects this (CR2 of Bell and McCaffrey, Survey
+    Methodology 28(2), 2002). Student's t widens the draws for the unknown scatter of few blocks. Where single blocks
+    decide, their scatter underestimates the covariance, so in no direction is it less than for independent rows. A
+    bootstrap over blocks would sometimes draw an H with hardly any information on a value that few blocks determine;
+    such tails describe no arm.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -64,9 +64,9 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
 
 
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return the information (K, P, P) and score (K, P) of each block, the prior's information, and the residual.
+    """Return information (K, P, P) and score (K, P) of each block, the prior's information (P, P), and a factor.
 
-    The residual is the RMS of data rows, at least 1.
+    The factor is the RMS of the data rows, in standard deviations, and at least 1.
     """
     clusters, p = problem.clusters, len(u)
     count, square, seen, row = int(clusters.max()) + 1, 0.0, 0, 0
@@ -79,27 +79,27 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
             some = np.flatnonzero(own == block)
             gram[block] += j[some].T @ j[some]
             score[block] += j[some].T @ r[some]
-        counts = j.any(1)  # padding rows have neither a residual nor a slope
+        counts = j.any(1)  # padding rows, whose residual and slope are 0, do not count
         square, seen = square + float((r[counts] ** 2).sum()), seen + int(counts.sum())
-    prior += np.diag(np.where(prior.any(0), 0.0, FLAT))  # a flat prior has no row
+    prior += np.diag(np.where(prior.any(0), 0.0, FLAT))  # a flat prior has no row of its own
     return gram, score, prior, float(np.sqrt(max(1.0, square / max(seen, 1))))
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return root (P, P) of the covariance root root^T, raised where it is less than least least^T.
+    """Return a root (P, P) of the covariance root root^T after raising it to at least least least^T.
 
-    The comparison is by direction: the sum of two correlated parameters is known far better than each of them.
+    Directions are compared, not single parameters: the sum of two correlated ones is known far better than each.
     """
     axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
     return least @ (axes * np.maximum(seen, 1.0))
 
 
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return steps (S, P) that end in the cube: values that would leave it are clipped, and the others compensate.
+    """Return steps (S, P) that end in the cube: values outside are clipped, and the others compensate.
 
-    h (P, P) is half the Hessian of the sum of squares. Clipping alone would bias sums: an offset, for example, is
-    correlated with an asymmetry at its bound. Values are clipped one at a time, the farthest first, which often
-    brings a correlated value back.
+    The others minimize the sum of squares, half of whose Hessian is h (P, P). Clipping alone would bias sums: an
+    offset, for example, is correlated with an asymmetry at its bound. Values are clipped one at a time, the farthest
+    first, because this often brings a correlated value back into the cube.
     """
     steps = steps.copy()
     for step in steps:

@@ -1,4 +1,4 @@
-"""Prediction errors on motion that was not fitted: of torque, and of open-loop motion."""
+"""Errors of an identified arm on motion that was not fitted: predicted torque, and open-loop simulation."""
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from r2s.physics.simulator import Simulator
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-HORIZONS = (0.1, 0.5, 2.0)  # s, open-loop prediction
-SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording whose torque is scored, and of each part
+HORIZONS = (0.1, 0.5, 2.0)  # s, horizons of open-loop prediction
+SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording of which torque is compared, in total and per part
 REPLAYED_S = 240.0  # s of a longer recording that are replayed
 MAX_WINDOWS = 100  # per horizon
 
@@ -27,11 +27,11 @@ def prediction_errors(
     cutoff_hz: float,
     nthread: int = 0,
 ) -> dict:
-    """Return one side of summary.json: torque RMSE per joint and, for commanded torque, open-loop errors.
+    """Return the errors of the identified and the nominal arm on a recording, as an entry of summary.json.
 
-    position_rmse_mrad is over replays of `window_s`; ee_error_mm is the mean end-effector distance after each of the
-    HORIZONS that the trajectories reach. Of a long recording, parts that are spread over it count. Without a
-    trajectory as long as `window_s` there is no position_rmse_mrad.
+    The errors are torque RMSE per joint and, for commanded torque, position_rmse_mrad over replays of `window_s`, and
+    ee_error_mm, the mean end-effector distance after each of the HORIZONS that trajectories reach. If no trajectory
+    lasts `window_s`, there is no position_rmse_mrad. Of a long recording, parts spread over it are used.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}
@@ -52,7 +52,7 @@ def prediction_errors(
 
 
 def open_loop_error(robot: Robot, dynamics: Dynamics, recording: Recording, nthread: int) -> dict[str, float]:
-    """Return {"0.1": mm, ...}: mean distance between simulated and recorded end effector after each horizon."""
+    """Return {horizon in s: mm}, mean distance between simulated and recorded end effector after each horizon."""
     errors = {}
     for horizon in HORIZONS:
         if (windows := windows_or_none(recording, horizon, MAX_WINDOWS)) is None:

@@ -1,4 +1,4 @@
-"""The least-squares problem of an identification on the unit cube, and the interface of its searches."""
+"""The least-squares problem of an identification on the unit cube, and the interface of the searches for it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,33 +15,33 @@ from r2s.identification.search.levenberg_marquardt import minimize
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
-UNIFORM = 12**-0.5  # standard deviation of a uniform distribution, of its width
+UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
 TAIL = 25.0  # degrees of freedom of the prior of link-side torque, plus 1
-# implicit friction: least significance of its effect in standard deviations, and size relative to the expected one
+# implicit friction: its effect's least significance in standard deviations, and range of its size over the expected
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
-ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; nominal friction of a motor may be off by tens of Nm
-FIT_STEPS, FIT_FTOL = 12, 1e-3  # Jacobians of a fit, and its relative gain at the end
+ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more, as nominal friction may be off by tens of Nm
+FIT_STEPS, FIT_FTOL = 12, 1e-3  # largest number of Jacobians in a fit, and relative gain of a step at which it ends
 Report = Callable[[dict], None]
 
 
 class ExtraResidual(Protocol):
-    """Residual rows from other data than the recording: breakaway ramps, or replays for the presliding distance."""
+    """Residual rows from sources other than the data: ramps, presliding replays, or prior knowledge (`Known`)."""
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return (C, K), in standard deviations, for x (C, P)."""
+        """Return the K rows, in standard deviations, for candidates x (C, P): (C, K)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Residuals on the unit cube: data, prior and extra rows, in standard deviations.
+    """A least-squares problem on the unit cube, with rows of data, prior and extra residuals in standard deviations.
 
     Attributes:
-        data: the residual to minimize.
-        torque_data: the torque residual, for a fast start; may be `data` itself.
+        data: the residual of the recording: replays, or torque.
+        torque_data: the torque residual, for a fast start; it may be `data` itself.
         sigma: (P,) prior standard deviation about the nominal value (of the logarithm for logarithmic coordinates);
-            inf: flat.
+            inf: flat prior.
         extra: further residuals.
     """
 
@@ -58,7 +58,7 @@ class Problem:
         prior: Mapping[str, ArrayLike],
         extra: Sequence[ExtraResidual] = (),
     ) -> "Problem":
-        """Return the problem with prior {"offset": sigma or (n,), ...}, SI units; others get a flat one."""
+        """Return the problem with a prior {"offset": sigma or (n,), ...} in SI units, flat for other parameters."""
         return cls(data, torque_data, data.space.expand(prior, np.inf).astype(float), tuple(extra))
 
     @property
@@ -73,12 +73,12 @@ class Problem:
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each data row; errors of different blocks are independent."""
+        """(R,) block of each data row; errors in different blocks count as independent."""
         return self.data.clusters
 
     @property
     def uses_replays(self) -> bool:
-        """Whether the data are replayed windows instead of torques."""
+        """Whether the data are replayed windows rather than torques."""
         return self.data is not self.torque_data
 
     @property
@@ -88,39 +88,39 @@ class Problem:
 
     @property
     def prior_width(self) -> np.ndarray:
-        """(P,) on the unit cube, the standard deviation that the data's is compared with: the prior's.
+        """(P,) the prior's standard deviation on the unit cube, with which the posterior's is compared.
 
-        Of a flat prior it is that among arms in general (`ParameterSpace.usual`). Bounds count where they are
-        narrower: wider ones change nothing.
+        For a flat prior it is the standard deviation among arms in general (`ParameterSpace.usual`). It is at most
+        UNIFORM, that of a uniform distribution over the bounds.
         """
         stated = np.where(np.isinf(self.sigma), self.space.usual, self.sigma)
         return np.minimum(stated / self.space.width, UNIFORM)
 
     @property
     def weight(self) -> np.ndarray:
-        """(P,) prior residual per unit of the cube."""
+        """(P,) slope of each prior residual with respect to its coordinate on the unit cube."""
         return self.space.width / self.sigma
 
     def fixed(self, at: np.ndarray) -> "Problem":
-        """Return the problem with the values `at` fixed at their nominal ones."""
+        """Return the problem with the values at the indices `at` fixed at nominal, by a very narrow prior."""
         sigma = self.sigma.copy()
         sigma[at] = FIXED * self.space.width[at]
         return replace(self, sigma=sigma)
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with a flat prior of these values, because an extra residual determines them."""
+        """Return the problem with a flat prior for these values, because an extra residual serves as their prior."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
-        """Return the problem with another torque residual, also as data unless those are replays."""
+        """Return the problem with another torque residual; it also replaces `data` unless these are replays."""
         return replace(self, data=self.data if self.uses_replays else torque_data, torque_data=torque_data)
 
     def torque_reweighted(self, u: np.ndarray) -> "Problem":
-        """Return the problem with the torque residual reweighted at u (P,), a fit to it."""
+        """Return the problem with its torque residual reweighted at u (P,), a fit to torque."""
         return self.with_torque_data(self.torque_data.reweighted(self.space.from_unit(u), fitted=True))
 
     def reweighted(self, u: np.ndarray, fitted: bool) -> "Problem":
-        """Return the problem with all residuals reweighted about u (P,)."""
+        """Return the problem with all residuals of data reweighted at u (P,); see `TorqueResidual.reweighted`."""
         x = self.space.from_unit(u)
         out = self.with_torque_data(self.torque_data.reweighted(x, fitted))
         return replace(out, data=self.data.reweighted(x, fitted)) if self.uses_replays else out
@@ -134,7 +134,7 @@ class Problem:
         return np.concatenate([self.data(self.space.from_unit(u)), self._prior(u)], axis=1)
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield `residual` and its Jacobian (., P) at u (P,) in parts of rows: data, then prior and extra rows."""
+        """Yield `residual` and its Jacobian (., P) at u (P,) in parts: data rows first, then prior and extra rows."""
         if self.uses_replays:
             yield _differences(self.residual, u)
         else:
@@ -146,38 +146,38 @@ class Problem:
         return _differences(self._prior, u)
 
     def prior_information(self, u: np.ndarray) -> np.ndarray:
-        """Return (P, P), half the Hessian at u (P,) of the prior and extra rows."""
+        """Return (P, P) J^T J of the prior and extra rows at u (P,), half the Hessian of their sum of squares."""
         j = self.prior_rows(u)[1]
         return j.T @ j
 
     def _prior(self, u: np.ndarray) -> np.ndarray:
         prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
         if not (self.torque_data.commanded or self.torque_data.at_motor):
-            # heavy tails: data that clearly contradict a narrow prior outvote it, as Student's t lets an outlier
-            # (Lange et al., J. Am. Stat. Assoc. 84(408), 1989); near the nominal value it is normal
+            # heavy tails as in Student's t (Lange et al., J. Am. Stat. Assoc. 84(408), 1989): data that clearly
+            # contradict a narrow prior outweigh it; near the nominal value the prior is normal
             heavy = np.sign(prior) * np.sqrt(TAIL * np.log1p(prior**2 / TAIL))
             prior = np.where(self.sigma > 2 * FIXED * self.space.width, heavy, prior)
         return np.concatenate([prior, *(extra.residual(self.space, x) for extra in self.extra)], axis=1)
 
 
 def _differences(residual: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a residual (R,) and its Jacobian (R, P) at u (P,), by steps into the cube."""
+    """Return a residual (R,) and its Jacobian (R, P) at u (P,) by finite differences towards the cube's centre."""
     h = np.where(u > 0.5, -STEP, STEP)
     r = residual(np.concatenate([u[None], u + np.diag(h)]))
     return r[0], ((r[1:] - r[0]) / h[:, None]).T
 
 
 class Search(Protocol):
-    """A search minimizes the sum of squares of `Problem.residual` from `start` (P,).
+    """A search, which minimizes the sum of squares of `Problem.residual` from `start` (P,).
 
-    It calls `report` after every step or generation with a dict of search, evaluations, cost, done and total. `local`
-    searches continue from their start, so that they can follow another search.
+    After every step or generation it calls `report` with a dict of search, evaluations, cost, done and total. `local`
+    is true for searches that continue from their start, so that they can refine the result of another search.
     """
 
     local: bool
 
     def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-        """Return u (P,) on the unit cube."""
+        """Return the solution u (P,) on the unit cube."""
         ...
 
 
@@ -187,7 +187,7 @@ def fits_torque(search: Search) -> bool:
 
 
 def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
-    """Return u (P,) of a problem on torque, reweighted between rounds, and the problem with the last weights."""
+    """Fit a torque problem, reweighting between rounds; return u (P,) and the problem with the last weights."""
     u, rounds = problem.start, MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
     for k in range(rounds):
         u = minimize(problem.residual, problem.linearize, u, FIT_STEPS, FIT_FTOL)
@@ -197,11 +197,11 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 
 
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
-    """Return whether a simulator with implicit friction made the recording, at u (P,), a fit to its torque.
+    """Return whether the recording comes from a simulator with implicit friction; u (P,) is a fit to its torque.
 
     Implicit integration evaluates friction at the velocity half a step ahead; a continuous-time arm does not. The
-    effect must have about the expected size and be `significant` standard deviations. A missing rotor has a similar
-    effect, a hundred times larger.
+    effect must have about the expected size and exceed `significant` standard deviations. A rotor inertia that the
+    model lacks has a similar effect, a hundred times larger.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]
@@ -213,6 +213,6 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
         row, products, hessian = row + len(own), products + j.T @ both, hessian + j.T @ j
     gradient, slope = np.asarray(products).T
     best = np.linalg.lstsq(hessian, slope, rcond=None)[0]
-    size = moved @ moved - best @ slope  # of the part that no parameter explains
+    size = moved @ moved - best @ slope  # square of the effect's part that no parameter explains
     share = -(moved @ r - best @ gradient) / size
     return bool(EXPECTED[0] < share < EXPECTED[1] and share * np.sqrt(size) > significant)

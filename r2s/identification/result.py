@@ -15,27 +15,27 @@ from r2s.identification.problem import Problem
 from r2s.physics.dynamics import Dynamics
 
 EDGE = 5e-4  # share of a parameter's range that counts as its bound
-RIDGE = 1e-6  # on the unit cube, information on a value with a flat prior that no data show
-UNSEEN = 0.9  # posterior over prior sigma above which the data hardly determine a value
-SHARPER = 4.0  # a parameter is identifiable if half its interval is less than its prior's sigma over this
-NULL_SHARE = 0.5  # posterior over prior sigma above which a direction is listed as decided by the prior
-LISTED_PARTS, LEAST_PART = 6, 0.2  # parameters of such a direction: at most so many, with at least that part
+RIDGE = 1e-6  # information on the unit cube that is added to every value, as some have a flat prior and no data
+UNSEEN = 0.9  # ratio of posterior to prior sigma, above which the data hardly determine a value
+SHARPER = 4.0  # a value is identifiable if half its 95 % interval is less than its prior's sigma divided by this
+NULL_SHARE = 0.5  # ratio of posterior to prior sigma, above which a direction counts as decided by the prior
+LISTED_PARTS, LEAST_PART = 6, 0.2  # of such a direction: most values that are listed, and least component of one
 
 
 @dataclass(frozen=True)
 class IdentificationResult:
-    """The result.
+    """Result of an identification.
 
     Attributes:
         space, found: the parameters and their estimate.
         history: a row per step or generation of each search.
-        families: {"sigmoid": error of held-out torque, ...} relative to the best; empty if the family was given.
-        null_directions: combinations of parameters that only the prior decides: (posterior over prior sigma,
-            {name: part}), widest first.
-        unseen: names that keep their nominal value, because the data hardly determine them.
-        edges: breakaway commands from ramps, if there were any.
-        refused: whether replays disagreed with the torque fit and were discarded.
-        prior_rows: (B,) rows of prior, ramps and what was known, and their Jacobian (B, P) on the unit cube.
+        families: {"sigmoid": error of held-out torque relative to the best, ...}; empty if the user chose the family.
+        null_directions: combinations of parameters that mainly the prior decides: (posterior over prior sigma,
+            {name: component}), widest first.
+        unseen: names of values that stay nominal, because the data hardly determine them.
+        edges: breakaway commands from ramps; None without ramps.
+        refused: whether r2s discarded the replays, because they contradicted the torque fit.
+        prior_rows: (B,) residual rows of prior, ramps and earlier knowledge; Jacobian (B, P) on the unit cube.
     """
 
     space: ParameterSpace
@@ -60,7 +60,7 @@ class IdentificationResult:
 
     @property
     def at_bounds(self) -> list[str]:
-        """A line for each value at a bound of the search other than 0: the best value may lie beyond it."""
+        """A line for each value at a bound other than 0 of the search; the best value may lie beyond this bound."""
         s, u, unit, lines = self.space, self.space.to_unit(self.found.x), units(), []
         for block in s.blocks:
             for k, at in enumerate(s.where(block)):
@@ -76,7 +76,7 @@ class IdentificationResult:
 
     @property
     def note(self) -> dict[str, Any]:
-        """Entries of parameters.yaml about the identification itself."""
+        """Entries that describe the identification in parameters.yaml."""
         null = [{"share_of_prior_left": round(s, 2), **parts} for s, parts in self.null_directions]
         out = {"unseen_and_left_nominal": self.unseen, "decided_by_the_prior": null}
         out |= {"families_compared": self.families, "replays_refused": self.refused}
@@ -87,11 +87,11 @@ class IdentificationResult:
 
     @property
     def saved(self) -> tuple[ParameterSpace, ParameterEstimate]:
-        """Space and estimate for parameters.yaml, with breakaway torques from ramps as blocks of their own.
+        """Space and estimate for parameters.yaml; breakaway torques from ramps are added as blocks of their own.
 
-        Their interval is Student's (friction/repeatability.py) plus the uncertainty of the offset. Without a release
-        the torque lies between the largest command without motion and the bound; it is not identifiable, and all
-        draws have the same value.
+        Their interval combines Student's t (friction/repeatability.py) with the uncertainty of the offset. If no ramp
+        released a joint, its breakaway torque lies between the largest torque without motion and the bound. It is
+        then not identifiable, and all draws have the same value.
         """
         if self.edges is None:
             return self.space, self.found
@@ -100,9 +100,9 @@ class IdentificationResult:
         sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
         got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
         edges = self.space.dynamics(f.samples).breakaway
-        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # with the offset
+        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # because of the offset
         most = student.ppf(0.975, freedom)
-        # the far tails of few degrees of freedom are no estimate of an arm, and policies train on these draws
+        # policies train on these draws, and Student's far tails for few degrees of freedom describe no arm
         drawn = np.clip(np.random.default_rng(0).standard_t(freedom, edges.shape), -2 * most, 2 * most)
         edges = np.where(got, edges + scale * drawn, x)
         edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
@@ -112,7 +112,7 @@ class IdentificationResult:
         limit = np.maximum(self.space.robot.tau_max, np.abs([x, low, high]).max((0, 2)))
         low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -limit), np.minimum(high[:, 0], 0.0)
         high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], limit), np.maximum(low[:, 1], 0.0)
-        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone is the scale of identifiability
+        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone takes the place of the prior's sigma
         columns = [[a[..., 0], a[..., 1]] for a in (x, low, high, got & (half < zone / SHARPER), edges)]
         own = f.x, f.low, f.high, f.identifiable, f.samples
         space = replace(
@@ -126,12 +126,12 @@ class IdentificationResult:
 
 
 def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], **story: Any) -> IdentificationResult:
-    """Return the result; values that the data hardly determine go back to nominal.
+    """Return the result; values that the data hardly determine are set back to nominal.
 
     Args:
         problem: the solved problem.
-        space: its parameters, with the breakaway and stiction found since.
-        sure: fit, draws and information.
+        space: its parameters, including the breakaway and stiction that were estimated after the fit.
+        sure: the fields of `Posterior`: fit, draws and information.
         story: the fields history, families, edges and refused of `IdentificationResult`.
     """
     u = np.array(sure["u"], dtype=float)
@@ -140,11 +140,11 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
     u, unseen = _settle(u, problem.start, h + RIDGE * np.eye(len(u)), steps.std(0) / prior)
     steps = np.clip(u + steps, 0.0, 1.0) - u
     low, high = (np.minimum(0.0, np.quantile(sign * steps, 0.025, axis=0)) for sign in (1.0, -1.0))
-    inside = (u > EDGE) & (u < 1.0 - EDGE)  # at a bound the interval says nothing about the other side
+    inside = (u > EDGE) & (u < 1.0 - EDGE)  # at a bound, the interval is cut off on one side
     seen = inside & (-0.5 * (low + high) < prior / SHARPER)
     ends = space.from_unit(u + low), space.from_unit(u - high)
     found = ParameterEstimate(space.from_unit(u), *ends, seen, space.from_unit(u + steps))
-    # in units of the prior: a direction without further information has an eigenvalue of 1
+    # in units of the prior's sigma, a direction on which only the prior has information has an eigenvalue of 1
     h = h + np.diag(np.where(np.isinf(problem.sigma), prior**-2.0, 0.0))
     free = [k for k, name in enumerate(space.names) if name not in space.fixed]
     searched = [space.names[k] for k in free]
@@ -161,14 +161,14 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
 
 
 def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return u (P,) with unseen values set back to `start` where this costs nothing, and (P,) bool, which those are.
+    """Return u (P,), with poorly determined values set back to `start`, and (P,) bool, whether each was set back.
 
-    The data may determine values together but not one by one, like the masses of two consecutive links. So a value
-    goes back only if the others, refitted, explain data and prior as well: the sum of squares may rise by 1 in total.
+    The data may determine values together but not one by one, like the masses of two consecutive links. So a value is
+    set back only if the others, refitted, still explain data and prior: the sum of squares may rise by 1 in total.
 
     Args:
-        u, start: (P,) result and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.
-        share: (P,) posterior over prior sigma.
+        u, start: (P,) fit and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.
+        share: (P,) ratio of posterior to prior sigma.
     """
     best, unseen = u, np.zeros(len(u), dtype=bool)
     for k in np.argsort(-share, kind="stable")[: int((share > UNSEEN).sum())]:

@@ -15,29 +15,29 @@ from r2s.physics.friction import family as friction_family
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of `identify`: those of conf/identify, with terms and prior for one kind of torque.
+    """Settings of `identify`, as in conf/identify, with the terms and the prior for one kind of torque.
 
     Attributes:
-        bounds: {"phi1": [low, high], ...} of every parameter that may be estimated; an end is a number or (n,), for
-            torque-like parameters of tau_max (terms.py: `scaled_bounds`).
+        bounds: {"phi1": [low, high], ...} of every parameter that may be estimated; a bound is a number or (n,),
+            relative to the largest torque for torque-like parameters (terms.py: `scaled_bounds`).
         prior: {"inertia_scale": sigma or None (flat), ...} in the same units, see `scaled_prior` and `Problem`.
-        terms: estimated beside friction, see terms.py.
-        family: of friction; auto selects it by cross-validation.
+        terms: model terms that are estimated besides friction, see terms.py.
+        family: friction family; auto selects it by cross-validation.
         window_s: s, length of replayed windows (commanded torque).
-        stride: ms, averaging of compared angles (commanded torque).
-        cutoff_hz: of the zero-phase filter of torque.
-        breakaway: upper limit of the scan for breakaway torques without ramps, over the identified friction
-            (commanded torque; a link-side sensor does not measure the motor's). None keeps the nominal ones.
-        folds: of the cross-validation within the recording.
-        candidate_terms: terms that enter if they improve held-out prediction; `link` replaces `inertia_scale`.
-        prunable_terms: terms that are removed if held-out prediction stays as good.
-        stated: mean, width or fixed value per parameter, by the user (stated.py).
-        known: from an earlier identification, or from another kind of torque (known.py).
-        seed: of the posterior's draws.
-        nthread: of the physics; 0 uses all cores.
+        stride: ms, time over which angles are averaged before they are compared (commanded torque).
+        cutoff_hz: cutoff of the zero-phase filter for torque.
+        breakaway: without ramps, breakaway torques are scanned up to this multiple of the identified friction
+            (commanded torque only: a link-side sensor does not measure the motor's). None leaves them nominal.
+        folds: number of folds of the cross-validation within the recording.
+        candidate_terms: terms that are added if they improve held-out prediction; `link` replaces `inertia_scale`.
+        prunable_terms: terms that are removed if held-out prediction stays as good without them.
+        stated: the user's mean, width or fixed value per parameter (stated.py).
+        known: prior knowledge from an earlier identification, or from another kind of torque (known.py).
+        seed: seed of the posterior's draws.
+        nthread: threads of the physics; 0 uses all cores.
 
     Raises:
-        UserError: an unknown family, term or parameter, or a number outside its range.
+        UserError: a family, term or parameter is unknown, or a number is outside its range.
     """
 
     bounds: Mapping[str, Sequence[ArrayLike]]

@@ -1,4 +1,4 @@
-"""What a user states of an arm: the mean and width, or the fixed value, of a parameter and joint, in SI units."""
+"""A user's prior statements about an arm: mean and width, or a fixed value, per parameter and joint, in SI units."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,13 +15,13 @@ from r2s.physics.friction import family, known_families
 
 Stated = Mapping[str, Mapping[str, Any]]  # {"coulomb": {"mean": [3.1, None, 2.0], "width": 0.2}, ...}
 KEYS = ("mean", "width", "fixed")
-TINY = 1e-9  # half the width of the bounds of a fixed value, relative to the value or to its bounds
+TINY = 1e-9  # half the distance between a fixed value's bounds, relative to the value or to its original bounds
 
 
 def check_stated(stated: Stated, n: int | None = None) -> None:
-    """Raise UserError for an unknown parameter or key, or a value that is no number or one for each of n joints.
+    """Raise UserError for an unknown parameter or key, or a value that is neither a number nor a list of n of them.
 
-    n: None: lengths are not checked.
+    If n is None, lengths are not checked.
     """
     check_parameters("identify.prior", stated)
     for name, entry in stated.items():
@@ -40,7 +40,7 @@ def check_stated(stated: Stated, n: int | None = None) -> None:
 
 
 def check_family(stated: Stated, name: str) -> None:
-    """Raise UserError for a friction parameter that the family `name` lacks, or that `auto` may not choose."""
+    """Raise UserError if the friction family `name` lacks a stated friction parameter, or if `name` is auto."""
     known = {own for f in known_families() for own in f.names}
     for parameter in stated:
         if parameter not in known or (name != "auto" and parameter in family(name).names):
@@ -54,7 +54,7 @@ def check_family(stated: Stated, name: str) -> None:
 
 
 def _check(where: str, value: Any, count: int | None, positive: bool) -> None:
-    """Raise UserError unless a setting is a number, or a list of `count` numbers or nulls."""
+    """Raise UserError unless a setting is a number or null, or a list of `count` such values."""
     what = "a positive number" if positive else "a number"
     several = f" or a list of {count} (null: nothing is stated of a joint)" if count != 1 else ""
     parts = value if isinstance(value, list | tuple) else [value]
@@ -67,14 +67,14 @@ def _check(where: str, value: Any, count: int | None, positive: bool) -> None:
 
 
 def _values(entry: Mapping[str, Any], key: str, count: int) -> np.ndarray:
-    """Return (count,) the stated values of a key; nan: nothing is stated."""
+    """Return the values (count,) that an entry states under a key; nan where it states nothing."""
     value = entry.get(key)
     parts = value if isinstance(value, list | tuple) else [value]
     return np.broadcast_to(np.array([np.nan if x is None else x for x in parts], dtype=float), count).copy()
 
 
 def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
-    """Return the space with bounds about the fixed values that leave nothing to search."""
+    """Return the space with bounds so close to the user's fixed values that nothing is left to search."""
     lower, upper, names = space.lower.copy(), space.upper.copy(), []
     for block, entry in stated.items():
         if block not in space.blocks:
@@ -89,16 +89,16 @@ def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
 
 
 def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the prior that the user states for values of a space by mean and width, or None.
+    """Return the prior that the user states by mean and width for values of a space; None if there is none.
 
-    A mean without a width has the width of `prior`, a width without a mean is about the nominal value. The width, a
-    standard deviation, of a logarithmic parameter is relative to its mean.
+    A mean without a width gets its width from `prior`; a width without a mean is centred at the nominal value. Widths
+    are standard deviations in SI units; those of logarithmic parameters are divided by the mean.
 
     Args:
         space: of the search. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.
 
     Raises:
-        UserError: a parameter that is not in the space, a mean outside its bounds, or no width.
+        UserError: a stated parameter is not in the space, a mean is outside its bounds, or there is no width.
     """
     names, means, widths = [], [], []
     for block, entry in stated.items():
@@ -129,7 +129,7 @@ def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, Arra
 
 
 def with_terms_of(stated: Stated, terms: Sequence[str], blocks_of: Any, every: Sequence[str]) -> list[str]:
-    """Return the terms and the stated parameters' terms; one parametrization of the tensors replaces the other."""
+    """Return `terms` plus those of the stated parameters; `inertia_scale` and `link` replace each other."""
     out = list(terms)
     for block in stated:
         own = [t for t in every if block in blocks_of(t)]

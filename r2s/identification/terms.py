@@ -1,4 +1,4 @@
-"""Terms of the model besides friction: which parameters they estimate, with which bounds and prior."""
+"""Terms of the model besides friction: the parameters that each adds, and their bounds and prior in SI units."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,8 +19,8 @@ TERMS = (
     *("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "signal_delay", "load", "gain"),
     *("drag", "drag_sin", "drag_cos"),
 )
-# terms without effect on the recorded torque: delay and lag lie between command and motion, gain in the sensor, and a
-# link-side sensor does not measure rotors
+# terms that do not affect a kind of torque: delay and lag lie between command and motion, gain and signal delay in
+# the measurement, and a link-side sensor does not measure rotors
 NO_EFFECT = {
     "commanded": ("gain", "signal_delay"),
     "measured": ("delay", "lag", "armature"),
@@ -32,7 +32,7 @@ NOTHING: Stated = {}
 
 
 def optional_friction() -> list[str]:
-    """Return the friction parameters, of any family, that are estimated only if a term names them."""
+    """Return the friction parameters of all families that are estimated only if a term names them."""
     return list(dict.fromkeys(name for f in known_families() for name in f.optional))
 
 
@@ -58,7 +58,7 @@ def blocks_of(term: str) -> tuple[str, ...]:
 
 
 def add_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:
-    """Return the terms and `more`; `link` replaces `inertia_scale`, because it includes the tensor."""
+    """Return `terms` plus `more`; `link` replaces `inertia_scale`, because it already includes the inertia tensor."""
     return [name for name in terms if not (name == "inertia_scale" and "link" in more)] + list(more)
 
 
@@ -70,13 +70,13 @@ def search_space(
     recording: Recording,
     stated: Stated = NOTHING,
 ) -> ParameterSpace:
-    """Return the space of the friction family's parameters and of the terms that act on the recorded torque.
+    """Return the parameter space of the friction family and of those terms that affect the recorded kind of torque.
 
-    bounds: as in `scaled_bounds`; the family's own bounds, in SI units, fill in for parameters without. stated: by
-    the user, of which fixed values count here (stated.py).
+    bounds: as in `scaled_bounds`; friction parameters that they lack have the family's own bounds, in SI units.
+    stated: the user's statements, of which only fixed values are used here (stated.py).
 
     Raises:
-        UserError: a term without bounds.
+        UserError: a term, or the whole family, has no bounds.
     """
     left_out = set(nominal.family.optional) - set(terms)
     own = [name for name in nominal.family.names if name not in left_out]
@@ -96,10 +96,10 @@ def search_space(
 def scaled_bounds(
     bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
 ) -> dict[str, Sequence[ArrayLike]]:
-    """Return bounds in SI units; torque-like parameters are given as shares of the largest torque.
+    """Return bounds in SI units; those of torque-like parameters are given relative to the largest torque.
 
-    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. For it
-    they reach at least up to that torque.
+    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. So for
+    motor torque, these bounds extend at least to the largest torque.
     """
     out = dict(bounds)
     for name, size in _sizes(robot, recording).items():
@@ -114,14 +114,14 @@ def scaled_bounds(
 def scaled_prior(
     prior: Mapping[str, ArrayLike | None], robot: Robot, recording: Recording, nominal: Dynamics | None = None
 ) -> dict[str, ArrayLike]:
-    """Return standard deviations in SI units, without the flat priors (None).
+    """Return the priors' standard deviations in SI units; flat priors (None) are left out.
 
-    Torque-like parameters are given as shares of the largest torque; logarithmic ones have no unit. A viscous
-    coefficient in the arm's file is a guess: its standard deviation is at least its value.
+    Those of torque-like parameters are given relative to the largest torque; logarithmic ones have no unit. A viscous
+    coefficient in the arm's file is a guess, so its standard deviation is at least its value.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():
-        if recording.torque == "measured":  # a Panda's wrist has sensor offsets and cables like its shoulder
+        if recording.torque == "measured":  # a Panda's wrist has as large sensor offsets as its shoulder
             size = np.max(size)
         if name in out and name not in logarithmic():
             out[name] = np.asarray(out[name], dtype=float) * size
@@ -131,5 +131,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return the unit of torque-like bounds and priors: the torque limit, or the recorded torque if it is larger."""
+    """Return `sizes` for the largest torque of each joint: its limit, or the recorded torque where that is larger."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

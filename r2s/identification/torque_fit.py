@@ -1,4 +1,4 @@
-"""How much of a recording's torque the nominal arm explains, and which other order, mounting or mass explains it."""
+"""How much of a recorded torque the nominal arm explains, and whether another joint order, mounting or mass does."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -12,19 +12,19 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia, nominal_torque, regressor
 from r2s.physics.robot import Robot
 
-MASS, MASS_LEFT = 3.0, 0.1  # a link's factor that is named, and the share of the misfit that it leaves, at most
-CARRIED = 3  # last links, whose mass an undeclared payload may explain
-TILTED = np.radians(20)  # angle of a mounting that is named; link masses are not known better
-INERTIA = 0.3, 4.0  # allowed scale of the nominal torque: published tensors, payloads, sensor gains
+MASS, MASS_LEFT = 3.0, 0.1  # least factor of a link's mass that is reported, and most of the misfit that it may leave
+CARRIED = 3  # number of last links whose mass is not judged, because a payload may be undeclared
+TILTED = np.radians(20)  # least angle of a mounting that is reported; uncertain masses may cause smaller ones
+INERTIA = 0.3, 4.0  # allowed factor of the nominal torque: errors of tensors, payloads, sensor gains
 FRICTION, OFFSET = 0.5, 0.1  # of tau_max, at most
-MAX_LEFT = 2.0  # upper limit of the unexplained share of a joint
-# gravity is judged where it changes: least RMS, of tau_max; factor of a standard error for correlated rows; largest
-# standard error of the share
+MAX_LEFT = 2.0  # upper limit of a joint's unexplained share
+# gravity is judged where it changes: least RMS of its change, of tau_max; factor by which correlated rows raise the
+# standard error; largest standard error of the share
 CHANGES, CORRELATED, MAX_SIGMA = 0.01, 3.0, 0.15
 
 
 class Moments(NamedTuple):
-    """Motion at which torque is compared: q, dq, ddq, tau (T, n), zero-phase filtered; dq and ddq are slopes of q."""
+    """Motion and torque, q, dq, ddq, tau (T, n), zero-phase filtered; dq and ddq are time derivatives of q."""
 
     q: np.ndarray
     dq: np.ndarray
@@ -33,14 +33,14 @@ class Moments(NamedTuple):
 
 
 class Unexplained:
-    """Share of a torque's square that the motion of its joint does not explain; `seen`: the judged joints."""
+    """Share of the recorded torque's square that the model leaves unexplained; `seen` are the judged joints."""
 
     def __init__(self, robot: Robot, m: Moments, gravity: bool):
         self.robot, self.m = robot, m
         self.seen, self.need = np.arange(robot.n), self.inverse_dynamics(gravity)
 
     def with_need(self, need: np.ndarray) -> "Unexplained":
-        """Return the same with another nominal torque (T, n) Nm."""
+        """Return a copy with another nominal torque (T, n) Nm."""
         out = copy(self)
         out.need = need
         return out
@@ -50,17 +50,17 @@ class Unexplained:
         return nominal_torque(self.robot, self.m.q, self.m.dq, self.m.ddq, gravity)
 
     def fit(self, parts: np.ndarray) -> np.ndarray:
-        """Return the factors (K,) of torques (K, T, n) Nm that all joints share, besides their own friction."""
+        """Return the factors (K,), equal for all joints, with which torques (K, T, n) Nm best fit tau - `need`."""
         rows = np.concatenate(self._apart([*parts, self.m.tau - self.need]))
         return np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0]
 
     def misfit(self) -> float:
-        """Return sum (tau - nominal torque)^2 / sum tau^2, after each joint's own friction is removed."""
+        """Return sum (tau - nominal torque)^2 / sum tau^2, after each joint's friction and offset are removed."""
         left, whole = np.square(np.concatenate(self._apart([self.m.tau - self.need, self.m.tau]))).sum(0)
         return float(left / max(whole, 1e-12))
 
     def scaled(self) -> tuple[np.ndarray, float]:
-        """Return each joint's factor (S,) of the nominal torque that fits tau best, and the misfit that is left."""
+        """Return for each joint the factor (S,) of nominal torque that fits tau best, and the remaining misfit."""
         factors, left, whole = [], 0.0, 1e-12
         for need, tau in (x.T for x in self._apart([self.need, self.m.tau])):
             factors.append(need @ tau / max(need @ need, 1e-12))
@@ -68,7 +68,7 @@ class Unexplained:
         return np.array(factors), left / whole
 
     def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return (T, K) of each joint, in shares of tau_max: torques (T, n) without its friction and offset."""
+        """Return for each joint (T, K), of tau_max: K torques (T, n) minus the friction and offset fitted to each."""
         out = []
         for j in self.seen.tolist():
             own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
@@ -77,7 +77,7 @@ class Unexplained:
         return out
 
     def gravity_shares(self) -> np.ndarray | None:
-        """Return the share of nominal gravity in tau for each joint whose motion determines it, or None."""
+        """Return the share of nominal gravity torque in tau, for each joint whose motion determines it, or None."""
         inertial = self.inverse_dynamics(False)
         weight, shares = self.inverse_dynamics(True) - inertial, []
         for j in self.seen:
@@ -93,15 +93,15 @@ class Unexplained:
         return np.array(shares) if shares else None
 
     def each(self, tau: np.ndarray) -> np.ndarray:
-        """Return (S,): the unexplained share of tau (T, n) of each joint, given its own motion."""
+        """Return the share (S,) of each joint's tau, a column of (T, n), that its own motion leaves unexplained."""
         return np.array([self._share(j, tau[:, j]) for j in self.seen.tolist()])
 
     def pairs(self) -> np.ndarray:
-        """Return (S, S): the unexplained share of column k of tau, given the motion of joint j."""
+        """Return (S, S): element j, k is the share of tau's column k that joint j's motion leaves unexplained."""
         return np.array([[self._share(j, self.m.tau[:, k]) for k in self.seen] for j in self.seen.tolist()])
 
     def _share(self, j: int, tau: np.ndarray) -> float:
-        """Explain tau (T,) Nm by joint j: nominal torque, a rotor, Coulomb and viscous friction, an offset."""
+        """Return the share of tau (T,) that joint j's nominal torque, rotor, friction and offset do not explain."""
         most, m = self.robot.tau_max[j], self.m
         slow = [m.ddq[:, j], np.tanh(m.dq[:, j] / WIDTH_DQ), m.dq[:, j]]
         scale = most / np.maximum([np.sqrt((x**2).mean()) for x in slow], 1e-9)
@@ -113,7 +113,7 @@ class Unexplained:
 
 
 def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return corrections by another order of all columns, or of tau's: by name, rotated, reversed, or two swapped."""
+    """Return (misfit, words) for other joint orders of tau or all signals: by name, rotated, reversed, swapped."""
     robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}
@@ -141,7 +141,7 @@ def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return corrections by another mass of one link, with its moments in proportion."""
+    """Return (misfit, words) for each link that would need another mass, with its moments in proportion."""
     robot, m, out = left.robot, left.m, []
     y = regressor(robot, m.q, m.dq, m.ddq, robot.gravity if gravity else None)
     standard, names = LinkInertia(robot.mass, robot.com, robot.inertia).standard(), robot.model(gravity=False)
@@ -159,7 +159,7 @@ def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def mounting(left: Unexplained) -> list[tuple[float, str]]:
-    """Return the correction by another direction of gravity, fitted to the torque: an arm on a wall or a ceiling."""
+    """Return (misfit, words) for a direction of gravity fitted to the torque, such as for an arm on a wall, or []."""
     robot, size = left.robot, float(np.linalg.norm(left.robot.gravity))
     inertial = left.inverse_dynamics(False)
     parts = np.array([left.inverse_dynamics(g) - inertial for g in np.eye(3)])

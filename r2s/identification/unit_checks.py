@@ -1,9 +1,9 @@
-"""Units, signs and joint order of a recording, judged by the arm's model.
+"""Checks of a recording's units, signs, joint order, gravity and clock against the arm's model.
 
 dq is compared with the slope of q, its integral with q (r2s/recordings/clock.py), and torque with the nominal arm's
-torque for the same motion. The judgement is coarse on purpose: a nominal arm that is wrong by a factor of 3, an
+torque for the same motion. The checks are coarse on purpose. A nominal arm that is wrong by a factor of 3, an
 undeclared payload, any friction and sensor offsets pass; a factor of 1000, of 57.3 or of -1, another joint order or
-mounting do not. r2s refuses a recording only if a correction leaves at most a quarter of what is unexplained.
+mounting do not. Most checks refuse a recording only if a correction leaves at most a quarter of the unexplained part.
 """
 
 from collections.abc import Sequence
@@ -19,26 +19,26 @@ from r2s.recordings.clock import check_clock
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # of the motion at which torques are compared
+CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # low-pass, rate and number of compared rows
 EDGE = 100  # ms, dropped at both ends of a trajectory, where the filter has transients
-JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s of a longer recording: of units; of the clock, and each part
-SLOWEST_HZ = 5.0  # sampling rate below which nothing is judged
+JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s of a longer recording: for units; for the clock, per part
+SLOWEST_HZ = 5.0  # sampling rate below which only the clock is judged
 MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
-STILL = 0.02  # rad, range of a joint that stands
-REFUSED, CORRECTED = 0.5, 0.25  # unexplained shares of a square: refused from; left by a correction, of that
-SUSPECT = 0.3  # misfit from which another order is tried; arms of our recordings: 0.006 to 0.21
-TURNED = 0.05  # misfit from which a mounting is tried: its three numbers must leave a tenth of it
-HELD = 0.05  # of tau_max RMS: a joint with so much gravity torque is judged even if it stands
-HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # shares of nominal gravity with which a torque includes it, or does not
-CURRENT = 0.005  # A/Nm, a smaller factor is no current: no arm's joint gives 200 Nm/A
-OVER_LIMIT = 3.0  # times tau_max, at most
-RATIO = 4.0  # factor between dq and the slope of q that is refused, like its inverse
+STILL = 0.02  # rad, largest range of a joint that counts as at rest
+REFUSED, CORRECTED = 0.5, 0.25  # unexplained share that is too much; relative share that a correction may leave
+SUSPECT = 0.3  # misfit above which other joint orders are tried; correct recordings had 0.006 to 0.21
+TURNED = 0.05  # misfit above which other mountings are tried; their three numbers must leave a tenth of it
+HELD = 0.05  # of tau_max RMS: a joint with so much nominal torque is judged even at rest
+HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # shares of nominal gravity in a torque with it; largest without it
+CURRENT = 0.005  # A/Nm, least factor of a current: no arm's joint has 200 Nm/A
+OVER_LIMIT = 3.0  # largest allowed torque over tau_max
+RATIO = 4.0  # factor between dq and the slope of q above which, or below its inverse, dq is refused
 UNITS = {"tau": {1e3: "mNm", 1e-3: "kNm"}, "dq": {np.degrees(1): "deg/s", 1e3: "mrad/s", np.radians(1): "", 1e-3: ""}}
 ORDER, UNITS_OF, GRAVITY, CLOCK, MASSES = "order of joints", "units and signs", "gravity", "clock", "masses"
 
 
 class DataError(UserError):
-    """A recording is refused; `check` names the check, one of those above."""
+    """Error for a recording that a check refuses; `check` is the check's name, such as ORDER."""
 
     def __init__(self, check: str, message: str):
         super().__init__(message)
@@ -47,11 +47,11 @@ class DataError(UserError):
 
 @dataclass(frozen=True)
 class Judged:
-    """What the checks of a recording measured; nan or None: the motion does not show it.
+    """Results of the checks of a recording; nan or None where the motion does not determine a result.
 
     Attributes:
-        clock: (n,) change of q over the integral of dq. scale: (n,) dq over the slope of q.
-        misfit: share of the torque's square that the nominal arm leaves. shares: (S,) of nominal gravity in tau.
+        clock: (n,) ratio of the change of q to the integral of dq. scale: (n,) ratio of dq to the slope of q.
+        misfit: unexplained share of the torque's square. shares: (S,) of nominal gravity in tau, by joint.
     """
 
     clock: np.ndarray
@@ -61,10 +61,10 @@ class Judged:
 
 
 def check_units(robot: Robot, recording: Recording) -> Judged | None:
-    """Return what was measured of clock, dq and tau, or None: too few rows are not judged.
+    """Check clock, dq and tau, and return the results, or None if there are too few rows.
 
     Raises:
-        DataError: dq or tau have other units, signs or joint order, or the clock is wrong.
+        DataError: dq or tau has another unit, sign or joint order, tau is implausible, or the clock is wrong.
     """
     moved = np.ptp(recording.q, axis=0) > STILL
     dead = np.flatnonzero(moved & (np.ptp(recording.tau, axis=0) == 0))
@@ -114,9 +114,9 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
     if not len(seen):
         return ratios
     s, v = slope[:, seen], dq[:, seen]
-    cross = s.T @ v / len(s)  # of joint j's slope and column k
+    cross = s.T @ v / len(s)  # of joint j's slope with column k of dq
     square = np.maximum((v**2).mean(0), 1e-12)
-    left = 1.0 - cross**2 / (size[seen, None] ** 2 * square)  # unexplained by any factor
+    left = 1.0 - cross**2 / (size[seen, None] ** 2 * square)  # share that no factor explains
     own = np.diag(left)
     if (swap := _swapped(left, own)) is not None:
         fits = _fits(seen, swap, "dq", "the slope of q of ")
@@ -146,7 +146,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints that other columns fit better, and these columns, or None; pairs (S, S): unexplained shares."""
+    """Return joints that other columns fit far better, and these columns, or None; for pairs see `Unexplained`."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():
@@ -167,7 +167,7 @@ def _check_torque(
         return None, None
     own = left.each(m.tau)
     tau = f"the recording: {recording.torque} tau"
-    corrections = []  # (what it leaves of the misfit, check, description)
+    corrections = []  # (remaining share of the misfit, check, description)
     if own.mean() > REFUSED or most.max() > OVER_LIMIT:
         for factor, unit in UNITS["tau"].items():
             words = f"is {factor:g} times what {robot.name} needs for this motion: {unit}, not Nm?"
@@ -177,7 +177,7 @@ def _check_torque(
         corrections.append((left.each(-m.tau).mean() / own.mean(), UNITS_OF, words))
     misfit = left.misfit()
     if misfit > SUSPECT:
-        kind = left.with_need(left.inverse_dynamics(not gravity)).misfit()  # of the other kind of torque
+        kind = left.with_need(left.inverse_dynamics(not gravity)).misfit()  # with or without gravity, the opposite
         limit = min(SUSPECT, kind)
         orders = [(after / misfit, ORDER, words) for after, words in other_orders(left, gravity) if after < limit]
         corrections += orders
@@ -215,14 +215,14 @@ def _check_torque(
                 "data.torque=motor and data.torque_constant=[Nm/A of each joint, gear included]",
             )
         raise DataError(GRAVITY, f"{tau} hardly contains gravity {mean}: is it data.torque=commanded?")
-    # an undeclared payload adds another share to each joint
+    # with an undeclared payload, shares would differ between joints
     if not gravity and shares.min() > HAS_GRAVITY[0] and shares.max() < HAS_GRAVITY[1]:
         raise DataError(GRAVITY, f"{tau} contains gravity {mean}: is it data.torque=measured?")
     return misfit, shares
 
 
 def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, str, str]]:
-    """Return corrections of single joints: swapped columns, and flipped signs."""
+    """Return (remaining misfit, check, description) for corrections of some joints: other columns, other signs."""
     seen, out, pairs = left.seen, [], left.pairs()
     if (swap := _swapped(pairs, own)) is not None:
         order = np.arange(len(seen))
@@ -238,7 +238,7 @@ def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, s
 
 
 def _listed(joints: Sequence[int] | np.ndarray) -> str:
-    """Return " 3" or "s 1, 2, 3" for joints from 0."""
+    """Return " 3" or "s 1, 2, 3" for joints that are counted from 0."""
     return f"{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
 
 

@@ -1,7 +1,7 @@
-"""A verdict on a recording before it is fitted: a line per check, pass, warn or fail, and the widths to expect.
+"""Verdict on a recording before it is fitted: pass, warn or fail for each check, and expected interval widths.
 
-A recording fails if the checks of an identification refuse it (checks.py, unit_checks.py); the lines show what they
-measured.
+A recording fails if the checks of an identification refuse it (checks.py, unit_checks.py). Each line also shows what
+its check measured.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,19 +26,19 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 PASS, WARN, FAIL, OPEN = "pass", "warn", "fail", "-"  # OPEN: not judged
-UNEVEN, UNEVEN_SHARE = 0.5, 0.05  # of the median step: a step that is uneven; share of the rows that may be
+UNEVEN, UNEVEN_SHARE = 0.5, 0.05  # an uneven step's deviation, of the median step; allowed share of such steps
 OFF_CLOCK = 0.03  # filters of dq and elastic gears change slow motion by 1 to 2 % (recordings/clock.py)
 LATE_S = 1e-3  # s, or half a row: the resolution of a log
 SURE = 2.0  # standard deviations
-LOADED = 0.7, 1.4  # shares of nominal gravity without an undeclared load: masses of files are known to a third
-SPEEDS_S = 600.0  # s of a longer recording whose speeds are counted
-FAST, SLOW = 0.2, 0.05  # of dq_max: a friction curve reaches from below SLOW to beyond FAST
-LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # shares of the moving rows below SLOW, and in each direction
+LOADED = 0.7, 1.4  # shares of nominal gravity that need no undeclared load: files' masses are accurate to a third
+SPEEDS_S = 600.0  # s of a longer recording whose speeds are examined
+FAST, SLOW = 0.2, 0.05  # of dq_max: a friction curve needs speeds from below SLOW to above FAST
+LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # least shares of moving rows that are below SLOW, and in each direction
 
 
 @dataclass(frozen=True)
 class Line:
-    """A check: its verdict, what was found, what to do about it, and the numbers by name (arrays are per joint)."""
+    """Outcome of a check: verdict, finding, advice, and the measured values by name (arrays are per joint)."""
 
     check: str
     verdict: str
@@ -52,28 +52,28 @@ class Line:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The lines of a recording, and the widths to expect; None after a fail."""
+    """The outcomes of all checks of a recording, and the expected widths; these are None if a check fails."""
 
     lines: tuple[Line, ...]
     expected: ExpectedWidths | None = None
 
     @property
     def fails(self) -> list[Line]:
-        """Lines that refuse the recording."""
+        """Lines of the checks that refuse the recording."""
         return [line for line in self.lines if line.verdict == FAIL]
 
     @property
     def warnings(self) -> list[Line]:
-        """Lines that warn."""
+        """Lines of the checks that warn."""
         return [line for line in self.lines if line.verdict == WARN]
 
     @property
     def worst(self) -> str:
-        """The verdict on the whole."""
+        """The verdict on the recording as a whole: that of the worst check."""
         return FAIL if self.fails else WARN if self.warnings else PASS
 
     def refuse(self, name: str = "") -> None:
-        """Raise UserError with the first fail; `name` of the recording begins it."""
+        """Raise UserError about the first failed check, if any; the message begins with `name`, the recording's."""
         for line in self.fails:
             raise UserError(f"{name}{line.found}")
 
@@ -96,7 +96,7 @@ def judge(robot: Robot, nominal: Dynamics, recording: Recording, settings: Setti
     """Return the verdict on a recording.
 
     Args:
-        robot, nominal: the arm, and where an identification starts.
+        robot, nominal: the arm, and the dynamics at which an identification starts.
         recording: with its period, if the motion repeats (`Recording.in_phase`).
         settings: of the identification.
     """
@@ -254,13 +254,13 @@ def _listed(joints: Sequence[int] | np.ndarray) -> str:
 
 
 def _span(x: np.ndarray, form: str = "{:.3g}") -> str:
-    """Return "0.98 to 1.02", of the values that are there."""
+    """Return the range of the values that are not nan, such as "0.98 to 1.02"."""
     low, high = form.format(np.nanmin(x)), form.format(np.nanmax(x))
     return low if low == high else f"{low} to {high}"
 
 
 def with_validation(verdict: Verdict, error: UserError | None, name: str = "") -> Verdict:
-    """Return the verdict with a line about a validation file, which `error` refuses; name: if there are several."""
+    """Return the verdict with a line about validation file `name`; error: why it is refused, or None."""
     check = f"validation {name}".strip()
     line = Line(check, FAIL, str(error)) if error else Line(check, PASS, "holds other motion")
     return replace(verdict, lines=(*verdict.lines, line))

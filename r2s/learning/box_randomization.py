@@ -1,4 +1,4 @@
-"""Domain randomization of a box that is pushed: `dr=box`."""
+"""Domain randomization of a box that the tool pushes: `dr=box`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ RANGES = "mass", "table", "friction", "damping", "bristle"
 
 @dataclass(frozen=True, kw_only=True)
 class BoxRandomization(UniformRandomization):
-    """Arms as of `UniformRandomization`, each with a box of its own.
+    """Arms from `UniformRandomization`, each with its own random box.
 
     mass ~ log U(mass); stiffness ~ log U(stiffness); table, friction, damping, bristle ~ U
     x, y ~ U(-spread, spread) and yaw ~ U(-yaw, yaw) about the nominal place
@@ -24,10 +24,10 @@ class BoxRandomization(UniformRandomization):
     Attributes:
         size: (3,) m, edges. mass: kg, table, friction (with the tip), stiffness: N/m, damping: s/m, bristle: m, all
             [least, most], see `Surface`.
-        spread: m. yaw: degrees. point: (3,) m, normal: (3,), of the table; None: of `table_frame`.
+        spread: m. yaw: degrees. point: (3,) m, normal: (3,), of the table; None: default of `table_frame`.
 
     Raises:
-        UserError: a range that is none, a box that would tilt, or no tool.
+        UserError: a range is malformed, the box would tilt, or there is no tool.
     """
 
     size: Sequence[float]
@@ -56,7 +56,7 @@ class BoxRandomization(UniformRandomization):
         check_number("dr.yaw", self.yaw, "[0, 180]")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return the dynamics of m arms."""
+        """Return random dynamics of m arms, each with its box."""
 
         def drawn(low: float, high: float) -> np.ndarray:
             return rng.uniform(low, high, m)

@@ -1,8 +1,8 @@
 """Checkpoints of a training: its state in one file, and the transitions of the replay buffer in chunks beside it.
 
 Each transition is written once. The state names the chunks that belong to it, so an interrupted write leaves the
-previous checkpoint intact. A chunk is removed when the buffer has overwritten all of it, so the files hold the buffer
-and at most one interval between checkpoints more. Files hold tensors, numbers and names only, which
+previous checkpoint intact. A chunk is removed when the buffer has overwritten all of it. So the files hold the buffer
+and at most the transitions of one more checkpoint interval. Files hold tensors, numbers and names only, which
 torch.load(weights_only=True) reads.
 """
 
@@ -20,11 +20,11 @@ from r2s.learning.replay import Replay
 
 
 class Checkpoint:
-    """The checkpoint of one training in a folder of its own."""
+    """The checkpoint of one training, in its own folder."""
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._chunks = list[int]()  # transitions seen at the end of each chunk, which begins at the end before
+        self._chunks = list[int]()  # for each chunk, transitions seen at its end; the next chunk begins there
 
     @property
     def env_steps(self) -> int:
@@ -47,7 +47,7 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill `replay`, an empty buffer, with the saved transitions and return the state; None without a checkpoint.
 
-        Every transition has the row that it had, so a seed draws the same batches.
+        Every transition gets its former row, so a seed draws the same batches.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.
@@ -74,7 +74,7 @@ class Checkpoint:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-# parts of torch's RuntimeError on a full disk; which one appears depends on the place in its writer
+# parts of torch's RuntimeError on a full disk; which one appears depends on where the write fails
 DISK_FULL = ("PytorchStreamWriter", "iostream error", "inline_container.cc")
 
 
@@ -93,7 +93,7 @@ def load_tensors(path: Path, option: str) -> dict[str, Any]:
     """Return what `save_tensors` wrote: tensors, numbers and names, never a pickled object.
 
     Raises:
-        UserError: the file is missing or damaged; the line begins with `option`.
+        UserError: the file is missing or damaged; the message begins with `option`.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)  # perhaps written on a GPU

@@ -1,7 +1,7 @@
-"""Demonstrations: a task's model-based reference, with noise, fills the replay buffer before the updates.
+"""Demonstrations: a model-based controller with noise fills the replay buffer before the first update.
 
-Off-policy learners need no more than good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random
-torques hardly ever reach a goal and stay there. The reference does both, and its noise shows what is near its motion.
+Off-policy learners need only good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random torques
+hardly ever reach a goal and stay there. The controller does both, and its noise explores around its motion.
 """
 
 import math
@@ -17,15 +17,15 @@ from r2s.tasks.push import PushTask
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-NOISE = 0.3  # of an action, standard deviation for the last arm; first choice, development seeds 0 to 2 of reach
-KEPT = 0.9  # correlation of the noise from step to step: white noise hardly moves an arm
+NOISE = 0.3  # standard deviation on the last arm's action; first value tried, development seeds 0 to 2 of reach
+KEPT = 0.9  # correlation of the noise between steps: white noise hardly moves an arm
 
 
 class Demonstrator:
-    """A reference with noise; arm i of B has a standard deviation of NOISE i / (B - 1), so the first has none.
+    """A model-based controller with noise; on arm i of B its standard deviation is NOISE i / (B - 1), 0 on the first.
 
     Args:
-        reference: acts like `r2s.learning.networks.Policy`.
+        reference: the controller, with the interface of `r2s.learning.networks.Policy`.
     """
 
     def __init__(self, reference: Oracle | Pusher):
@@ -39,10 +39,10 @@ class Demonstrator:
 
 
 def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstrator | None:
-    """Return the demonstrator of reaching with torque or of pushing with the task's impedance, else None.
+    """Return the demonstrator for reaching with torque, or for pushing with a Cartesian impedance, else None.
 
     Args:
-        robot, task: the arm and its task. dynamics: model of one arm, about which a training draws.
+        robot, task: the arm and its task. dynamics: model of one arm, the center of the training's draws.
     """
     control = task.control(robot)
     if isinstance(task, ReachTask) and control.name == "torque":

@@ -1,7 +1,7 @@
 """A task as a batch-locked TorchRL environment on simulated arms.
 
-A step of all arms: action -> command of the task's controller -> one control period of r2s/learning/vector_arms.py ->
-observation, reward terms, truncation. Episodes are truncated and never terminate, so values bootstrap at their end.
+One step of all arms: action -> command of the task's controller -> one control period of r2s/learning/vector_arms.py
+-> observation, reward terms, truncation. Episodes are truncated and never terminate, so critics bootstrap at the end.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from r2s.physics.robot import Robot
 from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State, Task, observation_scale, observe
 
-GROUPS = 8  # groups of arms that reset together: a reset of four arms costs hardly more than of one
+GROUPS = 8  # groups of arms that reset together: resetting four arms costs hardly more than resetting one
 
 
 class TaskEnv(EnvBase):
@@ -34,8 +34,8 @@ class TaskEnv(EnvBase):
         robot, task: the arm and its task.
         draw: domain randomization, called at every reset; a `Pushes` also applies joint torques at every step.
         nsim: number of arms. nthread: threads, 0: all cores.
-        seed: of goals, starts and draws.
-        stagger: end the first episodes of GROUPS groups of arms at different times.
+        seed: seed of goals, starts and draws.
+        stagger: whether GROUPS groups of arms end their first episodes at different times.
         reward: terms and weights; None: the task's terms with its `paper_weights`.
     """
 
@@ -61,12 +61,12 @@ class TaskEnv(EnvBase):
         first = self._drawn(nsim)
         self.arms = self.arms_type(robot, task, first, nsim, nthread, seed=of_noise)
         self.reward, self.control = reward or Reward(), task.control(robot)
-        self.reward.terms(task)  # raises for a task with other terms
+        self.reward.terms(task)  # raises if the reward does not fit the task
         self.weights = self.reward.weights(task, 0.0)
-        self._factor = self.reward.factor  # of `set_progress`, as are the sum of the terms and its steps
+        self._factor = self.reward.factor  # for `set_progress`, like the sum of the terms and its steps
         self._seen, self._seen_steps = np.zeros_like(self.weights), 0
         self._torque = task.torque_limit(robot)
-        self._staggered = self._stagger = stagger  # as given, and whether the next reset does it
+        self._staggered = self._stagger = stagger  # the setting, and whether the next reset staggers
         self._pool = task.goals(robot, np.random.default_rng(of_goals), task.pool)
         self.goal = np.zeros((nsim, *self._pool.shape[1:]))
         self._dq, self._count = np.zeros((nsim, robot.n)), np.zeros(nsim, dtype=np.int64)
@@ -84,9 +84,9 @@ class TaskEnv(EnvBase):
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
 
     def set_progress(self, progress: float) -> None:
-        """Set the weights of the reward to those at this share, 0 to 1, of a training, for loops of other libraries.
+        """Set the reward weights for the spent share of a training, 0 to 1; for training loops of other libraries.
 
-        Its factor adapts to the steps since the last call, as in `r2s.learning.train.train`.
+        The reward's factor adapts to the steps since the last call, as in `r2s.learning.train.train`.
         """
         if self._seen_steps:
             mean = self._seen / self._seen_steps
@@ -95,7 +95,7 @@ class TaskEnv(EnvBase):
         self.weights = self.reward.weights(self.task, progress, self._factor)
 
     def place(self, q: np.ndarray, goal: np.ndarray, ids: np.ndarray | None = None) -> State:
-        """Start episodes of the arms `ids` (all by default) at rest at q (m, n) with goals (m, ...)."""
+        """Start episodes of the arms `ids` (all by default) at rest at q (m, n) rad with goals (m, ...)."""
         state = self.arms.place(q, ids=ids)
         at = slice(None) if ids is None else ids
         self.goal[at], self._dq[at], self._count[at] = goal, 0.0, 0
@@ -130,9 +130,9 @@ class TaskEnv(EnvBase):
         return replace(drawn, speed_noise=np.maximum(drawn.speed_noise, noise))
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Return the step and the next state, in which truncated episodes have restarted.
+        """Return the step, and the next state after a reset of truncated episodes.
 
-        Same as in EnvBase, without its checks and copies, which take a fifth of a step of 32 arms.
+        It does the same as in EnvBase without checks and copies, which take a fifth of the time of a step of 32 arms.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)
@@ -140,7 +140,7 @@ class TaskEnv(EnvBase):
         return tensordict, self._present(self._restart(cut)) if len(cut) else after.exclude("reward")
 
     def read(self) -> TensorDict:
-        """Return the tensordict of the present state."""
+        """Return the tensordict of the current state."""
         return self._present(self.arms.read())
 
     def _present(self, state: State) -> TensorDict:
@@ -170,7 +170,7 @@ class TaskEnv(EnvBase):
         return self.reward.judge(self.task, state, ddq, self.goal, self._scale)
 
     def state(self) -> dict[str, Any]:
-        """Return the state of simulation and generators for `set_state`: arrays, numbers and names."""
+        """Return the state of simulation and generators, in arrays, numbers and names, for `set_state`."""
         own = {name: getattr(self, name).copy() for name in ("goal", "_dq", "_count", "_scale")}
         return own | {"arms": self.arms.state(), "rng": self.rng.bit_generator.state, "_stagger": self._stagger}
 
@@ -202,7 +202,7 @@ class TaskEnv(EnvBase):
         return after
 
     def _forces(self, draw: Pushes) -> np.ndarray:
-        """Return (nsim, n) Nm, the torques of the next control step."""
+        """Return (nsim, n) Nm, the external joint torques of the next control step."""
         return draw.forces(self.rng, self.nsim)
 
     def _set_seed(self, seed: int | None) -> None:

@@ -1,6 +1,6 @@
 """Evaluation in simulation: 200 fixed episodes, deterministic, the same for every policy.
 
-There are two sets of goals, starts and draws. SELECTION selects the best policy during a training. REPORT gives the
+There are two sets of goals, starts and draws. SELECTION selects the best policy during a training. REPORT is for the
 reported measures; no policy is selected on it. Settings of conf/algo and conf/reward were compared on REPORT as well,
 so benchmarks/minutes.py uses a third set.
 """
@@ -20,7 +20,7 @@ SELECTION, REPORT = 7_000_000, 2_026_1122  # seeds, larger than those of trainin
 
 
 def generators(seed: int) -> list[np.random.Generator]:
-    """Return independent generators of starts, goals and draws."""
+    """Return independent random generators for starts, goals and draws."""
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)]
 
 
@@ -32,14 +32,14 @@ def fixed_episodes(robot: Robot, task: Task, count: int, seed: int = REPORT) -> 
 
 
 def fixed_draws(draw: Draw, count: int, seed: int = REPORT) -> Dynamics:
-    """Return the dynamics of the arms of these episodes."""
+    """Return the dynamics of the arms in the fixed episodes."""
     return draw(generators(seed)[2], count)
 
 
 def make_evaluation(
     robot: Robot, task: Task, draw: Draw, *, episodes: int = 200, nthread: int = 0, seed: int = REPORT
 ) -> Callable[[PolicyLike], Episodes]:
-    """Return policy -> Episodes, which runs all fixed episodes in parallel, each on an arm with its own fixed draw.
+    """Return a function policy -> Episodes that runs all fixed episodes in parallel, each on an arm of its own draw.
 
     The function raises FloatingPointError if an action or a reward is not finite.
     """

@@ -1,7 +1,7 @@
 """A task as Gymnasium environments: `ArmVectorEnv`, a batch of simulated arms, and `ArmEnv`, one of them.
 
-Each arm of a batch has its own random generator, so that arm i goes through the episodes of a single arm with its
-seed. Observations are normalised with the scales of the task, as in the policies of r2s.
+Each arm of a batch has its own random generator, so arm i runs the same episodes as a single arm with the same seed.
+Observations are normalised with the scales of the task, as in the policies of r2s.
 """
 
 from typing import Any
@@ -22,14 +22,14 @@ from r2s.physics.robot import Robot
 from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State, Task, observation_scale
 
-SEEDS = 2**63  # of the episodes of an arm
+SEEDS = 2**63  # number of seeds for an arm's episodes
 
 
 class SeparateArms(VectorArms):
-    """`VectorArms` with a generator of sensor noise per arm, `streams`, which also gives the torques of `Pushes`."""
+    """`VectorArms` with one generator per arm, `streams`, for sensor noise and for the torques of `Pushes`."""
 
     def seed(self, seed: int | np.random.SeedSequence) -> None:
-        """Restart the sensor noise of all arms."""
+        """Restart the generators of all arms from this seed."""
         super().seed(seed)
         self.streams = self._rng.spawn(self.width)
 
@@ -43,7 +43,7 @@ class SeparateArms(VectorArms):
 
 
 class SeparateEnv(TaskEnv):
-    """`TaskEnv` whose arm i takes the seeds of its episodes from `rngs[i]`."""
+    """`TaskEnv` whose arm i draws the seeds of its episodes from `rngs[i]`."""
 
     arms_type = SeparateArms
     arms: SeparateArms
@@ -62,19 +62,19 @@ class SeparateEnv(TaskEnv):
 class ArmVectorEnv(gym.vector.VectorEnv):
     """`num_envs` simulated arms at a task, stepped together.
 
-    Observations (num_envs, d) float32 are in standard deviations of the task, clipped to 10; actions (num_envs, a)
+    Observations (num_envs, d) float32 are normalised by the task's scales and clipped to 10. Actions (num_envs, a)
     are clipped to [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal, m; `info["reward_terms"]`
-    (num_envs, k) are the terms of the reward, without weights, and 0 in an arm that has just restarted. Episodes are
+    (num_envs, k) are the unweighted terms of the reward, 0 for an arm that has just restarted. Episodes are
     truncated after `task.steps` steps.
 
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
         num_envs: number of arms. nthread: threads, 0: all cores.
-        reward: terms and weights, those of the beginning of a training until `set_progress`; None: as in `TaskEnv`.
+        reward: terms and weights; until `set_progress`, weights at the start of a training. None: as in `TaskEnv`.
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
-        UserError: another autoreset_mode.
+        UserError: the autoreset_mode is none of these three.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.observation_space, self.action_space = (gym.vector.utils.batch_space(s, num_envs) for s in spaces)
 
     def set_progress(self, progress: float) -> None:
-        """Set the weights of the reward to those at this share, 0 to 1, of a training; see `TaskEnv.set_progress`."""
+        """Set the reward weights for the spent share of a training, 0 to 1; see `TaskEnv.set_progress`."""
         self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
-        """Return observations (m, d) of r2s as this environment gives them."""
+        """Return observations (m, d) of r2s in the normalised form of this environment."""
         return ((observation - self.mean) / self.std).clip(-CLIP, CLIP).astype(np.float32)
 
     def reset(
@@ -116,7 +116,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes of all arms, or of the arms of `options["reset_mask"]` (num_envs,) bool.
 
-        seed: of arm 0, with seed + i for arm i, or a list, one for each arm; None: the arms' generators go on.
+        seed: a number, arm i gets seed + i; or a list with one seed per arm; None: the arms' generators continue.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
@@ -133,10 +133,10 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         """Run one control period.
 
         Raises:
-            UserError: actions of another shape, or in the mode Disabled of an arm whose episode has ended.
+            UserError: the actions have another shape, or, in mode Disabled, the episode of an arm has ended.
             FloatingPointError: an action is not finite.
         """
-        waiting = self.ended.copy()  # arms that the mode NextStep resets in this step; their physics runs unseen
+        waiting = self.ended.copy()  # arms that mode NextStep resets in this step; their result is discarded
         if waiting.any() and self.mode == AutoresetMode.DISABLED:
             raise UserError(f"step: the episode of arm {waiting.argmax()} has ended; reset it first")
         action = np.asarray(actions, dtype=np.float32)
@@ -177,7 +177,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
 
 
 class ArmEnv(gym.Env):
-    """One simulated arm: `ArmVectorEnv` with a single arm and without automatic resets; arguments as there."""
+    """One simulated arm: an `ArmVectorEnv` of one arm without automatic resets, with the same arguments."""
 
     def __init__(self, robot: Robot, task: Task, draw: Draw, *, reward: Reward | None = None):
         self.batch = ArmVectorEnv(robot, task, draw, nthread=1, reward=reward, autoreset_mode=AutoresetMode.DISABLED)
@@ -189,7 +189,7 @@ class ArmEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; `seed` sets the random numbers of this and all later episodes."""
+        """Start a new episode; `seed` determines the random numbers of this and all later episodes."""
         super().reset(seed=seed)
         self.batch.env.rngs = [self.np_random]
         observation, info = self.batch.reset()
@@ -203,5 +203,5 @@ class ArmEnv(gym.Env):
 
 
 def _single(info: dict[str, Any]) -> dict[str, Any]:
-    """Return the info of the only arm."""
+    """Return the info of the single arm."""
     return {"distance": float(info["distance"][0]), "reward_terms": info["reward_terms"][0]}

@@ -1,4 +1,4 @@
-"""What DDPG, TD3, SAC and TQC share: networks, optimizer, target networks and the interface of a learner."""
+"""Base classes of DDPG, TD3, SAC and TQC: networks, optimizer, target networks and interface of a learner."""
 
 import copy
 import math
@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from r2s.errors import UserError, check_number
 from r2s.learning.networks import Actor, Critics, Normalizer, Policy
 
-KERNELS = 4  # C++ files of a compiled update, at most
+KERNELS = 4  # most C++ files of a compiled update
 
 
 class Learner(nn.Module, ABC):
@@ -25,14 +25,14 @@ class Learner(nn.Module, ABC):
 
     Args:
         scale: mean and standard deviation (d,) that normalize an observation.
-        action_scale: (a,), an action of 1 in SI units; part of the policy.
+        action_scale: (a,), value of an action of 1 in SI units; part of the policy.
         critics: number of critics, and outputs of each.
         hidden: units per hidden layer of actor and critics.
         gamma: discount. tau: Polyak step of the target networks. lr: learning rate of Adam.
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
             critics hardly distinguish actions, the policy then prefers small actions to alternating full torque.
-        explore_correlation: of the exploration noise of an arm between two steps, a first-order process with constant
-            variance; 0: white. Correlated noise moves an arm as far as white noise with less acceleration (Lillicrap
+        explore_correlation: correlation of an arm's exploration noise, a first-order process with constant variance,
+            between two steps; 0: white. For equal displacement, correlated noise accelerates an arm less (Lillicrap
             et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
 
     Raises:
@@ -40,7 +40,7 @@ class Learner(nn.Module, ABC):
     """
 
     action_scale: Tensor
-    compiled: tuple[str, ...] = ("gradients",)  # methods that take most of an update
+    compiled: tuple[str, ...] = ("gradients",)  # methods that take most of an update's time
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Learner(nn.Module, ABC):
         self.register_buffer("action_scale", action_scale.float())
         self.gamma, self.tau, self.lr, self.action_l2 = gamma, tau, lr, action_l2
         self.explore_correlation, self.explore_share = explore_correlation, 1.0
-        self._noise: Tensor | None = None  # of the last exploration
+        self._noise: Tensor | None = None  # that of the last exploration
         self.updates = 0
         # One optimizer suffices: Adam skips parameters without a gradient, such as the actor's in a delayed update.
         self.optimizer = torch.optim.Adam([*self.actor.parameters(), *self.critics.parameters()], lr=lr, fused=True)
@@ -83,7 +83,7 @@ class Learner(nn.Module, ABC):
 
     @abstractmethod
     def losses(self, batch: Mapping[str, Tensor], *noise: Any) -> dict[str, Tensor]:
-        """Return the losses of a batch, with names that begin with loss_, and other scalars to log.
+        """Return the losses of a batch, under names that begin with loss_, and other scalars to log.
 
         The random draws are arguments, so that the tests can compare the losses with TorchRL's.
 
@@ -101,9 +101,9 @@ class Learner(nn.Module, ABC):
         """
 
     def gradients(self, batch: Mapping[str, Tensor], *noise: Any) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
-        """Return `losses` of a batch in SI units and the gradient of their sum by each of `trained`.
+        """Return `losses` of a batch in SI units, and the gradient of their sum with respect to each of `trained`.
 
-        They are one function, so that they are compiled to one graph; `backward` would be a second one.
+        One function computes both, so that they compile to one graph; `backward` would be a second graph.
         """
         return differentiate(self.losses(self.normalized(batch), *noise), self.trained)
 
@@ -137,14 +137,14 @@ class Learner(nn.Module, ABC):
 
     @property
     def trained(self) -> list[Tensor]:
-        """The parameters that the optimizer moves: all but those of target networks."""
+        """The parameters that the optimizer changes: all but those of target networks."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def compile(self, batch_size: int) -> bool:  # type: ignore[override]
         """Compile the losses with their gradient for this batch size, before the first update.
 
-        This takes half a minute of a core, some seconds if the machine has cached it. On a GPU it captures a graph.
-        If compilation fails, for example without a C++ compiler, one warning appears and the losses stay uncompiled.
+        This takes half a minute of one core, or some seconds with a cached result. On a GPU it captures a graph.
+        If compilation fails, for example without a C++ compiler, it warns once, and the losses stay uncompiled.
 
         Returns:
             Whether the losses are compiled.
@@ -160,13 +160,13 @@ class Learner(nn.Module, ABC):
         batch = {k: torch.zeros(batch_size, size, device=self.action_scale.device) for k, size in sizes.items()}
         batch |= {k: torch.zeros(batch_size, device=self.action_scale.device) for k in ("reward", "terminated")}
         devices = [self.action_scale.device] if self.action_scale.is_cuda else []
-        # by default torch starts a compiling process per core, in each of as many jobs of a sweep
+        # by default torch starts a compiling process per core, and a sweep runs many jobs at once
         workers = {} if devices else {"compile_threads": min(torch.get_num_threads(), KERNELS)}
         try:
             for name, method in eager.items():
                 setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
             traced = dynamo.patch(trace_autograd_ops=True)  # torch.autograd.grad within the graph
-            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # the update draws noise
+            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # because the update draws noise
                 self.update(batch)
         except RuntimeError as error:
             why = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -180,7 +180,7 @@ class Learner(nn.Module, ABC):
         return True
 
     def descend(self, losses: Mapping[str, Tensor], trained: Sequence[Tensor], gradients: Sequence[Tensor]) -> None:
-        """Take one Adam step on the parameters `trained` with the gradients of these losses.
+        """Take one Adam step on the parameters `trained` with their gradients, if the losses are finite.
 
         Raises:
             FloatingPointError: a loss is not finite; the learner is unchanged.
@@ -200,14 +200,14 @@ class Learner(nn.Module, ABC):
 
     def set_extra_state(self, state: dict) -> None:
         """Restore what `get_extra_state` returned."""
-        # torch keeps the given moments by reference: without a copy two learners would write into them
+        # torch keeps references to the given moments: without a copy, two learners would share and overwrite them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         noise = state.get("noise")  # older checkpoints have none
         self.updates, self._noise = state["updates"], None if noise is None else noise.to(self.action_scale.device)
 
 
 class DeterministicLearner(Learner):
-    """What DDPG and TD3 share: a deterministic policy with a target network, and Gaussian exploration noise.
+    """Base class of DDPG and TD3: a deterministic policy with a target network, and Gaussian exploration noise.
 
     Args:
         scale, action_scale, critics, shared: see `Learner`.
@@ -237,11 +237,11 @@ class DeterministicLearner(Learner):
 
 
 class EntropyLearner(Learner):
-    """What SAC and TQC share: a stochastic policy, and a temperature that holds its entropy.
+    """Base class of SAC and TQC: a stochastic policy, and a temperature that controls its entropy.
 
     Args:
         scale, action_scale, critics, shared: see `Learner`.
-        alpha_init: initial temperature. target_entropy: its goal; None: minus the number of actions.
+        alpha_init: initial temperature. target_entropy: of the policy; None: minus the dimension of an action.
     """
 
     entropy_goal: Tensor
@@ -261,13 +261,13 @@ class EntropyLearner(Learner):
             check_number("target_entropy", target_entropy, "(-inf, inf)")
         super().__init__(scale, action_scale, critics, **shared)
         self.target_entropy = -float(len(action_scale)) if target_entropy is None else target_entropy
-        # a tensor, so that compiled losses follow it
+        # a tensor, so that compiled losses use its current value
         self.register_buffer("entropy_goal", torch.tensor(float(self.target_entropy)), persistent=False)
         self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Move the goal of the entropy: a Gaussian whose standard deviations are multiplied by `share`."""
+        """Shift the target entropy by that of a Gaussian whose standard deviations are multiplied by `share`."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -277,7 +277,7 @@ class EntropyLearner(Learner):
 
         Args:
             batch: see `update`, with normalized observations.
-            noise: two standard normal draws (B, a), for the next action and for the action of the actor's loss.
+            noise: two standard normal draws (B, a): for the next action, and for the action in the actor's loss.
         """
 
     @torch.no_grad()
@@ -294,7 +294,7 @@ class EntropyLearner(Learner):
         return out | {"alpha": self.log_alpha.detach().exp()}
 
     def entropy_losses(self, alpha: Tensor, value: Tensor, action: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        """Return actor and alpha losses and the entropy; value, log_prob (B,) of action (B, a)."""
+        """Return actor and alpha losses and the entropy; value and log_prob (B,) belong to action (B, a)."""
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.entropy_goal)).mean()
         return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}
@@ -320,13 +320,13 @@ def total(losses: Mapping[str, Tensor]) -> Tensor:
 def differentiate(
     losses: Mapping[str, Tensor], trained: Sequence[Tensor]
 ) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
-    """Return the scalars, detached, and the gradient of `total` by these parameters."""
+    """Return the scalars, detached, and the gradient of `total` with respect to the parameters `trained`."""
     return {k: v.detach() for k, v in losses.items()}, torch.autograd.grad(total(losses), trained)
 
 
 @torch.no_grad()
 def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
-    """Move every parameter of `target` by the share tau towards that of `source`."""
+    """Move every parameter of `target` by the fraction tau towards that of `source`."""
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
 
 

@@ -1,6 +1,6 @@
 """Model-based baselines: minimum-jerk joint motion, computed torque, friction compensation.
 
-They have the interface, observations and rate of a policy, and use the model that policies train in.
+They have the interface, observations and rate of a policy, and use the model in which policies train.
 """
 
 import mujoco
@@ -19,16 +19,16 @@ from r2s.tasks.task import Task
 
 STIFF = 12.0  # rad/s, bandwidth of the critically damped feedback; the limit at 50 Hz with the latency of an arm
 POSTURE = 1e-3  # m^2, weight of the start posture in the inverse kinematics
-FAST = 0.9 * ALLOWED  # share of a joint's velocity limit, below that of the safety filter
+FAST = 0.9 * ALLOWED  # share of a joint's speed limit, below the share that the safety filter allows
 PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (15 / 8)
 
 
 class Oracle:
-    """Minimum-jerk motion with computed torque for B arms; `action` as in `r2s.learning.networks.Policy`.
+    """Minimum-jerk motion with computed torque for B arms, with the `action` of `r2s.learning.networks.Policy`.
 
     Args:
         robot, task: the arm and its task, under control=torque. dynamics: model of one arm.
-        move_s: s, shortest duration of a motion; no joint exceeds FAST of its velocity limit.
+        move_s: s, shortest duration of a motion, longer if a joint would exceed the share FAST of its speed limit.
     """
 
     def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
@@ -46,7 +46,7 @@ class Oracle:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d); zero effort starts a new episode."""
+        """Return actions (B, n) in [-1, 1] for observations (B, d); an effort of zero marks a new episode."""
         rows, n = observation.numpy().astype(np.float64), self.robot.n
         out = np.empty((len(rows), n))
         for i, row in enumerate(rows):
@@ -71,7 +71,7 @@ class Oracle:
         return rigid + self.dynamics.friction(dto) - self.dynamics.offset
 
     def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
-        """Return q (n,) near `start` within the limits, with the end effector at `goal` (3,) m; damped least squares.
+        """Return q (n,) near `start`, within limits, with the end effector at `goal` (3,) m; damped least squares.
 
         Joints whose friction exceeds the torque limit do not move.
         """
@@ -93,7 +93,7 @@ class Oracle:
 
 
 class ZeroAction:
-    """A policy with zero actions, for a controller that follows the task; see `r2s.learning.networks.Policy`.
+    """A policy with zero actions, for a controller that does the task alone; see `r2s.learning.networks.Policy`.
 
     Args:
         action_dim: number of values in an action.
@@ -111,7 +111,7 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
     """Return `algo=computed_torque`: zero actions under control=computed_torque, `Oracle` for reaching with torque.
 
     Raises:
-        UserError: another task or controller.
+        UserError: the task or its controller is another one.
     """
     if task.control(robot).name == "computed_torque":
         return ZeroAction(robot.n)
@@ -124,12 +124,12 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 
 
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
-    """Return `algo=hybrid_force`: zero actions under control=hybrid, which approaches and holds a task's force.
+    """Return `algo=hybrid_force`: zero actions under control=hybrid, which touches the surface and exerts the force.
 
-    Its force is open loop: J^T f plus the friction of its model.
+    The controller exerts the force in open loop: J^T f plus the friction of its model.
 
     Raises:
-        UserError: another controller, or a task without a contact.
+        UserError: the controller is another one, or the task has no contact.
     """
     control = task.control(robot)
     if control.name != "hybrid" or not hasattr(task, "contact"):

@@ -1,4 +1,4 @@
-"""Networks of all algorithms: normalizer, actor, ensemble of critics, and the policy on an arm."""
+"""Networks of all algorithms: normalizer, actor, ensemble of critics, and the policy that an arm runs."""
 
 from collections.abc import Iterable
 from itertools import pairwise
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 CLIP = 10.0  # largest normalised observation, in standard deviations
-LOG_STD = -5.0, 2.0  # bounds of the scale's logarithm
+LOG_STD = -5.0, 2.0  # bounds of the logarithm of the actor's scale
 
 
 class Normalizer(nn.Module):
@@ -28,10 +28,10 @@ class Normalizer(nn.Module):
 
 
 class Actor(nn.Module):
-    """Gaussian before tanh: observation (B, d) -> loc, scale (B, a).
+    """Gaussian whose tanh is the action: observation (B, d) -> loc, scale (B, a).
 
-    Deterministic algorithms use `mode` only and do not train the outputs of the scale. So the policy files of all
-    algorithms have one format, and compared networks have one size.
+    Deterministic algorithms use only `mode` and do not train the outputs for the scale. So the policy files of all
+    algorithms have the same format, and compared networks have the same size.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, hidden: tuple[int, ...]):
@@ -56,8 +56,8 @@ class Policy(nn.Module):
     """A deterministic policy: observation (B, d) -> action (B, a), both in SI units.
 
     Args:
-        normalizer, actor: networks. scale, offset: (a,); action in SI units = offset + scale x action in [-1, 1], see
-            `r2s.control.controller.Controller`. offset None: zero.
+        normalizer, actor: networks. scale, offset: (a,), map an action in [-1, 1] to SI units: offset + scale x
+            action, see `r2s.control.controller.Controller`. offset None: zero.
     """
 
     action_scale: Tensor

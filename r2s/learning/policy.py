@@ -41,7 +41,7 @@ def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
     """Return the policy of a run folder.
 
     Raises:
-        UserError: policy.pt is missing, damaged, or of another arm.
+        UserError: policy.pt is missing, damaged, or made for another arm or task.
     """
     path = Path(folder) / "policy.pt"
     if not path.is_file():
@@ -60,8 +60,8 @@ def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
 def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
     """Write policy.onnx: `observation` (B, d) -> action (B, a) in SI units, normalization included.
 
-    The output has the name of the controller's action, `torque` by default. The metadata describe joints, policy
-    rate, limits, low-pass and controller for a driver.
+    The output is named after the controller's action, `torque` by default. For a driver, metadata describe joints,
+    policy rate, limits, low-pass and controller.
     """
     import onnx
 

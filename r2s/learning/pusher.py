@@ -1,9 +1,9 @@
-"""`algo=pusher`: a model-based pusher of `task=push`, without learning, to measure policies against.
+"""`algo=pusher`: a model-based pusher for `task=push`, a baseline without learning.
 
-Quasi-static: a frictionless push at a face point p along its inward normal n moves a box by v = n and w = (p x n) /
-r^2 (the ellipsoid of r2s/physics/sliding.py), whatever its mass and friction. Of many points on the four faces the
-pusher takes the one whose motion reduces the error |e|^2 + r^2 e_yaw^2 fastest (steepest descent), less what the way
-to it around the box costs. It has no memory and plans anew in every control period.
+Its model is quasi-static: a frictionless push at a face point p along the inward normal n moves a box with v = n and
+w = (p x n) / r^2 (limit surface of r2s/physics/sliding.py), whatever its mass and friction. From many points on the
+four faces, the pusher selects the one that reduces the error |e|^2 + r^2 e_yaw^2 fastest (steepest descent), minus a
+cost of the way to this point. It has no memory and plans anew in every control period.
 """
 
 import numpy as np
@@ -19,23 +19,23 @@ from r2s.physics.surface import Surface
 from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
 
 POINTS, EDGE = 9, 0.75  # points per face, and share of a half edge that they span
-CLEAR = 0.02  # m, between tip and box on the way around it
-NEAR = 0.012  # m, error of the place before a face from which the tip pushes
-WAY = 0.4  # 1/m, price of the way, in shares of the steepest descent
-DONE = 0.008  # m, error at which it leaves the box alone
-SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, of a push and on the way; m, error from which a push slows down
-GAIN = 0.25  # of the law's damping, feedback of the tip's speed: 25 Hz and the latency allow little more
+CLEAR = 0.02  # m, clearance between tip and box on the way around it
+NEAR = 0.012  # m, lateral error of the tip in front of a face below which it pushes
+WAY = 0.4  # 1/m, cost of the way per length, as a share of the steepest descent
+DONE = 0.008  # m, error below which it stops pushing
+SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, on the way; m, error from which a push slows down
+GAIN = 0.25  # gain of the tip speed feedback, share of the law's damping: 25 Hz and the latency allow little more
 
 
 class Pusher:
-    """The pusher for B arms; `action` as in `r2s.learning.networks.Policy`.
+    """The pusher for B arms, with the `action` of `r2s.learning.networks.Policy`.
 
     Args:
-        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm, whose
-            friction it compensates.
+        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm; its
+            friction is compensated.
 
     Raises:
-        UserError: another task or controller.
+        UserError: the task or its controller is another one.
     """
 
     def __init__(self, robot: Robot, task: PushTask, dynamics: Dynamics):
@@ -83,7 +83,7 @@ class Pusher:
         return np.einsum("bnk,bn->bk", inverse, torque)
 
     def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the velocity (3,) m/s of the tip along the table, and the direction (2,) of a push, else 0."""
+        """Return the tip velocity (3,) m/s along the table, and the direction (2,) of a push, 0 without a push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from the table to the box
         at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), self._reach * error[2]])
@@ -110,7 +110,7 @@ class Pusher:
         return np.array([*(rotation.T @ way), 0.0]), push
 
     def _around(self, at: np.ndarray, to: np.ndarray) -> np.ndarray:
-        """Return the next point (2,) m of a way from `at` to `to` that keeps clear of the box, all in its frame."""
+        """Return the next point (2,) m on a way around the box from `at` to `to`, all in the frame of the box."""
         edge = self._half + self._task.tip_radius
         clear = edge + CLEAR
         corners = clear * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
@@ -127,7 +127,7 @@ class Pusher:
         return corners[seen[int(np.argmin(ways))]]
 
     def _left(self, corners: np.ndarray, first: int, to: np.ndarray, edge: np.ndarray) -> float:
-        """Return the length, m, of the shortest way along the corners from one of them to a point."""
+        """Return the length, m, of the shortest way from the corner `first` along other corners to the point `to`."""
         lengths = []
         for step in (1, -1):
             k, length = first, 0.0
@@ -154,7 +154,7 @@ def _face_points(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _crosses(a: np.ndarray, b: np.ndarray, half: np.ndarray) -> bool:
-    """Return whether the line from a to b (2,) m passes inside a rectangle with half edges (2,) m."""
+    """Return whether the line from a to b (2,) m crosses a rectangle around 0 with half edges (2,) m."""
     low, high = 0.0, 1.0
     for k in range(2):
         step = b[k] - a[k]

@@ -18,33 +18,33 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import nominal_plane, tilted
 
-Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or of one for all
+Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or one for all arms
 
-DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # of a `Surface`
-TRIES = 64  # rejections of a tensor before the center replaces it
+DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # drawn fields of a `Surface`
+TRIES = 64  # draws of a tensor; if all are rejected, the center is used
 
 
 @dataclass(frozen=True)
 class UniformRandomization:
-    """Uniform draws around a center; the paper's randomization is phi_relative 0.10, inertia_relative 0.05.
+    """Uniform draws around a center; the paper uses phi_relative 0.10 and inertia_relative 0.05.
 
     phi (all 21) ~ center * U(1 - phi_relative, 1 + phi_relative), independent
     I_xx I_yy I_zz I_xy I_xz I_yz of a link ~ U(physical tensors whose elements are within center * (1 +-
         inertia_relative)): elements are independent, and unphysical tensors are drawn again
 
     The paper states independent elements within 5 %. Rejection is necessary: where the triangle inequality is tight,
-    independent elements make impossible bodies. At 5 %, the Panda's links 4 and 7 accept every draw. Link 1, a rod
+    independent elements yield impossible bodies. At 5 %, the Panda's links 4 and 7 accept every draw. Link 1, a rod
     (I_zz is 0.013 I_xx), accepts 22 %, which correlates I_xx and I_yy by 0.97. Links 2, 3, 5 and 6 accept 47 to 63 %,
     and no two of their elements correlate by more than 0.6. Each element still spans its 5 %.
 
     Attributes:
         robot: the arm.
         center: its dynamics, without a batch dimension.
-        phi_relative, inertia_relative: half widths; 0 keeps the center.
-        payload: [least, most] kg on each arm, see `with_payloads`; None: no payload.
+        phi_relative, inertia_relative: relative half widths; 0: the center itself.
+        payload: [least, most] kg, range of each arm's payload, see `with_payloads`; None: no payload.
 
     Raises:
-        UserError: a half width outside [0, 1), or a wrong payload.
+        UserError: a half width is outside [0, 1), or the payload is not allowed.
     """
 
     robot: Robot
@@ -59,7 +59,7 @@ class UniformRandomization:
         check_payload(self.payload, self.robot)
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return the dynamics of m arms."""
+        """Return random dynamics of m arms."""
         center, width, n = self.center, self.inertia_relative, self.robot.n
         phi = center.phi * rng.uniform(1 - self.phi_relative, 1 + self.phi_relative, (m, *center.phi.shape))
         inertia = np.broadcast_to(center.inertia, (m, n, 3, 3)).copy()
@@ -81,8 +81,8 @@ class UniformRandomization:
 class PosteriorRandomization:
     """Draws from the posterior of an identification: rows of `samples` (S, P) of `space`, with their correlations.
 
-    Every row is physical: tensor scales are positive, and the full parametrization has no unphysical values. payload:
-    see `UniformRandomization`.
+    Every row is physically valid: tensor scales are positive, and the full parametrization has no invalid values.
+    payload: see `UniformRandomization`.
     """
 
     space: ParameterSpace
@@ -93,7 +93,7 @@ class PosteriorRandomization:
         check_payload(self.payload, self.space.robot)
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return the dynamics of m arms."""
+        """Return random dynamics of m arms."""
         drawn = self.space.dynamics(self.samples[rng.integers(len(self.samples), size=m)])
         return with_payloads(self.space.robot, drawn, self.payload, rng, m)
 
@@ -103,7 +103,7 @@ class Pushes(Protocol):
     """A randomization that applies joint torques at every control step of a training, not of an evaluation."""
 
     def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
-        """Return (m, n) Nm for the next control step of m arms."""
+        """Return the torques (m, n) Nm for the next control step of m arms."""
         ...
 
 
@@ -116,10 +116,10 @@ class ForceRandomization:
 
     Attributes:
         robot: the arm. center: its dynamics, without a batch dimension.
-        share: relative to `Dynamics.level`.
+        share: largest torque, relative to `Dynamics.level`.
 
     Raises:
-        UserError: a negative share.
+        UserError: the share is negative.
     """
 
     robot: Robot
@@ -130,16 +130,16 @@ class ForceRandomization:
         check_number("dr.share", self.share, "[0, inf)")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return the center, for all arms."""
+        """Return the center: all arms have the same dynamics."""
         return self.center
 
     def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
-        """Return (m, n) Nm."""
+        """Return the torques (m, n) Nm of one control step."""
         return self.share * self.center.level * rng.uniform(-1.0, 1.0, (m, self.robot.n))
 
 
 def check_pair(name: str, pair: Any, allowed: str) -> None:
-    """Raise UserError unless dr.NAME is [least, most], both `allowed`, such as "[0, inf)"."""
+    """Raise UserError unless dr.NAME is [least, most], both in the interval `allowed`, such as "[0, inf)"."""
     if not isinstance(pair, list | tuple) or len(pair) != 2:
         raise UserError(f"dr.{name}: expected [least, most], got {pair!r}")
     for value in pair:
@@ -150,19 +150,19 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ContactRandomization(UniformRandomization):
-    """Arms as of `UniformRandomization`, each with a plane of its own around a nominal one.
+    """Arms from `UniformRandomization`, each with its own random plane near a nominal one.
 
     stiffness ~ log U(stiffness); exponent ~ U({least, most}); damping, friction ~ U; bristle ~ U(bristle)
     point ~ point + U(-place, place) normal; normal tilted by U(0, tilt) about a random axis
 
     Attributes:
-        point: (3,) m, normal: (3,), of the nominal plane; None: of a table below the tip at home.
+        point: (3,) m, normal: (3,), of the nominal plane; None: a table below the tip at home.
         stiffness: N/m, exponent, damping: s/m, friction, bristle: m, all [least, most], see `Surface`.
-        place: m. tilt: degrees.
-        surface: run folder of an identified surface, whose posterior is drawn instead; None: the ranges.
+        place: m, largest displacement along the normal. tilt: degrees, the largest.
+        surface: run folder of an identified surface; draws come from its posterior. None: from the ranges.
 
     Raises:
-        UserError: a range that is none, or outside what a surface may have; no tool.
+        UserError: a range is malformed or outside what a surface allows, or the robot has no tool.
     """
 
     stiffness: Sequence[float]
@@ -178,7 +178,7 @@ class ContactRandomization(UniformRandomization):
 
     @cached_property
     def _identified(self) -> Surface | None:
-        """All draws of the posterior."""
+        """All posterior draws of the identified surface; None: there is none."""
         if not self.surface:
             return None
         draws = load_contact(self.surface, "dr.surface").draws
@@ -198,7 +198,7 @@ class ContactRandomization(UniformRandomization):
         check_number("dr.tilt", self.tilt, "[0, 45]")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return the dynamics of m arms."""
+        """Return random dynamics of m arms, each with its surface."""
         if (known := self._identified) is not None:
             row = rng.integers(len(known.stiffness), size=m)  # type: ignore[arg-type]
             drawn = Surface(**{k: getattr(known, k)[row] for k in DRAWN})
@@ -220,10 +220,10 @@ class ContactRandomization(UniformRandomization):
 def posterior_randomization(
     robot: Robot, center: Dynamics, calibration: str | Path | None, payload: Sequence[float] | None = None
 ) -> PosteriorRandomization:
-    """Return draws from the posterior in the run folder `calibration`, which has its own center.
+    """Return the randomization by the posterior in the run folder `calibration`; `center` is not used.
 
     Raises:
-        UserError: no such folder, or one without posterior draws.
+        UserError: there is no such folder, or it has no posterior draws.
     """
     if not calibration:
         raise UserError("dr: identified draws from a posterior; give calibration=RUN_FOLDER as well")
@@ -232,7 +232,7 @@ def posterior_randomization(
 
 
 def check_payload(payload: Sequence[float] | None, robot: Robot) -> None:
-    """Raise UserError unless this is None or [least, most] kg that the arm may carry."""
+    """Raise UserError unless the payload is None, or [least, most] kg that the arm may carry."""
     if payload is None:
         return
     if not isinstance(payload, list | tuple) or len(payload) != 2:
@@ -248,8 +248,8 @@ def with_payloads(
 ) -> Dynamics:
     """Return the dynamics of m arms, each with a random payload of [least, most] kg; None: no payload.
 
-    mass ~ U(least, most); center ~ U(ball about the end effector, half as large as `payload_max` allows); inertia of
-    a ball of water. Gravity compensation does not include the payload.
+    mass ~ U(least, most); center ~ U(ball about the end effector with half the radius that `payload_max` allows);
+    inertia of a ball of water. Gravity compensation does not include the payload.
     """
     if payload is None:
         return dynamics
@@ -261,6 +261,6 @@ def with_payloads(
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:
-    """Return (...) bool: the tensor (..., 3, 3) is positive definite and satisfies the triangle inequality."""
+    """Return (...) bool: whether the tensor (..., 3, 3) is positive definite and obeys the triangle inequality."""
     moments = np.linalg.eigvalsh(tensor)
     return (moments[..., 0] > 0) & (moments[..., 0] + moments[..., 1] >= moments[..., 2])

@@ -7,9 +7,9 @@ from torch import Tensor
 
 
 class Replay:
-    """The last `size` of all transitions added; transition number k is in row k % size.
+    """The last `size` of all added transitions; transition number k is in row k % size.
 
-    Without the generality of TorchRL's TensorDictReplayBuffer it takes a fifth of its time (benchmarks/bench.py).
+    It is less general than TorchRL's TensorDictReplayBuffer and takes a fifth of its time (benchmarks/bench.py).
 
     Args:
         size: capacity in transitions. device: of its tensors.
@@ -26,14 +26,14 @@ class Replay:
         return min(self.seen, self.size)
 
     def extend(self, transitions: Mapping[str, Tensor]) -> None:
-        """Add transitions: tensors (n, ...), of the same names, shapes and types in every call."""
+        """Add n transitions: tensors (n, ...) with the same names, shapes and types in every call."""
         if not self._rows:  # empty tensors take no memory before they are written to
             self._rows = {k: v.new_empty(self.size, *v.shape[1:], device=self.device) for k, v in transitions.items()}
         count = len(next(iter(transitions.values())))
-        self.seen += max(0, count - self.size)  # those that the others of this call overwrite
+        self.seen += max(0, count - self.size)  # transitions that later ones of this call overwrite
         count = min(count, self.size)
         first = self.seen % self.size
-        fits = min(count, self.size - first)  # the rest begins again in row 0
+        fits = min(count, self.size - first)  # the rest continues in row 0
         for name, rows in self._rows.items():
             added = transitions[name][-count:]
             rows[first : first + fits] = added[:fits]
@@ -46,6 +46,6 @@ class Replay:
         return {name: rows.index_select(0, pick) for name, rows in self._rows.items()}
 
     def transitions(self, begin: int, end: int) -> dict[str, Tensor]:
-        """Return the transitions with the numbers begin to end - 1, which are in the buffer."""
+        """Return the transitions with the numbers begin to end - 1, which must be in the buffer."""
         pick = torch.arange(begin, end, device=self.device) % self.size
         return {name: rows[pick] for name, rows in self._rows.items()}

@@ -18,7 +18,7 @@ class SAC(EntropyLearner):
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.
-        n_critics: number of critics; target and actor use the smallest of their values.
+        n_critics: number of critics; target and actor loss use the smallest of their values.
     """
 
     def __init__(self, scale: tuple[Tensor, Tensor], action_scale: Tensor, *, n_critics: int = 2, **shared: Any):

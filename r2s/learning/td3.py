@@ -1,8 +1,8 @@
 """Twin Delayed Deep Deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477).
 
-Three changes to DDPG: the target is the smaller of two critics, the target's action has noise, and the actor and the
-target networks move in every other update only. The losses equal those of `torchrl.objectives.TD3Loss` with the
-paper's squared error; the tests compare them.
+TD3 changes DDPG in three ways: the target uses the smaller value of two critics, the target's action has noise, and
+the actor and the target networks change only in every other update. The losses equal those of
+`torchrl.objectives.TD3Loss` with the paper's squared error; the tests compare them.
 """
 
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ class TD3(DeterministicLearner):
 
     Args:
         scale, action_scale, shared: see `DeterministicLearner`.
-        n_critics: number of critics; the target is the smallest of their values, the actor follows the first.
+        n_critics: number of critics; the target uses the smallest of their values, the actor loss the first critic.
         smoothing_std, smoothing_clip: standard deviation and limit of the noise on the target's action.
-        policy_delay: updates of the critics per update of the actor and of the target networks.
+        policy_delay: critic updates per update of the actor and of the target networks.
     """
 
     last_actor_loss: Tensor
@@ -57,13 +57,13 @@ class TD3(DeterministicLearner):
         return {"loss_critic": self._critic_loss(batch, noise), "loss_actor": self._actor_loss(batch)}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step; return the losses: between actor updates, the last actor loss."""
+        """Do one gradient step; return the losses, with the last actor loss if this update has none."""
         critics, actor = list(self.critics.parameters()), list(self.actor.parameters())
         out, gradients = self._critic_gradients(batch, torch.randn_like(batch["action"]))
-        due = self.updates % self.policy_delay == 0  # also in the first update, so that every logged row has a loss
+        due = self.updates % self.policy_delay == 0  # also in the first update: every logged row has an actor loss
         if due:
             if self.action_scale.is_cuda and "_actor_gradients" in vars(self):
-                # compiled for a GPU each method is a captured graph, and the second overwrites outputs of the first
+                # compiled for a GPU, each method is a captured graph; the second overwrites outputs of the first
                 out, gradients = {k: v.clone() for k, v in out.items()}, [g.clone() for g in gradients]
             more, of_actor = self._actor_gradients(batch)
             self.last_actor_loss = more["loss_actor"].clone()  # a captured graph overwrites its outputs

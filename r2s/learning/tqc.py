@@ -1,7 +1,7 @@
 """Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
 
-The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). For speed the
-critics are one batched network instead of a vmap.
+The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). For speed, the
+critics are one batched network instead of a vmap over networks.
 """
 
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class TQC(EntropyLearner):
-    """Learner of a stochastic policy with quantile critics; the target drops their highest atoms.
+    """Learner of a stochastic policy with quantile critics; the target omits the highest atoms.
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.
-        n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms dropped, per critic.
+        n_critics, n_quantiles: numbers of critics, and of atoms of each. drop_per_critic: omitted atoms per critic.
     """
 
     def __init__(
@@ -55,9 +55,9 @@ class TQC(EntropyLearner):
 
 
 def quantile_huber(quantiles: Tensor, target: Tensor) -> Tensor:
-    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): sum over C of the mean over all pairs.
+    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): its mean over pairs, summed over C.
 
-    A pair with difference delta = target - quantile costs |tau - [delta < 0]| huber(delta); tau is the fraction of
+    A pair with difference delta = target - quantile costs |tau - [delta < 0]| huber(delta). tau is the fraction of
     the quantile, huber(delta) is delta^2 / 2 within 1 and |delta| - 1/2 beyond.
 
     Args:

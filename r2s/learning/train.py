@@ -1,13 +1,13 @@
 """The training loop of all algorithms: act, step all arms, store, update, evaluate at intervals.
 
 The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows the share spent.
-With env_steps alone a seed gives the same run bit for bit at a fixed number of threads, stopped and resumed or not.
-With minutes the curriculum follows the clock.
+With env_steps alone, runs of one seed and one number of threads are equal bit for bit, even if stopped and resumed.
+With minutes, the curriculum depends on the clock.
 
-The arms step while the learner updates, in a thread of their own: updates draw from the transitions before that step.
-On one core both take turns, with the same result. Sharing one team of threads instead would serve neither: those of
-OpenMP spin for milliseconds after an update, on the cores that the physics needs then, and on a busy machine each of
-their barriers waits for a thread that the system has put aside.
+The arms step in their own thread while the learner updates, so updates draw from the transitions before that step. On
+one core, step and updates alternate with the same result. One shared team of OpenMP threads would be slower for both:
+after an update these threads spin for milliseconds on the cores that the physics then needs, and on a busy machine
+each of their barriers waits for a thread that the system has suspended.
 """
 
 import copy
@@ -37,7 +37,7 @@ LOG_UPDATES = 1000  # updates between two rows of metrics.csv
 
 @dataclass(frozen=True)
 class Budget:
-    """End of a training: minutes of wall clock or env_steps, whichever comes first.
+    """The length of a training: minutes of wall clock or env_steps, whichever ends first.
 
     Raises:
         UserError: neither is given, or a value is not positive.
@@ -55,7 +55,7 @@ class Budget:
                 check_number(f"budget.{name}", value, "(0, inf)")
 
     def spent(self, seconds: float, env_steps: int) -> float:
-        """Return the share spent; the training ends at 1."""
+        """Return the spent share of the budget; the training ends at 1."""
         time_share = seconds / (60.0 * self.minutes) if self.minutes else 0.0
         step_share = env_steps / self.env_steps if self.env_steps else 0.0
         return max(time_share, step_share)
@@ -69,11 +69,11 @@ class Loop:
         batch_size: transitions per update. updates_per_step: updates per step of all arms.
         learning_starts: environment steps before the first update, with actions of the demonstrator or random ones.
         replay_size: capacity of the replay buffer.
-        lr_decay, lr_end: from this share of the budget on, the learning rate falls linearly to the share lr_end.
-        explore_end: the standard deviation of exploration falls geometrically to this share at the end of the budget.
-        eval_env_steps: environment steps between two evaluations; the last evaluation is at the end.
-        compile: compile the losses first; the budget includes this time.
-        concurrent: step the arms in a thread of their own.
+        lr_decay, lr_end: from the share lr_decay of the budget on, the learning rate falls linearly to lr_end times
+            its initial value.
+        explore_end: factor to which the standard deviation of exploration falls geometrically over the budget.
+        eval_env_steps: environment steps between two evaluations; another evaluation ends the training.
+        compile: compile the losses first, within the budget. concurrent: step the arms in their own thread.
         matmul: precision of matrix products in updates, see torch.set_float32_matmul_precision. "medium" rounds their
             factors to bfloat16 if the processor has instructions for it; "auto": see `fastest_matmul`.
 
@@ -117,8 +117,8 @@ class Callbacks:
     """Functions that a training calls.
 
     Attributes:
-        log: gets each row of metrics.csv. evaluated: each row of evaluations.csv.
-        progress: after every step, the share of the budget and the numbers to show.
+        log: gets each row of metrics.csv. evaluated: gets each row of evaluations.csv.
+        progress: gets the spent share of the budget and the numbers to show, after every step.
     """
 
     log: Callable[[dict], None] = lambda row: None
@@ -145,8 +145,8 @@ def train(
         evaluate: policy -> Episodes, see r2s/learning/evaluate.py.
         loop, budget: settings.
         demonstrator: acts in the first loop.learning_starts environment steps; None: uniform random actions.
-        checkpoint: written after every evaluation; if it exists, the training continues from it.
-        callbacks: for logs and progress.
+        checkpoint: written after every evaluation; if its file exists, the training continues from it.
+        callbacks: functions for logs and progress.
 
     Raises:
         FloatingPointError: an action, observation, reward or loss is not finite.
@@ -168,7 +168,7 @@ def train(
         if run.updates % LOG_UPDATES < loop.updates_per_step or run.updates == loop.updates_per_step:
             callbacks.log(run.metrics(losses))
         if run.env_steps >= run.next_eval:
-            while run.next_eval <= run.env_steps:  # several are due after many random steps; one is enough
+            while run.next_eval <= run.env_steps:  # if several are due after the first, random steps, one is enough
                 run.next_eval += loop.eval_env_steps
             callbacks.evaluated(run.evaluate())
             if checkpoint:
@@ -182,7 +182,7 @@ class Training:
 
     Attributes:
         env_steps, updates: counters. next_eval: environment steps of the next evaluation.
-        factor: result of `Reward.adapt`, or of Reward.factor. evaluation: the last row of evaluations.csv.
+        factor: last result of `Reward.adapt`, `Reward.factor` at first. evaluation: the last row of evaluations.csv.
     """
 
     def __init__(
@@ -211,12 +211,12 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time of the training, stopped runs included."""
+        """Wall-clock time of the training, s, including the runs before a resume."""
         return time.perf_counter() - self._began
 
     @contextmanager
     def step(self, spent: float) -> Iterator[None]:
-        """Step all arms while the block runs, then store the transitions; `spent`: share of the budget."""
+        """Step all arms while the block runs, then store the transitions; `spent`: spent share of the budget."""
         env, state = self._env, self._state
         state["action"] = self._action(state["observation"])
         with self._dated_errors():
@@ -231,13 +231,13 @@ class Training:
         self.env_steps += env.nsim
 
     def _action(self, observation: Tensor) -> Tensor:
-        """Return the actions (nsim, a) of the next step."""
+        """Return the actions (nsim, a) for the next step: exploratory, of the demonstrator, or random."""
         if self.env_steps >= self._loop.learning_starts:
             return self._algo.explore(observation.to(self._device)).cpu()
         return self._demonstrator.action(observation) if self._demonstrator else self._env.action_spec.rand()
 
     def update(self) -> dict[str, torch.Tensor]:
-        """Do one gradient update on a batch with the present reward weights; return the losses."""
+        """Do one gradient update on a batch with the current reward weights; return the losses."""
         weights = torch.from_numpy(self._env.weights.astype(np.float32)).to(self._device)
         batch = self._replay.sample(self._loop.batch_size)
         batch["reward"] = batch.pop("reward_terms") @ weights
@@ -247,7 +247,7 @@ class Training:
         return losses
 
     def metrics(self, losses: dict[str, torch.Tensor]) -> dict[str, float]:
-        """Return a row of metrics.csv; means of the reward terms are over the steps since the last row."""
+        """Return a row of metrics.csv; it averages the reward terms over the steps since the last row."""
         names, means = self._env.reward.terms(self._env.task), np.mean(self._terms, axis=0)
         self._terms = []
         row = {"env_steps": self.env_steps, "updates": self.updates, "wall_clock_s": self.seconds}
@@ -256,7 +256,7 @@ class Training:
         return row | {f"term_{name}": float(x) for name, x in zip(names, means, strict=True)}
 
     def evaluate(self) -> dict[str, Any]:
-        """Evaluate the present policy; return a row of evaluations.csv."""
+        """Evaluate the current policy; return a row of evaluations.csv."""
         with self._dated_errors(", in an evaluation"):
             measures = self._env.task.measures(self._evaluate(copy.deepcopy(self._algo.policy).cpu()))
         counters = {"env_steps": self.env_steps, "updates": self.updates, "wall_clock_s": self.seconds}
@@ -264,7 +264,7 @@ class Training:
         return self.evaluation
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Write a checkpoint."""
+        """Write the state and the replay buffer to a checkpoint."""
         state: dict[str, Any] = {"env_steps": self.env_steps, "updates": self.updates, "next_eval": self.next_eval}
         state |= {
             "factor": torch.as_tensor(np.asarray(self.factor, dtype=float)),
@@ -291,7 +291,7 @@ class Training:
 
     @contextmanager
     def _dated_errors(self, when: str = "") -> Iterator[None]:
-        """If the block raises FloatingPointError, add the env steps so far to the message."""
+        """Add the env steps so far to the message of a FloatingPointError that the block raises."""
         try:
             yield
         except FloatingPointError as error:
@@ -299,40 +299,40 @@ class Training:
 
 
 def run_now(function: Callable[..., Any], *given: Any) -> Future:
-    """Do what an executor's `submit` does, at once."""
+    """Call the function at once; return its result as a future, like an executor's `submit`."""
     done: Future = Future()
     done.set_result(function(*given))
     return done
 
 
 def generators(device: torch.device) -> dict[str, torch.Tensor]:
-    """Return the states of torch's generators that a training on this device draws from."""
+    """Return the states of the torch generators from which a training on this device draws."""
     states = {"torch": torch.get_rng_state()}
     return states | {"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else states
 
 
 def set_generators(states: Mapping[str, Any], device: torch.device) -> None:
-    """Restore what `generators` returned; a state of a generator that this device does not use is left out."""
+    """Restore what `generators` returned, except generators that this device does not use."""
     torch.set_rng_state(states["torch"])
     if device.type == "cuda" and "cuda" in states:
         torch.cuda.set_rng_state(states["cuda"], device)
 
 
 def keep_memory() -> None:
-    """Let glibc keep freed memory: otherwise it returns large blocks, and every update page-faults them in again."""
+    """Make glibc keep freed memory: otherwise it returns large blocks, which every update must page in again."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
         libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     except (OSError, AttributeError):
-        pass  # another C library: only slower
+        pass  # another C library: updates are only slower
 
 
 def fastest_matmul(device: torch.device) -> str:
-    """Return the precision of `matmul_precision` with the fastest updates: bfloat16 where matrix units multiply it.
+    """Return the `matmul_precision` of the fastest updates: bfloat16, "medium", if the device has units for it.
 
-    With AVX-512 alone, rounding the factors costs networks of 128 to 256 units as much as faster products save
-    (benchmarks/results/speed.md).
+    With AVX-512 alone, for networks of 128 to 256 units, rounding the factors costs as much time as the faster
+    products save (benchmarks/results/speed.md).
     """
     units = device.type == "cuda" or torch.cpu.get_capabilities().get("amx_bf16", False)
     return "medium" if units else "highest"
@@ -340,7 +340,7 @@ def fastest_matmul(device: torch.device) -> str:
 
 @contextmanager
 def matmul_precision(precision: str) -> Iterator[None]:
-    """Set the precision of float32 matrix products in the block; elsewhere, as in policies, it is the highest."""
+    """Set the precision of float32 matrix products in the block; outside, such as in policies, it is "highest"."""
     torch.set_float32_matmul_precision(precision)
     try:
         yield
@@ -349,14 +349,14 @@ def matmul_precision(precision: str) -> Iterator[None]:
 
 
 def _tensors(node: Any) -> Any:
-    """Return nested dicts with tensors in place of arrays, which torch loads without pickles."""
+    """Return nested dicts with tensors instead of arrays, because torch loads tensors without pickle."""
     if isinstance(node, dict):
         return {k: _tensors(v) for k, v in node.items()}
     return torch.from_numpy(np.ascontiguousarray(node)) if isinstance(node, np.ndarray) else node
 
 
 def _arrays(node: Any) -> Any:
-    """Return nested dicts with arrays in place of tensors."""
+    """Return nested dicts with arrays instead of tensors."""
     if isinstance(node, dict):
         return {k: _arrays(v) for k, v in node.items()}
     return node.numpy() if isinstance(node, torch.Tensor) else node

@@ -19,17 +19,17 @@ class VectorArms:
     """`width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
     Every ms of a control period: command -> control law -> soft start, low-pass, clip, rate limit -> safety filter ->
-    delay and lag -> physics. Kinematics follow at its end. States hold true speeds and, separately, sensor noise.
+    delay and lag -> physics. Kinematics follow at its end. A `State` has true speeds and, separately, sensor noise.
 
     Attributes:
         speeds: None, because true speeds need no smoothing.
 
     Args:
         robot, task: the arm, and the task with its controller.
-        dynamics: of `width` arms, or of one for all.
+        dynamics: of `width` arms, or of one arm for all.
         nthread: threads, 0: all cores.
         soft_start_s: s, fade-in of an episode's torque.
-        seed: of the sensor noise, which restarts when all arms are placed.
+        seed: of the sensor noise, which restarts whenever all arms are placed.
     """
 
     def __init__(
@@ -53,12 +53,12 @@ class VectorArms:
         self.sim.drive(filter_limits(robot, torque), torque, task.cutoff_hz, soft_start_s, task.push_limit)
         self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
         self.speeds = None
-        self._limited = np.zeros(width)  # cycles before the last step
+        self._limited = np.zeros(width)  # limited cycles before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
         self.seed(seed)
         self._sigma, self._noise = np.zeros((2, width, robot.n))
         self._sigma[:] = dynamics.speed_noise
-        # of the perceived pose of a box: x m, y m, yaw rad
+        # noise of the perceived pose of a box: x m, y m, yaw rad
         self._pose = (task.table, task.pose_noise) if task.moves_box else None  # type: ignore[attr-defined]
         self._pose_noise = np.zeros((width, 3))
         m, degrees = self._pose[1] if self._pose else (0.0, 0.0)
@@ -74,7 +74,7 @@ class VectorArms:
         self.sim.push(tau)
 
     def place(self, starts: np.ndarray, first: int = 0, ids: np.ndarray | None = None) -> State:
-        """Reset the arms `ids` (None: all) to rest at starts (m, n) rad; return the state of all."""
+        """Reset the arms `ids` (None: all) to rest at starts (m, n) rad; return the state of all arms."""
         self.sim.reset(starts, np.zeros_like(starts), ids)
         at = slice(None) if ids is None else ids
         self._steps[at], self._limited[at] = 0, 0.0
@@ -88,7 +88,7 @@ class VectorArms:
         self._seed, self._rng = seed, np.random.default_rng(seed)
 
     def _sense(self, at: np.ndarray | slice = ALL) -> None:
-        """Draw the sensor noise of these arms for the present state."""
+        """Draw the sensor noise of these arms for the current state."""
         if self._sigma.any():
             sigma = self._sigma[at]
             self._noise[at] = sigma * self._rng.standard_normal(sigma.shape)
@@ -96,7 +96,7 @@ class VectorArms:
             self._pose_noise[at] = self._pose_sigma * self._rng.standard_normal(self._pose_noise[at].shape)
 
     def read(self) -> State:
-        """Return the present state of all arms; its arrays are views."""
+        """Return the current state of all arms; its arrays are views."""
         sim, t = self.sim, self._steps * self._period
         limited = (sim.limited - self._limited) / self._substeps
         noise = self._noise if self._sigma.any() else None
@@ -139,7 +139,7 @@ class VectorArms:
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:
-    """Raise FloatingPointError if a row of (m, k) is not finite; `steps` (m,): steps of the episodes so far."""
+    """Raise FloatingPointError unless `rows` (m, k) are finite; `steps` (m,): steps of the episodes so far."""
     finite = np.isfinite(rows)
     if not finite.all():
         arm = int((~finite.all(-1)).argmax())

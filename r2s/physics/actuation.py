@@ -23,7 +23,7 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
     """Return one joint's low-pass state and effort, Nm, after one cycle: soft start, low-pass, clip, rate limit.
 
     Args:
-        target: Nm, in this cycle. filtered, effort: Nm, in the cycle before. cycle: its number, from 1.
+        target: Nm, in this cycle. filtered, effort: Nm, of the previous cycle. cycle: number of this cycle, from 1.
         factor: gain of the low-pass. fade: duration of the soft start, cycles.
         tau_max: Nm. step_max: Nm per cycle.
     """
@@ -38,7 +38,7 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
 
 @njit(cache=True)
 def condition(target, state, settings, nstep, out):
-    """Write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`: `condition_joint` for m arms.
+    """Apply `condition_joint` to m arms; write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`.
 
     Args:
         target: (m, n) Nm. state: low-pass state (m, n) Nm, effort (m, n) Nm and cycle count (m,), updated here.
@@ -60,10 +60,10 @@ class Actuation:
     """Soft start, low-pass, clip and rate limit of the target torques of m arms.
 
     Attributes:
-        last: (m, n) Nm, the effort, after all four. filtered: (m, n) Nm, after the low-pass.
+        last: (m, n) Nm, the effort, after all four stages. filtered: (m, n) Nm, after the low-pass.
 
     Args:
-        robot: gives torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
+        robot: its torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
         soft_start_s: s, time over which the torque of a motion fades in; 0: no fade.
     """
 
@@ -90,8 +90,8 @@ class Actuation:
 
 
 MAX_DELAY = 0.02  # s, longest pure delay of the model
-# Steps by which a semi-implicit step responds early to its torque: q(k+1) - 2 q(k) + q(k-1) = h^2 a(k), whereas on an
-# arm the torques of steps k - 1 and k contribute half each.
+# Steps by which a semi-implicit simulation responds too early: there q(k+1) - 2 q(k) + q(k-1) = h^2 a(k), whereas on
+# an arm the torques of steps k - 1 and k contribute half each.
 EARLY = 0.5
 SLOTS = int(MAX_DELAY / SIM_DT) + 3  # commands in the delay line
 
@@ -100,8 +100,8 @@ SLOTS = int(MAX_DELAY / SIM_DT) + 3  # commands in the delay line
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    A command that arrives within a step acts for the rest of that step. The lag is m' = (u - m) / lag; from the state
-    m, its mean over a time s is u + (m - u) (1 - exp(-s / lag)) lag / s.
+    A command that arrives within a step acts for the rest of that step. The lag obeys dm/dt = (u - m) / lag; the
+    mean torque over a time s, from the state m, is u + (m - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
         line: (SLOTS, n) Nm, the command of cycle k in row k % SLOTS. motor: (n,) Nm, state of the lag.
@@ -122,7 +122,7 @@ def motor_torque(line, motor, cycle, delay, lag, out):
 
 @njit(cache=True)
 def delayed(tau, delay, lag, steps, line, motor, cycle, out):
-    """Delay each arm's commands by `delay` steps and lag them by `lag` steps: the mean torque of each step."""
+    """Write each arm's mean torque per step for commands that are delayed by `delay` and lagged by `lag` steps."""
     for i in range(tau.shape[0]):
         for k in range(steps):
             line[i, cycle[i] % SLOTS] = tau[i, k]
@@ -139,8 +139,8 @@ def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.n
 class Motors:
     """Delay and lag between the commands and the joint torques of m simulated arms.
 
-    A pure delay, then a first-order lag, as on an arm in continuous time. The simulation responds half a step early
-    (EARLY); this class compensates for it.
+    They are a pure delay, then a first-order lag, as on an arm in continuous time. The simulation responds half a
+    step early (EARLY); this class compensates for it.
     """
 
     def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):
@@ -150,7 +150,7 @@ class Motors:
         self.set(delay, lag)
 
     def set(self, delay: np.ndarray | float, lag: np.ndarray | float, ids: np.ndarray | None = None) -> None:
-        """Set delay and lag, s, of the arms `ids` (all by default): one for all, or (m,)."""
+        """Set delay and lag, s, of the arms `ids` (all by default): one value for all, or (m,)."""
         at = slice(None) if ids is None else ids
         self._delay[at], self._lag[at] = steps_late(delay, lag)
 

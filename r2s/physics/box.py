@@ -1,4 +1,4 @@
-"""Where a box stands on a table, for the task that pushes it, for domain randomization and for twins."""
+"""Pose of a box on a table, for the task that pushes it, for domain randomization and for twins."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,11 +11,11 @@ from r2s.physics.surface import Surface
 from r2s.physics.tip import default_plane, nominal_plane
 
 SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; the tip pushes below the hand
-PUSHED_AT = 0.4  # of the box's height, where the tip pushes
-SPREAD, YAW = 0.02, 20.0  # m, degrees, by which a box stands elsewhere than its nominal place, to either side
-FORWARD = 0.25  # of the end effector's distance from the base at home: the nominal place lies so far ahead
-# of a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m; from a
-# carton on a smooth table to a block of wood on a dry one
+PUSHED_AT = 0.4  # share of the box's height, at which the tip pushes
+SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal place, to either side
+FORWARD = 0.25  # share of the end effector's distance from the base at home, by which the nominal place lies ahead
+# Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
+# from a carton on a smooth table to a block of wood on a dry one
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)
 STIFFNESS, DAMPING, BRISTLE = (5e3, 1e5), (0.5, 3.0), (1e-4, 3e-4)
 EXPECTED = {"mass": 0.8, "table": 0.35, "friction": 0.3, "stiffness": 2.5e4, "damping": 1.5, "bristle": 2e-4}
@@ -33,21 +33,21 @@ class TableFrame:
     axes: np.ndarray
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Return points (..., 3) m of the base frame in this frame."""
+        """Transform points (..., 3) m from the base frame to this frame."""
         return (points - self.origin) @ self.axes.T
 
     def outside(self, points: np.ndarray) -> np.ndarray:
-        """Return points (..., 3) m of this frame in the base frame."""
+        """Transform points (..., 3) m from this frame to the base frame."""
         return self.origin + points @ self.axes
 
     def planar(self, pose: np.ndarray) -> np.ndarray:
-        """Return (..., 3), x m, y m and yaw rad of a box, from its centre m and its first axis (..., 6)."""
+        """Return x m, y m and yaw rad (..., 3) of a box from its pose (..., 6): centre, m, and first axis."""
         x = self.inside(pose[..., :3])
         first = pose[..., 3:] @ self.axes.T
         return np.concatenate([x[..., :2], np.arctan2(first[..., 1:2], first[..., :1])], axis=-1)
 
     def pose(self, planar: np.ndarray, height: float) -> np.ndarray:
-        """Return (..., 6), the inverse of `planar` with the centre at a height, m."""
+        """Return the pose (..., 6) of a box from x, y and yaw (..., 3) and the height of its centre, m."""
         x, y, yaw = np.moveaxis(planar, -1, 0)
         centre = self.outside(np.stack([x, y, np.full_like(x, height)], axis=-1))
         return np.concatenate([centre, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1) @ self.axes], axis=-1)
@@ -56,12 +56,12 @@ class TableFrame:
         """Return poses (m, 6), moved by (m, 3): x m, y m and yaw rad in this frame."""
         c, s = np.cos(by[:, 2:]), np.sin(by[:, 2:])
         first, up = pose[:, 3:], self.axes[2]
-        turned = c * first + s * np.cross(up, first)  # it is perpendicular to up
+        turned = c * first + s * np.cross(up, first)  # `first` is perpendicular to `up`
         return np.concatenate([pose[:, :3] + by[:, :2] @ self.axes[:2], turned], axis=1)
 
 
 def table_frame(robot: Robot, point: Any = None, normal: Any = None) -> TableFrame:
-    """Return the frame of a table at a point (3,) m with a normal (3,); None: one below the tip at home, ahead."""
+    """Return the frame of a table at a point (3,) m with a normal (3,); None: below and ahead of the tip at home."""
     place, up = nominal_plane(robot, point, normal)
     across = place - (place @ up) * up
     size = float(np.linalg.norm(across))
@@ -88,7 +88,7 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
 def check_size(name: str, size: Any, table: float) -> np.ndarray:
     """Return the edges (3,) m of a box; raise UserError unless a push at PUSHED_AT moves it without a tilt.
 
-    A push that overcomes the friction, mu m g at the height h, tilts a box of half edge a where mu h > a.
+    A push at the height h that overcomes the friction mu m g tilts a box of half edge a if mu h > a.
     """
     if not isinstance(size, list | tuple | np.ndarray) or len(size) != 3:
         raise UserError(f"{name}: expected three edges in m, got {size!r}")

@@ -1,12 +1,12 @@
-"""Collision of arms with themselves and the table, compiled, for many arms at once.
+"""Compiled collision check of many arms with themselves and the table.
 
-Bodies are the geoms of the robot's file. If some geoms of the file collide, the others are visual and do not count.
-Planes and height fields belong to the surroundings. Meshes count as their convex hulls, as in MuJoCo, and signed
-distance fields as their bounding spheres. Pairs without a check:
+The bodies are the geoms of the robot's file. If the file lets some geoms collide, the others are visual and ignored.
+Planes and height fields are ignored as surroundings. A mesh counts as its convex hull, as in MuJoCo, and a signed
+distance field as its bounding sphere. These pairs are not checked:
 
-- table: geoms of the base, and of links whose joints are all vertical; their height never changes.
-- links: neighbours, which touch in their joint, and geoms closer than HOUSING_M at q_home. These are parts of one
-  joint's housing two links apart, as in the Panda's shoulder.
+- with the table: geoms of the base, and of links that only vertical joints move; their height never changes.
+- of two links: neighbours, which touch at their joint, and geoms closer than HOUSING_M at q_home. The latter are
+  parts of one joint's housing that belong to links two apart, as in the Panda's shoulder.
 """
 
 from collections.abc import Collection
@@ -47,7 +47,7 @@ class CollisionPairs:
 def collision_pairs(
     robot: Robot, model: mujoco.MjModel, *, table: bool = True, may_touch: Collection[tuple[str, str]] = ()
 ) -> CollisionPairs:
-    """Return the pairs of `robot.model` to check, against the table only with `table`.
+    """Return the pairs of `robot.model` to check; table: whether to check geoms against the table.
 
     may_touch: pairs of body names, or of a body name and "table", that are not checked.
     """
@@ -78,7 +78,7 @@ def collision_pairs(
 
 
 def link_name(model: mujoco.MjModel, geom: int) -> str:
-    """Return "link 'hand'" for a geom of the body hand, "obstacle 1" for that box."""
+    """Return "link 'hand'" for a geom of the body hand, "obstacle 1" for the first obstacle."""
     if model.geom(geom).name.startswith(PREFIX):
         return str(model.geom(geom).name)
     body = model.geom_bodyid[geom]
@@ -86,7 +86,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Bodies (G, WIDTH), hull vertices (V, 3), body rows in `above` (A,) and `pairs` (P, 2); table, m."""
+    """Bodies (G, WIDTH), hull vertices (V, 3), body rows of `above` (A,) and `pairs` (P, 2); table height, m."""
 
     bodies: np.ndarray
     vertices: np.ndarray
@@ -100,12 +100,12 @@ class CollisionCheck:
 
     Attributes:
         names: of the checked pairs, such as "link 'link5' and link 'link1'", in the order of `first_contact`.
-        links, scene: what the compiled functions below take.
+        links, scene: arguments of the compiled functions below.
 
     Args:
-        robot: its file's geoms.
-        table: m, height of the table in the base frame; -inf: no table. None: TABLE_M, or no table if the arm is
-            below that at q_home, as a hanging arm is.
+        robot: the arm with the geoms of its file.
+        table: m, height of the table in the base frame; -inf: no table. None: TABLE_M, or no table if the arm at
+            q_home reaches below TABLE_M, as a hanging arm does.
         may_touch: pairs of body names, or of a body name and "table", that are not checked.
 
     Raises:
@@ -231,7 +231,7 @@ def body_poses(links, bodies, q, frames, poses):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
-    """Return the distance of pair k, m, or a lower bound above `enough` m; work: (10, 3), any content."""
+    """Return the distance of pair k, m, or a lower bound if it is above `enough` m; work: (10, 3), any content."""
     bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]

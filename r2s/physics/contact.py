@@ -1,19 +1,19 @@
-"""Contact of a tool's tip with a surface within one step of 1 ms, implicit in stiffness, damping and friction.
+"""Contact of a tool's tip with a surface in one step of 1 ms, implicit in stiffness, damping and friction.
 
-Normal force: Hunt and Crossley (surface.py), as the mean over the path of the tip in the step: (V(d1) - V(d0)) /
-(d1 - d0) with the potential V of K d^e. This discrete gradient (Gonzalez, J. Nonlinear Science 6, 1996) keeps the
-energy of a bounce at any stiffness, and it contains touch and lift within a step. A semi-implicit step, q1 = q + h
-dq1, has its velocities half a step before its positions; so the path begins at d0 = d - h rate / 2, and ends at d1 =
-d0 + h (rate + rate1) / 2.
+Normal force: the law of Hunt and Crossley (surface.py), averaged over the tip's path in the step. The mean of K d^e
+is (V(d1) - V(d0)) / (d1 - d0) with its potential V. This discrete gradient (Gonzalez, J. Nonlinear Science 6, 1996)
+conserves the energy of a bounce at any stiffness, even if the tip touches or lifts within the step. In a
+semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions. So the path begins at depth d0 =
+d - h rate / 2 and ends at d1 = d0 + h (rate + rate1) / 2, with the penetration rates before and after the step.
 
-Tangential force: bristles in proportion to the load (Canudas de Wit et al., IEEE TAC 40(3), 1995), with deflection z
-and z_s = `bristle`: dz/dt = v - |v| z / z_s, force -mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s at the
-sphere's deepest point; backward Euler. In sliding this is mu F.
+Tangential force: bristles whose stiffness is proportional to the normal force F (Canudas de Wit et al., IEEE TAC
+40(3), 1995). With z_s = `bristle`, the deflection z follows dz/dt = v - |v| z / z_s, in backward Euler. The force
+-mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; in sliding it is mu F.
 
-The unknown is the velocity at the end of the step. About a guess both forces are linear in it: a drive, and a matrix
-that adds to the mass. The stick-slip law solves with them, so that a joint at rest sees the contact. `start_guess`,
-`add_contact`, a solution and `next_guess` repeat until the guess is right, usually once; `finish_contact` ends the
-step.
+The unknowns are the joint velocities at the end of the step. About a guess, both forces are linear in them: their
+constant part adds to the driving torque, a matrix to the mass matrix. The stick-slip law solves this system, so that
+a joint at rest sees the contact. `start_guess` begins; `add_contact`, the solution and `next_guess` repeat until the
+guess is right, usually once; `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -58,21 +58,21 @@ from r2s.physics.sliding import contact_point_velocity, load_box, move_box, slid
 from r2s.physics.stick_slip import JointForces, coming_velocity
 from r2s.physics.surface import normal_force
 
-RIGID = 1e-6  # m, `bristle` of a surface without one: a fiftieth of an encoder's step at a tip
-SLIP = 0.02  # m/s, damping of the bristles fades with speed, otherwise each reversal would cause a pulse of force
-MARGIN = 1e-3  # m, a tip farther away does not touch within a step: a drive would have to give it 2000 m/s^2
-FAR = 0.02  # m, a tip farther away would need 20 m/s
-ROUNDS = 12  # most guesses
-TOLERANCE = 1e-4  # of the force, error of the normal force at which they end
-LATE = 1e-2  # of the force, by which the tangential force may then lag behind load and speed
-BOX_LATE = 1e-3  # of the table's friction, by which it may lag behind the speed of a box
+RIGID = 1e-6  # m, smallest `bristle`, for a rigid surface: a fiftieth of an encoder's step, seen at a tip
+SLIP = 0.02  # m/s, speed above which bristle damping fades out; without fading, each reversal causes a force pulse
+MARGIN = 1e-3  # m, a tip farther away cannot touch within a step: this would take an acceleration of 2000 m/s^2
+FAR = 0.02  # m, a tip farther away would need 20 m/s to touch within a step
+ROUNDS = 12  # largest number of guesses in a step
+TOLERANCE = 1e-4  # relative error of the normal force at which the guesses end
+LATE = 1e-2  # share of the normal force: allowed error of the tangential force, which uses the guessed load and speed
+BOX_LATE = 1e-3  # share of the table's friction: its allowed error, because it uses the guessed speed of the box
 NEGLIGIBLE = 1e-6  # N
-SHORT = 1e-6  # of the depth, a shorter path has the force of its middle: the potential's difference is round-off
+SHORT = 1e-6  # share of the depth; on a shorter path V(d1) - V(d0) is round-off, so the force at its middle is used
 
 
 @njit(cache=True, error_model="numpy")
 def mean_force(contact, begin, rate, coming, h):
-    """Return the mean normal force, N, over a step from depth `begin` m, and its slope, N s/m, in `coming`.
+    """Return the mean normal force, N, of a step from depth `begin` m, and its derivative by `coming`, N s/m.
 
     rate, coming: m/s, penetration rates at the beginning and end of the step.
     """
@@ -101,9 +101,9 @@ def mean_force(contact, begin, rate, coming, h):
 
 @njit(cache=True, error_model="numpy")
 def _from_box(contact, x, y, z):
-    """Return the distance, m, of a point from the surface of a box, from whose centre it is at x, y, z m.
+    """Return the distance, m, from a box's surface to a point at x, y, z m from the box's centre; negative inside.
 
-    Writes the normal there, and turns the bristles into the tangential plane.
+    It also writes the surface normal there and projects the bristle deflection onto the tangential plane.
     """
     axes, half, normal = contact[AXES : AXES + 9], contact[HALF : HALF + 3], contact[NORMAL : NORMAL + 3]
     square, face, least, side = 0.0, 0, -np.inf, 1.0
@@ -130,14 +130,14 @@ def _from_box(contact, x, y, z):
 
 @njit(cache=True, error_model="numpy")
 def near(contact, place, anchor, axis, dq, h, jacobian):
-    """Write depth and Jacobian (ROWS, n) of a tip; return whether it may touch within the step.
+    """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch within the step.
 
-    Call it once per step: a box that the tip cannot touch slides on by the step.
+    Call it once per step, because it also moves a box that the tip cannot touch.
 
     Args:
-        contact: (COLUMNS,); of a tip that cannot touch, force and deflection become 0.
+        contact: (COLUMNS,), updated; if the tip cannot touch, force and deflection become 0.
         place: position (3,) m and rotation (9,) of the link that carries the tool, in the base frame.
-        anchor, axis: (n, 3) of the joints. dq: (n,) rad/s.
+        anchor, axis: (n, 3) m, joint anchors, and joint axes. dq: (n,) rad/s.
     """
     position, R = place
     rate = 0.0
@@ -181,7 +181,7 @@ def near(contact, place, anchor, axis, dq, h, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def _box_rate(contact):
-    """Return the rate of the depth, m/s, that the box's motion adds."""
+    """Return what the box's motion adds to the penetration rate, m/s."""
     point, rate = np.empty(3), 0.0
     contact_point_velocity(contact, contact[VELOCITY : VELOCITY + 4], point)
     for k in range(3):
@@ -191,9 +191,9 @@ def _box_rate(contact):
 
 @njit(cache=True, error_model="numpy")
 def _bristles(contact, force, speed, h):
-    """Return spring and damper, N/m and N s/m, of the tangential force under a normal force N at a speed m/s.
+    """Return spring, N/m, and damper, N s/m, of the friction under a normal force, N, at a sliding speed, m/s.
 
-    The force is -(spring z + damper v), with deflection z at the beginning and velocity v at the end of a step.
+    Friction is -(spring z + damper v), with deflection z at the beginning and velocity v at the end of a step.
     """
     reach = max(contact[BRISTLE], RIGID)
     late = MICRO_DAMPING * np.exp(-((speed / SLIP) ** 2)) / h
@@ -204,7 +204,7 @@ def _bristles(contact, force, speed, h):
 
 @njit(cache=True, error_model="numpy")
 def _velocity(jacobian, dq, slide):
-    """Return the rate of the depth, m/s, and write the tangential velocity (3,) m/s."""
+    """Return a tip's penetration rate and sliding speed, m/s; write its tangential velocity to `slide` (3,) m/s."""
     rate = 0.0
     slide[:] = 0.0
     for j in range(len(dq)):
@@ -216,7 +216,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Return rate and speed relative to a box whose contact has the velocity `point` (3,) m/s; change `slide`."""
+    """Return rate and speed, m/s, relative to a box that moves at `point` (3,) m/s in the contact; update `slide`."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]
@@ -228,7 +228,7 @@ def _relative(contact, rate, slide, point):
 
 @njit(cache=True, error_model="numpy")
 def start_guess(contact, jacobian, dq, h, guess):
-    """Write the guess (GUESS,) that a tip goes on at dq (n,) rad/s."""
+    """Write the first guess (GUESS,): the joint velocities dq (n,) rad/s do not change in the step."""
     rate, speed = _velocity(jacobian, dq, guess[SLIDE : SLIDE + 3])
     if contact[MASS] > 0.0:
         point = np.empty(3)
@@ -243,7 +243,7 @@ def start_guess(contact, jacobian, dq, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def add_contact(contact, jacobian, h, guess, mass, drive):
-    """Add the contact, linear about the guess, to a packed mass matrix, kg m^2, and a drive (n,) Nm."""
+    """Add the contact, linearized about the guess, to a packed mass matrix, kg m^2, and a driving torque (n,) Nm."""
     spring, damper = _bristles(contact, guess[NORMAL_FORCE], guess[SPEED], h)
     guess[SPRING], guess[DAMPER], slope = spring, damper, guess[SLOPE]
     force = guess[NORMAL_FORCE] + slope * (guess[RATE] - guess[NEXT])
@@ -265,7 +265,7 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
-    """Add the contact with a box; held: normal force N and minus the tangential one (3) if the box did not yield."""
+    """Add the contact with a box; held: N, normal force and minus tangential force (3) if the box did not yield."""
     n, at = contact[NORMAL : NORMAL + 3], np.empty(3)
     for k in range(3):
         at[k] = held[0] * n[k] - held[1 + k]
@@ -286,7 +286,7 @@ def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def next_guess(contact, jacobian, h, coming, guess):
-    """Set the guess to the velocities found, coming (n,) rad/s; return whether the old guess was right."""
+    """Set the guess to the solution `coming` (n,) rad/s; return whether the old guess was accurate enough."""
     force, fast = guess[NORMAL_FORCE], guess[SPEED]
     rate, speed = _velocity(jacobian, coming, guess[SLID : SLID + 3])
     box_late = 0.0
@@ -311,7 +311,7 @@ def next_guess(contact, jacobian, h, coming, guess):
 
 @njit(cache=True, error_model="numpy")
 def finish_contact(contact, h, guess):
-    """Write force and deflection after a step."""
+    """Write the force of a solved step and the deflection after it, and move the box."""
     spring, damper, force = guess[SPRING], guess[DAMPER], guess[LINEAR]
     _deflect(contact, guess[SLID : SLID + 3], guess[SPEED], h, (force, spring, damper))
     if contact[MASS] > 0.0:
@@ -320,7 +320,7 @@ def finish_contact(contact, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _deflect(contact, slide, speed, h, terms):
-    """Write the force of a normal force N, a spring and a damper, and the deflection after h s at a velocity (3,)."""
+    """Write the force by terms (normal force, spring, damper), and the deflection after h s at `slide` (3,) m/s."""
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0
     z = contact[DEFLECTION : DEFLECTION + 3]
@@ -334,7 +334,7 @@ def _deflect(contact, slide, speed, h, terms):
 
 @njit(cache=True, error_model="numpy")
 def explicit_contact(contact, jacobian, dq, h):
-    """Write force and deflection of a step that is much shorter than the contact's oscillation."""
+    """Write force and deflection of an explicit step, which must be much shorter than the contact's oscillation."""
     tangent = np.empty(3)
     rate, speed = _velocity(jacobian, dq, tangent)
     if contact[MASS] > 0.0:

@@ -9,7 +9,7 @@ from r2s.physics.surface import Surface
 
 # Columns of a contact: surface (see `Surface`), tool, and what a step writes
 K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
-# HALF: 0 for a plane. AXES: row by row. NORMAL: of a box, where the tip is
+# HALF: 0 for a plane. AXES: row by row. NORMAL: for a box, the surface normal at the tip
 HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
 # Of a box that moves on a table (sliding.py); MASS 0: the surface is fixed. WEIGHT: N. TABLE: friction coefficient.
 # REACH: m, moment over force of the table's friction. UP: normal of the table. VELOCITY, SPIN: of the centre, m/s,
@@ -19,19 +19,19 @@ MASS, INERTIA, WEIGHT, TABLE, REACH, UP = range(DEPTH + 1, DEPTH + 7)
 VELOCITY, SPIN, STRAIN, ARM, LOAD = UP + 3, UP + 6, UP + 7, UP + 11, UP + 14
 COLUMNS = LOAD + 1
 ROWS = 4  # of the Jacobian: normal, and the tangential part of x, y and z
-# Columns of a guess. RATE: of the depth, and SLIDE (3): tangential velocity, at the beginning of the step. NEXT and
-# SPEED: their guess for its end. BEGIN: m, where the path begins. LINEAR and SLID (3): force and velocity found.
+# Columns of a guess. RATE and SLIDE (3): penetration rate and tangential velocity before the step. NEXT, SPEED: guess
+# of rate and sliding speed after it. BEGIN: m, depth d0. LINEAR, SLID (3): force and velocity of the solution.
 RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE = 0, 1, 4, 5, 6, 7, 8
 SPRING, DAMPER, LINEAR, SLID = 9, 10, 11, 12
-# Of a box: velocity of the tip at the beginning (3), force if the tip goes on so (3) N, its decrease per change of
-# that velocity (9) N s/m, velocity and spin at the end (4), and the guess of the speed on the table
+# With a box: tip velocity before the step (3), contact force if the tip keeps it (3) N, decrease of that force per
+# change of tip velocity (9) N s/m, velocity and spin of the box after the step (4), and the guess of its speed
 TIP_BEGIN, FORCE_BEGIN, RESISTANCE = SLID + 3, SLID + 6, SLID + 9
 BOX_END, BOX_SPEED = RESISTANCE + 9, RESISTANCE + 13
 GUESS = BOX_SPEED + 1
 
 
 def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
-    """Return (..., COLUMNS) of a surface and the robot's tool, before the first step.
+    """Return the contact columns (..., COLUMNS) of a surface and the robot's tool, before the first step.
 
     Raises:
         UserError: the robot has no tool, or a value of the surface is out of its range.
@@ -65,5 +65,5 @@ def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
 
 
 def box_pose(contact: np.ndarray) -> np.ndarray:
-    """Return (..., 6), centre m and first axis of the box in contacts (..., COLUMNS)."""
+    """Return the pose (..., 6), centre m and first axis, of the box in contacts (..., COLUMNS)."""
     return np.concatenate([contact[..., POINT : POINT + 3], contact[..., AXES : AXES + 9 : 3]], axis=-1)

@@ -1,17 +1,17 @@
-"""What the driver does with a force when it stops an arm whose tip presses: hold, release or retreat.
+"""What the driver does with the contact force when it stops an arm whose tip presses: hold, release or retreat.
 
-If a stop only removed the command, the surface would give back F^2 / 2k and throw the tip off by up to F / k, and
-joint friction would keep up to `hidden` of the force (push_limit.py). So the target of a stop is
+If a stop only removed the command, the surface would return its energy F^2 / 2k and throw the tip off by up to F / k,
+and joint friction would hold up to `hidden` of the force (push_limit.py). So a stop has a target torque:
 
-- hold: the force that the limit of pushes estimated as the stop began, J^T R. Nothing moves.
+- hold: J^T R, with the force R that the push limit estimated when the stop began. Nothing moves.
 - release: the tip moves outwards at LEAVE until the force is gone. A velocity loop follows the joint speeds of least
   kinetic energy, -LEAVE m M^-1 J^T. Resistance and joint friction are fed forward, and an integral adds up to the
-  same friction for an arm that has more. The friction h of joints that move outwards pushes inwards, so R = F - h.
-  The motion ends at R = RELEASED - SLIDES h of the modelled h, that is at F <= RELEASED + (1 - SLIDES) h if friction
-  is at most the modelled one; with SLIDES of it the tip is in the air.
-- retreat: release, and RETREAT_M farther.
+  same friction again, for an arm with more of it. The friction h of joints that move outwards pushes inwards, so R =
+  F - h. The motion ends at R = RELEASED - SLIDES h with the modelled h, that is at F <= RELEASED + (1 - SLIDES) h if
+  friction is at most h; if friction is only SLIDES h, the tip is then in the air.
+- retreat: as release, then RETREAT_M farther.
 
-The limits of pushes, speeds and accelerations apply to every stop, and it ends after LEAVES_S.
+The limits of push, speed and acceleration apply to every stop, which ends after LEAVES_S.
 """
 
 import numpy as np
@@ -22,22 +22,22 @@ from r2s.physics.push_limit import FELT, HEIGHT, HOLD, LEAVE, PHASE, PULL, RESIS
 from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
-RELEASED = 0.5  # N
-SLIDES = 0.25  # friction of slowly sliding joints, share of the level that holds them; 0.35 with conf/friction/paper
-RETREAT_M = 0.01  # m, of the tip that came from `task.clearance` = 15 mm above the plane
+RELEASED = 0.5  # N, a smaller force counts as released
+SLIDES = 0.25  # friction of slowly sliding joints over their breakaway level; 0.35 with conf/friction/paper
+RETREAT_M = 0.01  # m; the tip has come from `task.clearance` = 15 mm above the plane
 LEAVES_S = 0.4  # s; 0.1 s is left to brake, and 20 N on the softest surface of conf/dr/contact.yaml are 10 mm deep
-MOST = 0.25  # share of the allowed speeds, at which a joint moves the tip outwards at most
+MOST = 0.25  # largest share of its allowed speed at which a joint moves the tip outwards
 GAIN = 0.5 * RATE  # 1/s, of the velocity loop: it leaves half of the latency budget to what resists
 BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
 
 @njit(cache=True, error_model="numpy")
 def stop_torque(limit, arm, kinematics, friction, limits, held, target):
-    """Write the target torque (n,) Nm of a cycle of a stop; return the share of the allowed speeds that it needs.
+    """Write the target torque (n,) Nm in a cycle of a stop; return the share of the allowed speeds that it needs.
 
     Args:
         limit, arm, kinematics, friction: see `push_bound`. limits: see `filter_limits`.
-        held: (n,) Nm of an adapter, which come on top and which a load resists: R counts them as the surface's.
+        held: (n,) Nm that an adapter adds to hold a load; R counts them as resistance of the surface.
     """
     n = len(target)
     root, row, lever, ddq = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

@@ -1,4 +1,4 @@
-"""Compiled control laws, which turn a command into joint torques once a millisecond.
+"""Compiled control laws, which map a command to joint torques every millisecond.
 
 A control law is a compiled function
 
@@ -11,8 +11,8 @@ A control law is a compiled function
     out         (n,) Nm, the target torque, without gravity
 
 The same function runs in MuJoCo's callback during training (mujoco_callback.py), in the driver of every arm
-(r2s/arm/driver.py) and in an exported bundle. The room control/ chooses law and parameters. The laws are in this room
-because MuJoCo's callback contains them and numba caches compiled code per room.
+(r2s/arm/driver.py) and in an exported bundle. The package r2s/control chooses law and parameters. The laws are in
+this package because MuJoCo's callback contains them and numba caches compiled code per folder.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from r2s.physics.impedance_laws import cartesian_impedance_law, joint_impedance_
 
 
 class ControlLaw(Protocol):
-    """A control law with its parameters; r2s/control/controller.py has it.
+    """A control law with its parameters; `Controller` in r2s/control/controller.py implements it.
 
     Attributes:
         law: the compiled function. parameters: (p,). command_size, memory_size: lengths of command and memory.
@@ -45,14 +45,14 @@ class ControlLaw(Protocol):
 
 @njit(cache=True, error_model="numpy")
 def torque_law(q, dq, command, parameters, memory, out):
-    """The command is the torque: `control=torque`."""
+    """Write the command as the torque: `control=torque`."""
     for j in range(len(q)):
         out[j] = command[j]
 
 
 @njit(cache=True, error_model="numpy")
 def computed_torque_law(q, dq, command, parameters, memory, out):
-    """Computed torque: feedforward, and a critically damped PD law weighted with the mass matrix.
+    """Write the computed torque: feedforward, and a critically damped PD law weighted with the mass matrix.
 
     tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)), updated every `hold` cycles.
 
@@ -109,7 +109,7 @@ def _either(own_number: int, own: Callable, others: Callable) -> Callable:
 
 @cache
 def chain(laws: tuple[Callable, ...]) -> Callable:
-    """Return the compiled function (number, q, dq, command, parameters, memory, out) that calls one of these laws."""
+    """Return the compiled function (number, q, dq, command, parameters, memory, out) that calls a law by number."""
     law: Callable = _no_law
     for k in reversed(range(len(laws))):
         law = _either(k, laws[k], law)

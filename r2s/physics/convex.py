@@ -2,7 +2,7 @@
 
 A body is a core, described by its support function, and a radius around it. The distance of two cores follows
 Gilbert, Johnson and Keerthi (IEEE J. Robot. Autom. 4(2), 1988), with the simplex cases of Ericson (Real-Time
-Collision Detection, 2005, ch. 5); the iteration ends as soon as the distance is known to be enough.
+Collision Detection, 2005, ch. 5); it ends once a lower bound of the distance exceeds `enough`.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ ITERATIONS = 64
 
 @njit(cache=True, error_model="numpy")
 def support_point(body, vertices, pose, dx, dy, dz):
-    """Return the support point (x, y, z) of a body's core in a direction; a pose has the columns of `link_frames`."""
+    """Return the support point (x, y, z) of a body's core in a direction; pose: a row (POSE,) of `link_frames`."""
     x = pose[3] * dx + pose[6] * dy + pose[9] * dz
     y = pose[4] * dx + pose[7] * dy + pose[10] * dz
     z = pose[5] * dx + pose[8] * dy + pose[11] * dz
@@ -54,7 +54,7 @@ def support_point(body, vertices, pose, dx, dy, dz):
 
 @njit(cache=True, error_model="numpy")
 def separation(enough, a, pose_a, b, pose_b, vertices, work):
-    """Return the distance of two bodies, m, or a lower bound above `enough` m; 0 or less if they overlap."""
+    """Return the distance of two bodies, m, or only a lower bound if this is above `enough` m; overlap: 0 or less."""
     around = a[RADIUS] + b[RADIUS]
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return np.sqrt(_segments(a, pose_a, b, pose_b)) - around
@@ -98,9 +98,9 @@ def _segments(a, p, b, r):
 
 @njit(cache=True, error_model="numpy")
 def _nearest(s, count, t):
-    """Return the point of a simplex s (4, 3) with `count` corners nearest to the origin, and the corners it needs.
+    """Return the point nearest to the origin in a simplex s (4, 3) of `count` corners, and the number that span it.
 
-    These corners move to the front of s; 4: the origin is inside. t: (6, 3), any content.
+    The spanning corners move to the front of s. With 4 of them the origin is inside. t: (6, 3), any content.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1

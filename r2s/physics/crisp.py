@@ -1,7 +1,7 @@
-"""Friction as crisp_controllers compensate it: the YAML of a ROS 2 controller, by the paper's eq. (5).
+"""Friction parameters for crisp_controllers: the YAML of a ROS 2 controller, with the paper's eq. (5).
 
 The controllers (github.com/utiasDSL/crisp_controllers) add fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
-fp3)) to each joint's torque. The sigmoid family is that law; other families are fitted by it.
+fp3)) to each joint's torque. The sigmoid family is the same law; other families are approximated by it.
 """
 
 from pathlib import Path
@@ -14,12 +14,12 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import SIGMOID
 from r2s.physics.robot import Robot
 
-SPEEDS, SLOWEST = 100, 0.01  # fitted speeds per direction, up to dq_max; the slowest, of dq_max
+SPEEDS, SLOWEST = 100, 0.01  # number of fitted speeds per direction, up to dq_max; the slowest one over dq_max
 STEEPEST = 100.0  # s/rad, fp2 at most: a steeper step is chatter for a controller that filters dq
 
 
 def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Return (...) Nm at dq (...) rad/s for phi (..., 3): fp1 Nm, fp2 s/rad, fp3 rad/s."""
+    """Return the friction (...) Nm at dq (...) rad/s for phi (..., 3): fp1 Nm, fp2 s/rad, fp3 rad/s."""
     fp1, fp2, fp3 = (phi[..., k] for k in range(3))
     return fp1 / (1 + np.exp(-fp2 * (dq + fp3))) - fp1 / (1 + np.exp(-fp2 * fp3))
 
@@ -39,7 +39,7 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
         def error(x: np.ndarray, j: int = j) -> np.ndarray:
             return sigmoid_law(dq[:, j], x) - true[:, j]
 
-        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # viscous, and Coulomb friction
+        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # like viscous, and like Coulomb friction
         fits = [least_squares(error, start, bounds=bounds, x_scale="jac") for start in starts]
         out[j] = min(fits, key=lambda fit: fit.cost).x
     return out, np.sqrt(np.mean((sigmoid_law(dq, out) - true) ** 2, axis=0))

@@ -1,8 +1,8 @@
 """Robot descriptions in three formats: MJCF, URDF and SDF with the same links, limits and friction.
 
-All values come from the robot's file, except identified masses, centres, tensors and rotors. The frame of a link in
-URDF and SDF is its joint's frame at angle zero, so tensors need no rotation (ignition-physics 5.1 of Gazebo Fortress
-misreads a rotated inertial frame).
+Masses, centres of mass, inertia tensors, rotor inertias and friction are the identified ones; all other values are
+those of `robot`. In URDF and SDF a link's frame is its joint's frame at angle zero, so inertia tensors need
+no rotation (ignition-physics 5.1 of Gazebo Fortress misreads a rotated inertial frame).
 """
 
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ class Link:
     """A moving link and its joint, in the form of URDF and SDF.
 
     Attributes:
-        name, joint: of the link, of its joint.
-        origin: (4, 4) pose of the joint in the frame of the link before it, at angle zero.
+        name, joint: names of the link and of its joint.
+        origin: (4, 4) pose of the joint in the parent link's frame, at angle zero.
         axis: (3,) in the joint's frame.
-        mass: kg. com: (3,) m, in the link's frame. inertia: (3, 3) kg m^2 about it, link axes.
-        damping: (3,) Nm s/rad, .../rad^2 and so on: MuJoCo's polynomial. friction: Nm, Coulomb. armature: kg m^2.
-        stiffness: (3,) Nm/rad and so on, of a spring that rests at springref, rad.
+        mass: kg. com: (3,) m, in the link's frame. inertia: (3, 3) kg m^2 about `com`, link axes.
+        damping: (3,) coefficients of MuJoCo's polynomial, first Nm s/rad. friction: Nm, Coulomb. armature: kg m^2.
+        stiffness: (3,) coefficients of a spring, the first Nm/rad; its torque is 0 at springref, rad.
     """
 
     name: str
@@ -53,8 +53,8 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
     """Return the arm's links, from the base outwards, and the pose (4, 4) of the end effector in the last link.
 
     Args:
-        robot: the arm. dynamics: masses, centres, tensors, rotors, friction.
-        friction: approximate friction by Coulomb and viscous terms that match it at 30 % and 100 % of dq_max.
+        robot: the arm. dynamics: masses, centres of mass, inertia tensors, rotor inertias, friction.
+        friction: True approximates it by Coulomb and viscous terms that match it at 30 % and 100 % of dq_max.
     """
     model = robot.model(gravity=True)
     bodies, moving = Bodies(model), model.jnt_bodyid
@@ -90,16 +90,16 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
 
 
 def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) Nm and (n,) Nm s/rad of the straight line through the friction at 0.3 and 1 times dq_max."""
+    """Return Coulomb (n,) Nm and viscous friction (n,) Nm s/rad that match the friction at 0.3 and 1 times dq_max."""
     fast, slow = (dynamics.family.level(dynamics.phi, share * robot.dq_max) for share in (1.0, 0.3))
     viscous = np.maximum((fast - slow) / (0.7 * robot.dq_max), 0.0)
     return np.maximum(fast - viscous * robot.dq_max, 0.0), viscous
 
 
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
-    """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; return a line for each format that cannot hold it.
+    """Write arm.xml (MJCF), arm.urdf and arm.sdf; return a message for each format that cannot represent the arm.
 
-    An arm with armature gets no arm.sdf, without a message: SDF has no rotors, and most arms have some.
+    An arm with armature gets no arm.sdf and no message about it: SDF has no rotors, and most arms have some.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
@@ -197,7 +197,7 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as SDF 1.9, fixed to the world, with a frame `ee` at the end effector.
 
     Raises:
-        UserError: the joints have armature, or a nonlinear spring or damping; SDF has none.
+        UserError: the joints have armature, or a nonlinear spring or damping, which SDF cannot represent.
     """
     links, tip = chain(robot, dynamics)
     if any(link.armature for link in links):
@@ -217,14 +217,14 @@ def write_world(
     version: str = "1.9",
     physics: str = "ignored",
 ) -> None:
-    """Write the world of r2s/engines/gazebo.py and gazebo_classic.py as SDF.
+    """Write the SDF world that r2s/engines/gazebo.py and gazebo_classic.py simulate.
 
-    It contains physics in 1 ms steps without a real-time limit, no gravity (libfranka's convention), no limits of
-    velocity or torque (the driver has them), and no friction (r2s applies it as a torque). A rotor becomes damping,
-    armature / 1 ms; the engines compensate that torque.
+    Its steps take 1 ms, without a real-time limit. It has no gravity (libfranka's convention), no limits of velocity
+    or torque (the driver enforces them), and no friction (r2s applies it as a torque). SDF has no rotors, so a rotor
+    becomes the damping armature / 1 ms, whose torque the engines cancel.
 
     Args:
-        path: file. robot, dynamics: the arm. plugin: of the world. version: of SDF.
+        path: file. robot, dynamics: the arm. plugin: the world's plugin element. version: version of SDF.
         physics: type of the physics engine; gz-sim ignores it.
     """
     links, tip = chain(robot, dynamics, friction=False)
@@ -243,7 +243,7 @@ def write_world(
 
 
 def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarray, *, world: bool) -> None:
-    """Append the model; `world`: for `write_world`."""
+    """Append the arm's model to `place`; world: whether the model is for `write_world`."""
     model = ET.SubElement(place, "model", name=robot.name)
     parent = "world"
     pose = np.eye(4)
@@ -275,12 +275,12 @@ def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarr
 
 
 def _polynomial(coefficients: np.ndarray) -> str:
-    """Return a coefficient, or all three if it is not linear."""
+    """Return the first coefficient as text, or all three if the polynomial is nonlinear."""
     return words(coefficients if coefficients[1:].any() else coefficients[:1])
 
 
 def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
-    """Raise UserError for a spring that a format cannot represent, or for nonlinear damping; springs: linear ones."""
+    """Raise UserError for nonlinear damping or springs, and for linear springs if the format has none (`springs`)."""
     for link in links:
         nonlinear = link.damping[1:].any() or link.stiffness[1:].any()
         if nonlinear or (link.stiffness.any() and not springs):
@@ -310,7 +310,7 @@ def _urdf_joint(root: ET.Element, name: str, kind: str, parent: str, child: str,
 
 
 def _roll_pitch_yaw(r: np.ndarray) -> np.ndarray:
-    """Return roll, pitch, yaw (3,) rad with Rz(yaw) Ry(pitch) Rx(roll) = r; any yaw at gimbal lock."""
+    """Return roll, pitch, yaw (3,) rad with Rz(yaw) Ry(pitch) Rx(roll) = r; at gimbal lock yaw is arbitrary."""
     yaw = np.arctan2(r[1, 0], r[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
     # from Rz(-yaw) r, whose elements are well conditioned for any yaw
@@ -319,17 +319,17 @@ def _roll_pitch_yaw(r: np.ndarray) -> np.ndarray:
 
 
 def pose_words(pose: np.ndarray) -> str:
-    """Return position and roll, pitch, yaw of a pose (4, 4), as SDF has them."""
+    """Return the text of a pose (4, 4) in SDF: position, then roll, pitch and yaw."""
     return f"{words(pose[:3, 3])} {words(_roll_pitch_yaw(pose[:3, :3]))}"
 
 
 def words(values: np.ndarray) -> str:
-    """Return numbers that come back exactly."""
+    """Return numbers as text from which the same floats can be read."""
     return " ".join(repr(float(v)) for v in values)
 
 
 def add_text(element: ET.Element, /, **children: object) -> None:
-    """Append a child with a text for each name."""
+    """Append one child element per keyword, with the value as its text."""
     for name, value in children.items():
         ET.SubElement(element, name).text = str(value)
 

@@ -13,7 +13,7 @@ from r2s.physics.robot import Robot, per_joint
 from r2s.physics.surface import Surface
 
 STICTION_MODELS = ("command", "net")
-PHI1 = 0.02  # of tau_max, friction (twice the Coulomb torque) of a joint of which nothing is known
+PHI1 = 0.02  # of tau_max, `phi1` (twice the Coulomb torque) of a joint whose friction is not declared
 MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: beyond the friction parameters of any arm
 
 
@@ -29,15 +29,15 @@ class Dynamics:
         mass: (..., n) kg, com: (..., n, 3) m, link frame.
         inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
         armature: (..., n) kg m^2, rotor inertia reflected to the joint; not visible to a link-side torque sensor.
-        load: (..., n) friction torque per gravity torque of the joint.
-        drag: (..., n, 2) Nm, offset proportional to sin q and cos q of the joint, such as a cable's.
+        load: (..., n) friction torque per gravity torque at the joint.
+        drag: (..., n, 2) Nm, coefficients of an offset in sin q and cos q of the joint, such as a cable's.
         gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; a property of
             the recording, not of the arm's motion.
-        signal_delay: (...) s, by which measured or motor torque is logged later than the angles; of the recording.
-        late_alike: whether measured torque counts as late as the logged dq, which is used as logged; of the
-            recording.
+        signal_delay: (...) s, by which measured or motor torque is later than the angles, in the recording.
+        late_alike: whether measured torque and logged dq count as equally late, so that dq is used as logged; a
+            property of the recording.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
-        family: of the friction.
+        family: the friction law.
         stiction_model: the torque that the breakaway edges limit. "command" is eq. (6) of the paper: command and
             offset have no effect within the edges. "net": a joint sticks while the sum of all torques on it, with the
             coupling to other joints, lies within the edges (r2s/physics/stick_slip.py).
@@ -100,7 +100,7 @@ class Dynamics:
 
     @property
     def level(self) -> np.ndarray:
-        """(..., n) Nm, friction at 1 rad/s, the smaller of both directions."""
+        """(..., n) Nm, friction at 1 rad/s, the smaller value of both directions."""
         n = self.phi.shape[-2]
         return np.minimum(self.friction(np.full(n, 1.0)), -self.friction(np.full(n, -1.0))).clip(0.0)
 
@@ -133,10 +133,10 @@ def nominal_dynamics(
 ) -> Dynamics:
     """Return the dynamics of `conf/friction` and `conf/inertia`; a value per joint, or one for all.
 
-    A family other than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" starts with the sigmoid. phi1=None
-    takes the arm's file at its word: its frictionloss and damping are Coulomb and viscous friction, "auto" starts
-    with that law, and a joint for which the file gives neither has PHI1 of its torque limit. The file's frictionloss
-    is also a breakaway torque of None.
+    A family other than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" starts with the sigmoid. With
+    phi1=None, the file's frictionloss and damping are Coulomb and viscous friction, "auto" starts with this law, and
+    a joint for which the file has neither gets a phi1 of PHI1 times its torque limit. A breakaway torque of None is
+    the file's frictionloss.
 
     Raises:
         UserError: a list of the wrong length, or a value out of its physical range.
@@ -152,7 +152,7 @@ def nominal_dynamics(
 
     declared = phi1 is None and bool(robot.damping.any() or robot.frictionloss.any())
     slow, fast = robot.frictionloss, robot.damping
-    guess = np.where(slow + fast > 0, 2.0 * (slow + fast), PHI1 * robot.tau_max)  # the sigmoid's at 1 rad/s
+    guess = np.where(slow + fast > 0, 2.0 * (slow + fast), PHI1 * robot.tau_max)  # phi1 with this friction at 1 rad/s
     phi = np.stack([joints("friction.phi1", guess if phi1 is None else phi1), joints("friction.phi2", phi2)], -1)
     scale = joints("inertia.scale", inertia_scale)
     for name, values in (("friction.phi1", phi[:, 0]), ("friction.phi2", phi[:, 1])):

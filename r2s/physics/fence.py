@@ -1,13 +1,13 @@
-"""The fence of the driver: stop an arm before it touches itself or the table. Compiled, a few microseconds.
+"""The driver's fence: it stops an arm before the arm touches itself or the table. Compiled, a few microseconds.
 
-A pair of `CollisionCheck` may not come nearer than FENCE_M in the posture in which the arm would rest if it braked
-now, at full speed not nearer than FENCE_M (1 + SPREAD), because links swing while they brake. The filter brakes along
-a ramp of BRAKE_S, which a joint follows LAG_S late; a joint that is slower than the fastest one, as a share of its
-allowed speed, begins to brake when the ramp has fallen to its own share. This posture moves continuously with the
-arm, so it cannot pass through an obstacle between two cycles.
+The fence predicts the posture in which the arm would come to rest if it braked now. There no pair of `CollisionCheck`
+may be nearer than FENCE_M, at full speed FENCE_M (1 + SPREAD), because links swing while they brake. The safety
+filter brakes along a ramp of BRAKE_S, which a joint follows LAG_S late. A joint with a smaller share of its allowed
+speed than the fastest one begins to brake when the ramp has fallen to that share. The predicted posture moves
+continuously with the arm, so it cannot pass through an obstacle between two cycles.
 
-An arm that starts nearer may leave: the least distance of a pair is half of the largest that it has had so far in the
-motion, at most FENCE_M. Pairs that overlap at the start are not watched until they are apart.
+An arm that starts nearer may move away: the allowed distance of a pair is half of the pair's largest distance so far
+in the motion, at most FENCE_M. Pairs that overlap at the start are ignored until they are apart.
 """
 
 from typing import NamedTuple
@@ -20,19 +20,19 @@ from r2s.physics.kinematics import POSE
 from r2s.physics.safety_filter import BRAKE_S, DQ_ALLOWED, LATENCY_S, RATE
 
 FENCE_M = 0.01  # m
-SPREAD = 3.0  # simulated stops from full speed end up to 0.02 m from where they are predicted
-LAG_S = 1 / RATE + LATENCY_S  # s, of the speed behind the ramp that it follows
+SPREAD = 3.0  # simulated stops from full speed end up to 0.02 m from the prediction
+LAG_S = 1 / RATE + LATENCY_S  # s, lag of a joint's speed behind the ramp
 
 
 class Fence(NamedTuple):
-    """What `breached` takes: links of `links_of`, and the scene of a `CollisionCheck`."""
+    """Geometry for `breached`: links of `links_of`, and the scene of a `CollisionCheck`."""
 
     links: np.ndarray
     scene: Scene
 
 
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return the number (E,) of the pair at which the driver would stop a motion q, dq (E, T, n), -1 for none.
+    """Return the number (E,) of the pair for which the driver would stop each motion q, dq (E, T, n), -1 for none.
 
     limits: (n, COLUMNS) of `filter_limits`.
     """
@@ -52,7 +52,7 @@ def breached(fence, limits, q, dq, least):
     Args:
         fence: `Fence`. limits: (n, COLUMNS) of `filter_limits`.
         q, dq: (n,) rad, rad/s, finite.
-        least: (K,) m, least distance of each pair, -inf before the first cycle of a motion; updated.
+        least: (K,) m, allowed distance of each pair, -inf before the first cycle of a motion; updated.
     """
     if len(least) == 0:
         return -1

@@ -1,7 +1,7 @@
-"""Joint friction: families of one interface, breakaway (eq. 6) and offsets.
+"""Joint friction: four laws, called families, with one interface; users can add their own.
 
-A family contains its law in NumPy, and the same law compiled for the physics step (mujoco_callback.py).
-`friction.family=` names one of the four below, or, by a dotted path such as my_module.MY_FAMILY, a user's own.
+A family contains its law twice: in NumPy, and compiled for the physics step (mujoco_callback.py). `friction.family=`
+selects one of the four families below by name, or a user's own by a dotted path such as my_module.MY_FAMILY.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,31 +13,31 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.errors import UserError, choices, nearest
 
-WIDTH_DQ = 0.01  # rad/s, width of the sign change of Coulomb friction; equal to the default dq_min of stiction
+WIDTH_DQ = 0.01  # rad/s, speed over which Coulomb friction changes its sign; equal to the default dq_min of stiction
 PRESLIDING = 1e-3  # rad, presliding distance if it is not identified; typical of a Panda's joints
-MICRO_DAMPING = 5e-3  # s, damping over stiffness of the bristles, damps their oscillation within a few periods
+MICRO_DAMPING = 5e-3  # s, ratio of the bristles' damping to stiffness; damps their oscillation within a few periods
 PHI = 8  # maximum number of parameters of a family
-VISCOUS = "viscous"  # the parameter that every family names so, Nm s/rad
+VISCOUS = "viscous"  # name of the viscous parameter in every family that has one, Nm s/rad
 
 
 @dataclass(frozen=True)
 class Family:
-    """A friction law of one joint with K parameters; 0 at rest and positive for positive velocity.
+    """A friction law of one joint with K parameters; its torque is 0 at rest and positive for positive velocity.
 
     Attributes:
         name: shown in tables.
         names, units: of the K parameters.
         logarithmic: names of positive parameters that span decades; their search space is logarithmic.
-        bounds: (low, high) of each parameter, for those that `identify.bounds` does not list.
-        optional: the last parameters; each is 0 and not estimated unless `identify.terms` names it.
+        bounds: (low, high) of each parameter; `identify.bounds` overrides them.
+        optional: names of the last parameters; each is 0 and not estimated unless `identify.terms` lists it.
         formula: the law in one line.
         law: (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n). `sign` is
             tanh(dq / 0.01), or the bristle deflection of a family with a memory, in [-1, 1].
-        native: the law for one joint and one step of h seconds, compiled by numba.njit:
-            (p (PHI,), v, h, memory (1,)) -> torque and slope at v. `memory` is the joint's state, 0 after a reset.
-        sharp: `native` with the jump at rest, for stiction_model="net", which solves for rest. None: the law has no
-            jump.
-        start: level (..., n) Nm at 1 rad/s -> list of the parameters that are not optional.
+        native: the law of one joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
+            torque and its derivative at v. `memory` is the joint's state, 0 after a reset.
+        sharp: `native` with a true jump at rest, for stiction_model="net", which computes rest exactly. None: the law
+            has no jump.
+        start: friction (..., n) Nm at 1 rad/s -> start values (a list) of the parameters that are not optional.
         held: phi (..., n, K) -> breakaway torque (..., n, 2) Nm, negative and positive, of a law with a memory.
             None: the law has no stiction of its own; the dead zone of eq. (6) or stick_slip.py provides it.
 
@@ -76,7 +76,7 @@ class Family:
         return self.held is not None
 
     def at_rest(self, phi: np.ndarray) -> np.ndarray:
-        """Return the friction (..., n, 2) Nm at the onset of sliding, negative and positive; 0 without a jump.
+        """Return the friction (..., n, 2) Nm at the onset of sliding, negative and positive; 0 if there is no jump.
 
         phi: (..., n, K).
         """
@@ -95,7 +95,7 @@ class Family:
         Args:
             dq: (..., n) rad/s.
             phi: (..., n, K), in the order of `names`; optional parameters may be missing.
-            bristle: (..., n) bristle deflection in [-1, 1], such as of `presliding`; default: tanh(dq / 0.01).
+            bristle: (..., n) bristle deflection in [-1, 1], as `presliding` returns it; default: tanh(dq / 0.01).
         """
         columns = [phi[..., k] for k in range(phi.shape[-1])] + [np.zeros(())] * (len(self.names) - phi.shape[-1])
         return self.law(dq, columns, np.tanh(dq / WIDTH_DQ) if bristle is None else bristle)
@@ -105,9 +105,9 @@ class Family:
         return 0.5 * (self.torque(dq_max, phi) - self.torque(-dq_max, phi))
 
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
-        """Return parameters (..., n, K) with the friction at 1 rad/s of phi (..., n, K') of another family.
+        """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of another family.
 
-        A viscous part that both laws have stays apart.
+        If both laws have a viscous parameter, it keeps its value.
         """
         if other == self:
             return phi
@@ -142,7 +142,7 @@ def _sigmoid_native(p, v, h, memory):
     return p[0] * (s - s0) + p[3] * v, p[0] * p[1] * s * (1.0 - s) + p[3]
 
 
-# The starts are named functions, because another process may receive a family by pickle.
+# The `start`s are named functions, not lambdas, because a family may be pickled for another process.
 def _sigmoid_start(level: np.ndarray) -> list[np.ndarray]:
     return [2 * level, np.full_like(level, 20.0), np.zeros_like(level)]
 
@@ -291,7 +291,7 @@ def family(name: str) -> Family:
     """Return a built-in family by its name, or import one by its dotted path.
 
     Raises:
-        UserError: the family is unknown, or another family has one of its parameters with another unit or scale.
+        UserError: the family is unknown, or one of its parameters has another unit or scale in another family.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:
@@ -323,7 +323,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if `family` would import the name, which a file gives, from a module that is not in `trust`."""
+    """Raise UserError if `family` would import the name, read from a file, from a module that is not in `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(

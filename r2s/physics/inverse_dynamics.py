@@ -15,10 +15,10 @@ SLIDES = 0.01  # rad/s, width of the sign change of load-dependent friction, as 
 
 @dataclass(frozen=True)
 class InverseDynamics:
-    """Inverse dynamics of one arm behind its gravity compensation.
+    """Inverse dynamics of one arm that compensates gravity.
 
     Attributes:
-        robot: the arm; its nominal links are the model of the gravity compensation.
+        robot: the arm; its gravity compensation uses the nominal links.
         dynamics: estimated dynamics of the arm.
     """
 
@@ -33,7 +33,7 @@ class InverseDynamics:
     def rigid(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the torque (m, n) Nm of links and rotors at q, dq, ddq (m, n) rad, rad/s, rad/s^2.
 
-        M ddq + C dq + g minus g of the nominal links, which the arm compensates.
+        This is M ddq + C dq + g, minus g of the nominal links, which the arm compensates.
         """
         own, nominal = self._links
         out = np.empty_like(q)
@@ -48,7 +48,7 @@ class InverseDynamics:
         return out
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
-        """Return the command (m, n) Nm, without gravity; `sliding` (m, n) rad/s: speeds that set friction."""
+        """Return the command (m, n) Nm, without gravity; sliding: (m, n) rad/s, speeds for friction."""
         d = self.dynamics
         out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
         if d.drag.any():

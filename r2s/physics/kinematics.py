@@ -10,9 +10,9 @@ from r2s.physics.robot import Robot
 
 POSE = 12  # columns of a pose: position (3,), rotation matrix (3, 3) row by row
 DAMPING = 1e-4  # m^2, damped least squares: (10 mm)^2 bounds the steps near a singularity
-HOMEWARD = 0.02  # share of the distance to the home posture, moved per point in the null space
-ITERATIONS = 8  # Newton steps per point, maximum
-CLOSE = 1e-5  # m, position error at which they end
+HOMEWARD = 0.02  # share of the distance to the home posture that a null-space motion covers per point
+ITERATIONS = 8  # largest number of Newton steps per point
+CLOSE = 1e-5  # m, position error at which the steps end
 MAX_STEP = 0.3  # rad per joint and Newton step
 
 
@@ -34,7 +34,7 @@ class HandKinematics:
     def follow(self, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
         """Return postures (T, n) rad with the end effector at points (T, 3) m, and the largest position error, m.
 
-        The solver starts each posture from the one before, the first from `start` (n,). In the null space it moves
+        The solver starts each posture from the previous one, the first from `start` (n,). In the null space it moves
         towards home. It ignores position limits.
         """
         out = np.empty((len(points), len(start)))
@@ -112,7 +112,7 @@ def _follow(links, tip, home, start, points, out):
                     gram[k, c] = DAMPING if k == c else 0.0
                     for j in range(n):
                         gram[k, c] += jacobian[k, j] * jacobian[c, j]
-            for j in range(n):  # once per point: the later steps correct the end effector
+            for j in range(n):  # only in the first step: the later ones correct the end effector
                 null_step[j] = HOMEWARD * (home[j] - q[j]) if iteration == 0 else 0.0
             for k in range(3):
                 for j in range(n):

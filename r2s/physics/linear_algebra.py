@@ -1,7 +1,7 @@
 """Cholesky factorization and solution of small symmetric positive definite systems, for compiled code.
 
 For the 7 joints of an arm these loops are faster than a LAPACK call. A root is the lower triangle L of A = L L^T with
-1 / L[i, i] on the diagonal: `solve` then multiplies instead of divides (Golub and Van Loan, Matrix Computations, 4th
+1 / L[i, i] on the diagonal, so `solve` multiplies instead of divides (Golub and Van Loan, Matrix Computations, 4th
 ed. 2013, section 4.2). A packed matrix holds its lower triangle row by row, (n (n + 1) / 2,), as MuJoCo stores the
 mass matrix of a serial arm.
 """
@@ -29,9 +29,9 @@ def unpack(packed, scale, diagonal, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def factor(matrix, root, active=None):
-    """Write the root of the lower triangle of `matrix` (n, n), which may be `root` itself.
+    """Write the root of a matrix (n, n), given by its lower triangle; `root` may be `matrix` itself.
 
-    active: (n,); the root is that of the rows and columns where it is not 0. None: of all.
+    active: (n,); only rows and columns where it is not 0 take part. None: all.
     """
     for i in range(len(root)):
         if active is not None and active[i] == 0.0:
@@ -52,7 +52,7 @@ def factor(matrix, root, active=None):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def solve(root, x, active=None):
-    """Replace x (n,) by the solution of A y = x; by 0 where `active` (n,), that of `factor`, is 0."""
+    """Replace x (n,) by the solution y of A y = x; y is 0 where `active` (n,), see `factor`, is 0."""
     n = len(x)
     for i in range(n):
         s = 0.0

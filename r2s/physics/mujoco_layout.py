@@ -1,4 +1,4 @@
-"""Where mjModel and mjData hold what the compiled callback reads: byte offsets, found in live structs."""
+"""Byte offsets in mjModel and mjData of the fields that the compiled callback reads, found in live structs."""
 
 import ctypes
 from typing import Any
@@ -19,7 +19,7 @@ def struct_offsets(width: int, kept: int) -> dict[str, int]:
     Pointers are found by the address of their NumPy view, sizes by their index in mjModel's introspection.
 
     Args:
-        width: columns of `jnt_user` of the model to look at. kept: rows of its `userdata`, (kept, n).
+        width: columns of `jnt_user` in the probed model. kept: rows of its `userdata` (kept, n).
     """
     joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
     spec = mujoco.MjSpec.from_string(

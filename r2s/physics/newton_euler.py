@@ -14,14 +14,14 @@ from r2s.physics.description import chain
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 
-# Columns of `links`: position and rotation in the link before at angle zero, axis, mass, centre of mass, tensor about
+# Columns of `links`: position and rotation in the parent link at angle zero, axis, mass, centre of mass, tensor about
 # it in link axes.
 PLACE, FRAME, AXIS, MASS, COM, TENSOR, LINK = 0, 3, 12, 15, 16, 19, 28
 WORK = 22  # columns of the work array of `equations`
 
 
 def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return (n, LINK): the arm with masses (n,) kg, centres (n, 3) m and tensors about them (n, 3, 3) kg m^2."""
+    """Return rows (n, LINK) for masses (n,) kg, centres (n, 3) m and tensors about them (n, 3, 3) kg m^2."""
     own = replace(Dynamics.of(robot, np.zeros((robot.n, 3))), mass=mass, com=com, inertia=inertia)
     rows = [
         [*link.origin[:3, 3], *link.origin[:3, :3].flat, *link.axis, link.mass, *link.com, *link.inertia.flat]
@@ -114,10 +114,10 @@ def joint_frame(R, link, angle):
     """Advance forward kinematics by one joint.
 
     Args:
-        R: axes of the link before (9 numbers, row by row). link: row of `links_of`. angle: rad.
+        R: axes of the parent link (9 numbers, row by row). link: row of `links_of`. angle: rad.
 
     Returns:
-        offset from the link before, m, the joint's axis, and the link's axes, all in base axes.
+        offset from the parent link, m, the joint's axis, and the link's axes, all in base axes.
     """
     offset = rotate(R, link[PLACE], link[PLACE + 1], link[PLACE + 2])
     R = product(R, link, FRAME)

@@ -1,4 +1,4 @@
-"""Boxes around an arm that its links keep clear of."""
+"""Boxes around an arm that the links must not touch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 
 from r2s.errors import UserError, instead_of
 
-PREFIX = "obstacle "  # of the geoms' names in a model
+PREFIX = "obstacle "  # prefix of the geoms' names in a model
 KEYS = ("center", "size", "yaw")
 
 

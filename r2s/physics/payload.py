@@ -1,8 +1,8 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A payload changes mass, centre and tensor of the last link, which is exact in every engine. An external force could
-not represent it, because that force would depend on the resulting acceleration. The payload's frame is that of
-`robot.ee_site`; on a Panda this is the flange, the frame of libfranka's setLoad.
+A payload changes mass, centre of mass and inertia tensor of the last link, which is exact in every engine. An
+external force could not represent it, because the force would depend on the acceleration that it causes. The
+payload's frame is that of `robot.ee_site`; on a Panda this is the flange, the frame of libfranka's setLoad.
 """
 
 from collections.abc import Mapping
@@ -22,17 +22,17 @@ from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
 
 Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centres (..., n, 3) m, tensors (..., n, 3, 3)
-USUAL = 0.5  # of an arm's largest payload and distance: what is usually carried
+USUAL = 0.5  # share of its largest payload mass and distance that an arm usually carries
 WATER = 1000.0  # kg/m^3
 
 
 @dataclass(frozen=True)
 class Payload:
-    """A payload; mass, centre and inertia may have any leading batch shape.
+    """A payload; mass, centre of mass and inertia may have any leading batch shape.
 
     Attributes:
         mass: (...) kg. centre: (..., 3) m, in the end-effector frame.
-        inertia: (..., 3, 3) kg m^2 about its centre, axes of that frame.
+        inertia: (..., 3, 3) kg m^2 about the centre, axes of the end-effector frame.
         on_s, off_s: (...) s, times of attachment and removal on the clock of a motion.
     """
 
@@ -48,14 +48,14 @@ class Payload:
 
 
 def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload") -> Payload | None:
-    """Return the payload that a setting describes, a number of kg, a mapping or a file; None for 0 kg.
+    """Return the payload that a setting describes as a number of kg, a mapping or a file; None for 0 kg.
 
     A number is a point mass at the end effector. A mapping has `mass`, and optionally `centre` (3,) m, `inertia` (3
     principal moments, or xx, yy, zz, xy, xz, yz, in kg m^2 about the centre; default: a sphere of water), `on_s`,
     `off_s`. A file is the payload.yaml of an identification, or its run folder.
 
     Args:
-        value: the setting. name: of it, for errors. most: kg and m, as `Robot.payload_max`.
+        value: the setting. name: its name, for errors. most: kg and m, as `Robot.payload_max`.
 
     Raises:
         UserError: mass, centre, tensor or times out of range, or no such file; the message begins with `name`.
@@ -104,7 +104,7 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...], default: np.ndarray)
 
 
 def _of_file(name: str, path: Path) -> Any:
-    """Return the mapping of a payload.yaml, or of the one in a run folder."""
+    """Return the mapping in a payload.yaml, given by its path or its run folder."""
     file = run_file(path, "payload.yaml", name)
     try:
         return yaml.safe_load(file.read_text())["payload"]
@@ -114,9 +114,9 @@ def _of_file(name: str, path: Path) -> Any:
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
-    """Return the tensor (3, 3) kg m^2 of 3 moments or 6 elements; the default is a sphere of water's.
+    """Return the tensor (3, 3) kg m^2 from 3 moments or 6 elements; None: that of a sphere of water.
 
-    The largest moment allowed is that of the largest mass, twice as far away as a centre may be.
+    The largest moment allowed is that of the largest mass at twice the largest distance of a centre.
     """
     if value is None:
         return sphere_inertia(np.array(mass))
@@ -183,7 +183,7 @@ def with_payload(robot: Robot, payload: Payload | None, links: Links) -> Links:
 def dynamics_with_payload(
     robot: Robot, dynamics: Dynamics, payload: Payload | None, declared: Payload | None = None
 ) -> Dynamics:
-    """Return the dynamics of an arm with this payload attached, at any time.
+    """Return the dynamics of an arm with this payload attached; its times do not matter.
 
     declared: the payload declared to the arm's gravity compensation (libfranka's setLoad), right or wrong.
     """

@@ -1,29 +1,29 @@
-"""Limit of the force with which a tool's tip may press on a surface, and of the speed at which it may meet it.
+"""Push limit: bounds the force with which a tool's tip presses on a surface, and its closing speed at contact.
 
-Along the inward normal the tip has the speed v and the effective mass m = 1 / (J M^-1 J^T) (Khatib, IEEE J. Robotics
-and Automation 3(1), 1987), and
+A push is a force along the inward normal, and J is the tip's Jacobian along it. With the tip's speed v and effective
+mass m = 1 / (J M^-1 J^T) in this direction (Khatib, IEEE J. Robotics and Automation 3(1), 1987),
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
 with the push P of the command, the contact force F >= 0 and the push P_f of joint friction, at most `hidden` =
-m |J M^-1| friction. The limit keeps, every millisecond,
+m |J M^-1| friction. Every millisecond the limit enforces
 
 1. P + hidden <= force_max,
-2. m dv/dt <= m RATE (v_max - v) with the force that resists the push estimated: P <= R + m RATE (v_max - v). v_max is
-   `speed_near` at the surface and grows with the distance from it.
+2. m dv/dt <= m RATE (v_max - v), with an estimate R of the force that resists the push: P <= R + m RATE (v_max - v).
+   v_max is `speed_near` at the surface and grows with the distance from it.
 
 R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. A tip in the air
-has R = 0 and cannot accelerate beyond v_max; a tip that presses has R = P, so its force can rise. A tip faster than
-v_max, or that leaves the surface, has lost what resisted it: R = 0.
+has R = 0 and cannot accelerate beyond v_max; a tip that presses has R = P, so its force can rise. If a tip is faster
+than v_max or leaves the surface, nothing resists it any more, and R is reset to 0.
 
-So the force is at most force_max + speed_near sqrt(k m) on a smooth surface of stiffness k: when it rises through
-force_max the tip moves at speed_near or slower, and from there on P + P_f - F brakes it. The friction mu F of a rough
-surface pushes a sliding tip inwards with up to mu c F, c = m |T J M^-1 J^T n| with T across the normal n. Then (1 -
-mu c) F takes the place of F: see `PushLimit.bound`.
+So the force is at most force_max + speed_near sqrt(k m) on a frictionless surface of stiffness k: when the force
+exceeds force_max, the tip's speed is at most speed_near, and from then on P + P_f - F brakes it. The friction mu F
+can push a sliding tip inwards with up to mu c F, c = m |T J M^-1 J^T n|, where T projects across the normal n. Then
+(1 - mu c) F replaces F: see `PushLimit.bound`.
 
-Both rules are half-spaces of torques with the same normal J M^-1. The limit sends the nearest torque by Gauss'
-principle, so it subtracts J^T f. The acceleration bounds of the joints (safety_filter.py) hold as well: regula falsi
-finds the force f with which their law sends a torque within the limit.
+Both rules limit torques to half-spaces with the same normal J M^-1. The nearest torque within them, by Gauss'
+principle, is the target minus J^T f with a force f. The acceleration bounds of the joints (safety_filter.py) hold as
+well: regula falsi finds the f for which the torque within these bounds also satisfies the push limit.
 """
 
 from dataclasses import dataclass
@@ -40,8 +40,8 @@ from r2s.physics.safety_filter import APPROACH, RATE, JointDynamics, bounded, jo
 from r2s.physics.safety_filter import WORK as FILTER_WORK
 from r2s.physics.tip import Tip, nominal_plane
 
-# Columns of a limit, and what it keeps between cycles: RESISTED N, SPEED m/s, whether it has begun; and of a stop
-# (contact_stop.py): its phase, the force N as it began, the height m at which it had released the surface, its pull N
+# Columns of a limit: settings, its state (R in N, the last speed in m/s, whether it has begun), and a stop's state
+# (contact_stop.py): phase, force N at its beginning, height m at which the tip released the surface, outward pull N
 FORCE_MAX, SPEED_NEAR, SLOPE, MARGIN, POINT, NORMAL, TIP, RADIUS, RESISTED, SPEED, BEGUN = (
     *(0, 1, 2, 3, 4, 7, 10, 13, 14, 15, 16),
 )
@@ -49,23 +49,23 @@ STOP, PHASE, FELT, HEIGHT, PULL = range(BEGUN + 1, BEGUN + 6)
 COLUMNS = PULL + 1
 HOLD, RELEASE, RETREAT = 1, 2, 3  # values of STOP
 STOPS = {"hold": HOLD, "release": RELEASE, "retreat": RETREAT}
-LEAVE = 0.05  # m/s, of a tip that a stop moves outwards: the depth of 20 N on 2e3 N/m in half of LEAVES_S
-WORK = 3  # rows of `work` beside n
-ROUNDS = 16  # most trials of f
-CLOSE = 1e-2  # m/s^2, by which the found torque may push less than is allowed
-OVERSHOOT = 1.5  # a tip meets the surface at up to this times v_max: it brakes as fast as the latency allows
+LEAVE = 0.05  # m/s, outward speed of a tip in a stop: covers the depth of 20 N on 2e3 N/m in half of LEAVES_S
+WORK = 3  # rows of `work` in addition to n
+ROUNDS = 16  # largest number of trials of f
+CLOSE = 1e-2  # m/s^2, the found torque may push by up to this less than allowed
+OVERSHOOT = 1.5  # largest closing speed over v_max: the tip brakes only as fast as the latency allows
 STIFF = 1e5  # N/m, stiffest surface of conf/dr/contact.yaml
-NEAR_M = 0.3  # m, from the surface; farther away the limit does nothing
+NEAR_M = 0.3  # m, distance from the surface beyond which the limit does nothing
 
 
 @dataclass(frozen=True)
 class PushLimit:
-    """Limits of `push_bound` at a plane of roughly known place; see the module.
+    """Settings of the push limit at a plane whose place is roughly known; see the module.
 
     Attributes:
         force_max: N. speed_near: m/s. point, normal: (3,) of the plane in the base frame, m.
-        place: m and tilt: rad, by which the true plane may differ. stop: what a stop does with a force, of STOPS.
-
+        place, tilt: m and rad, by which the true plane may differ from it.
+        stop: what a stop does with a contact force, a key of STOPS.
     """
 
     force_max: float
@@ -77,7 +77,7 @@ class PushLimit:
     stop: str = "release"
 
     def columns(self, robot: Robot) -> np.ndarray:
-        """Return the limit (COLUMNS,) of the robot's tool, before the first cycle."""
+        """Return the columns (COLUMNS,) of the limit for the robot's tool, before the first cycle."""
         Tip(robot)  # raises without a tool
         site, axes = ee_pose(robot)
         out = np.zeros(COLUMNS)
@@ -115,17 +115,17 @@ def push_limit(
     asked: float = 0.0,
     stop: str | None = None,
 ) -> PushLimit | None:
-    """Return the limit of `safety.force_max` and `safety.speed_near`; None if both are null.
+    """Return the push limit of the settings `safety.force_max` and `safety.speed_near`; None if both are null.
 
     Args:
         robot: with a tool. friction: (n,) Nm, level of each joint's friction.
-        force_max: N. speed_near: m/s; null: what lets a rigid surface of 1e5 N/m add force_max.
+        force_max: N. speed_near: m/s; null: the speed at which a surface of 1e5 N/m adds force_max.
         plane: point and normal; None: a table below the tip at home. asked: N, largest force of the task.
-        stop: of STOPS; None: release (contact_stop.py).
+        stop: a key of STOPS; None: release (contact_stop.py).
 
     Raises:
-        UserError: a value out of range, the robot has no tool, or the force is below what joint friction may hide
-            and the task asks.
+        UserError: a value out of range, the robot has no tool, or force_max is below the task's force plus
+            twice the force that joint friction may hide.
     """
     if stop is not None and stop not in STOPS:
         raise UserError(f"task.stop: {stop!r}; {instead_of(stop, STOPS)}")
@@ -149,9 +149,9 @@ def push_limit(
 
 @njit(cache=True, error_model="numpy")
 def tip_motion(limit, kinematics, dq, row):
-    """Write how joints move the tip inwards, (n,) m/rad; return its height, speeds m/s, and dJ/dt dq m/s^2.
+    """Write the Jacobian J (n,) m/rad into `row`; return the tip's height m, two speeds m/s, and dJ/dt dq m/s^2.
 
-    Height: m, above the highest place of the true plane. Speeds: inwards, and along the plane.
+    Height: above the highest possible place of the true plane. Speeds: inwards, and along the plane.
     """
     position, R, anchor, axis = kinematics
     a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
@@ -171,7 +171,7 @@ def tip_motion(limit, kinematics, dq, row):
         cx, cy, cz = uy * rz - uz * ry, uz * rx - ux * rz, ux * ry - uy * rx
         row[j] = -(nx * cx + ny * cy + nz * cz)
         vx, vy, vz = vx + s * cx, vy + s * cy, vz + s * cz
-        # the angular acceleration that this joint's turning axis adds, and the centripetal part of its link
+        # angular acceleration due to the rotation of this joint's axis, and the centripetal part of its link
         tx, ty, tz = s * (wy * uz - wz * uy), s * (wz * ux - wx * uz), s * (wx * uy - wy * ux)
         ex, ey, ez = ex + tx, ey + ty, ez + tz
         wx, wy, wz = wx + s * ux, wy + s * uy, wz + s * uz
@@ -190,7 +190,7 @@ def tip_motion(limit, kinematics, dq, row):
 
 @njit(cache=True, error_model="numpy")
 def push_bound(limit, arm, kinematics, last, friction, work):
-    """Return how large an inward acceleration, m/s^2, a torque may cause, infinite far from the surface.
+    """Return the bound, m/s^2, on the inward acceleration J M^-1 tau of a torque; infinite far from the surface.
 
     Args:
         limit: (COLUMNS,) of `PushLimit.columns`, updated.
@@ -231,7 +231,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit the torques `out` (n,) Nm: joint accelerations, with the contact as a load, and pushes.
+    """Limit the torques `out` (n,) Nm by joint acceleration, with the contact force as a load, and by push.
 
     Args as for `push_bound`, and share and limits as for `filter_torque`. Returns whether `out` changed.
     """
@@ -250,8 +250,8 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     mobility = 0.0
     for j in range(n):
         mobility += row[j] * lever[j]
-    # N; the excess at low and high. Where no joint is at its bound the first trial hits the middle of CLOSE: aimed at
-    # its border, rounding would decide, and another writing of the law would send another torque
+    # low, high: N, bracket of f; before, after: excess there. If no joint is at its bound, the first trial hits the
+    # middle of CLOSE: at its border, round-off would decide, and equivalent code would send another torque
     low, high, after, force = 0.0, np.inf, 0.0, (before + 0.5 * CLOSE) / mobility
     for _ in range(ROUNDS):
         for j in range(n):
@@ -274,7 +274,7 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
 
 @njit(cache=True, error_model="numpy")
 def _excess(lever, bound, tau):
-    """Return by how much the torques (n,) Nm push beyond `push_bound`, m/s^2."""
+    """Return by how much, m/s^2, the inward acceleration of torques tau (n,) Nm exceeds `bound`."""
     out = -bound
     for j in range(len(tau)):
         out += lever[j] * tau[j]

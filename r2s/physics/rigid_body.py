@@ -47,10 +47,10 @@ def tensor_elements(tensor: np.ndarray) -> np.ndarray:
 def regressor(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return (T, n, n, 10): derivative of each joint's torque by each standard parameter of each link.
+    """Return (T, n, n, 10): derivative of each joint's torque by each link's standard parameters.
 
     Args:
-        robot: its kinematics.
+        robot: the arm's kinematics.
         q, dq, ddq: (T, n) rad, rad/s, rad/s^2.
         gravity: (3,) m/s^2, or None for an arm with gravity compensation.
     """
@@ -85,7 +85,7 @@ def regressor(
         rotated = np.einsum("cij,tj->tci", basis, own_alpha)
         rotated += np.cross(own_omega[:, None], np.einsum("cij,tj->tci", basis, own_omega))
         moment[:, 4:] = np.einsum("tij,tcj->tci", R, rotated)
-        for j in range(k + 1):  # joints before a link carry it
+        for j in range(k + 1):  # every joint before a link carries it
             about = moment + np.cross((place[:, k] - anchor[:, j])[:, None], force)
             out[:, j, k] = np.einsum("ti,tci->tc", axis[:, j], about)
     return out
@@ -112,7 +112,7 @@ def rigid_body(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (rest (T, n) Nm, regressor (T, n, n, 10)): torque = rest + regressor @ standard parameters.
 
-    `rest` is the torque of the file's armature and welded bodies. For the arguments see `regressor`.
+    `rest` is the torque due to the file's armature and welded bodies. For the arguments see `regressor`.
     """
     total = nominal_torque(robot, q, dq, ddq, False if gravity is None else gravity)
     y = regressor(robot, q, dq, ddq, gravity)
@@ -192,7 +192,7 @@ class Kinematics:
 
 
 class InverseInertia:
-    """Inverse mass matrix of m nominal arms; 1 over its diagonal is a joint's inertia with the other joints free."""
+    """Inverse mass matrix of m nominal arms; 1 / diagonal: a joint's inertia while the other joints are free."""
 
     def __init__(self, robot: Robot, m: int = 1):
         model = robot.model(gravity=False)

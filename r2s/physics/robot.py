@@ -1,9 +1,9 @@
-"""The arm: kinematics, inertia and gravity of an MJCF or URDF file, limits of the file or the config.
+"""The arm: kinematics, inertia and gravity from an MJCF or URDF file, limits from the file or the config.
 
 r2s commands joint torques, so it uses a file's joints and links, and drops actuators, sensors, keyframes, free
 objects, gravity compensation and contacts. The file's damping and frictionloss are nominal values of the friction law
-(dynamics.py), its armature of the rotors; the rigid model has none of them. Any serial arm of hinge joints works:
-`robot.mjcf=FILE`.
+(dynamics.py), so `Robot.model` sets both to 0 except nonlinear damping; its armature is the nominal rotor inertia.
+Any serial arm of hinge joints works: `robot.mjcf=FILE`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,14 +24,14 @@ from r2s.physics.urdf import NO_RANGE, is_urdf
 
 PANDA = "r2s:models/panda.xml"
 # Share of an arm's torque rate limit that commands use. libfranka's own limiter stays 1e-3 Nm/s below the limit; an
-# FR3 reports its last torque as float32, which moves a step by up to 8e-6 Nm.
+# FR3 reports its last torque as float32, which changes a torque step by up to 8e-6 Nm.
 RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of this size
-# payload of an arm without a published one: kg g reach over the largest torque limit, and distance over reach, as of
-# a Panda (3 kg and 0.15 m, 87 Nm)
+# Payload limits of an arm that publishes none, with a Panda's ratios (3 kg, 0.15 m, 87 Nm): payload weight times
+# reach over the largest torque limit, and distance over reach.
 PAYLOAD_SHARE, PAYLOAD_FAR = 0.33, 0.15
-OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot for tasks, not for `load_robot`
+OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot that tasks use, not `load_robot`
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Robot:
 
     Attributes:
         name: the model's name.
-        mjcf: its file, MJCF or URDF.
-        q_min, q_max: (n,) rad; -inf and inf for a continuous joint.
+        mjcf: the model's file, MJCF or URDF.
+        q_min, q_max: (n,) rad, position limits; -inf and inf for a continuous joint.
         dq_max: (n,) rad/s. ddq_max: (n,) rad/s^2.
         tau_max: (n,) Nm. dtau_max: (n,) Nm/s.
         q_home: (n,) rad, start of episodes and excitations.
@@ -50,12 +50,12 @@ class Robot:
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
-        damping: (n,) Nm s/rad and frictionloss: (n,) Nm of the file; 0: it gives none.
+        damping: (n,) Nm s/rad and frictionloss: (n,) Nm from the file; 0 where the file has none.
         velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit, sqrt(2
             deceleration distance + offset^2) - offset at a distance from the position limit; None: no such limit.
-        tool: the tip that touches; None: a bare end effector.
-        lock: {joint: rad or m} of the file that are welded.
-        payload_max: (2,) kg and m, the heaviest payload, and the farthest place of its centre from the end effector.
+        tool: the spherical tip that touches surfaces; None: no tool.
+        lock: {joint: rad or m}, welded joints and their positions.
+        payload_max: (2,) kg and m, largest payload, and largest distance of its centre from the end effector.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Robot:
 
     @property
     def q_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """(low, high) (n,) rad: the position limits, or one turn about home if they are wider."""
+        """(low, high), (n,) rad: the position limits, but at most pi from home for a range above 2 pi."""
         more = self.q_max - self.q_min > 2 * np.pi
         low = np.where(more, np.maximum(self.q_min, self.q_home - np.pi), self.q_min)
         return low, np.where(more, np.minimum(self.q_max, self.q_home + np.pi), self.q_max)
@@ -105,9 +105,9 @@ class Robot:
         Args:
             gravity: False is libfranka's convention (the arm compensates gravity); True is for link-side torque.
             user: columns of `jnt_user`, the parameters of the callback (r2s/physics/mujoco_callback.py).
-            memory: doubles of the callback's state.
+            memory: number of doubles in the callback's state.
             dt: time step, s.
-            obstacles: boxes beside the arm, for distances.
+            obstacles: boxes around the arm, for distance computations.
         """
         spec, _ = read_spec(self.mjcf, self.lock)
         spec.compile()  # assigns the joints' ids; the changes below invalidate them
@@ -122,7 +122,7 @@ class Robot:
             joint.limited = int(np.isfinite(limits).all())
             joint.range = unit * limits if joint.limited else np.zeros(2)
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-            joint.parent.simple = False  # MuJoCo simplifies such bodies, but their inertia may change
+            joint.parent.simple = False  # MuJoCo simplifies `simple` bodies, but this inertia may change
         for number, box in enumerate(obstacles, 1):
             box.add_to(spec, number)
         spec.nuser_jnt = user
@@ -134,7 +134,7 @@ class Robot:
 
 
 def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
-    """Return (n,) floats from a value per joint or one for all; errors name `joints`, as "the 7 joints of panda".
+    """Return (n,) floats from a value per joint or one for all; joints: "the 7 joints of panda", for errors.
 
     Raises:
         UserError: a wrong number of values, or values that are no numbers.
@@ -171,19 +171,19 @@ def load_robot(
 ) -> Robot:
     """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
 
-    The file gives position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
-    its motor) and, by a keyframe named home, q_home; a URDF also gives velocity limits. Neither format has limits of
-    acceleration or torque rate. `gravcomp`, disabled gravity and objects on free joints do not belong to the arm.
+    The file has position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
+    its motor) and q_home, as a keyframe named home; a URDF also has velocity limits. Neither format has limits of
+    acceleration or torque rate. `gravcomp`, disabled gravity and objects on free joints are ignored.
 
     Args:
-        mjcf: the file; `r2s:models/panda.xml` is one of the package; None: the Panda.
+        mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; None: the Panda.
         ee: site, body or link of the end effector; None: the only site, or the last link of a URDF.
         q_home, q_min, q_max: rad. dq_max: rad/s. ddq_max: rad/s^2. tau_max: Nm. dtau_max: Nm/s.
         gravity: (3,) m/s^2 in the base frame; None: the file's; for a URDF, that of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
-        lock: {joint: rad or m} of the file that are welded there, such as a gripper's; None: none.
-        payload_max, payload_far: kg, m, of `Robot.payload_max`; None: from the torque limits and the reach.
+        lock: {joint: rad or m}, joints to weld at these positions, such as a gripper's; None: none.
+        payload_max, payload_far: kg, m, values of `Robot.payload_max`; None: from the torque limits and the reach.
 
     Raises:
         UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
@@ -224,7 +224,7 @@ def load_robot(
 
 
 def _read(path: Path, lock: Mapping[str, float] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel, np.ndarray]:
-    """Return the file's spec, its checked model, and velocity limits, infinite where it has none."""
+    """Return the file's spec, its checked model, and its velocity limits, nan where it has none."""
     if not path.is_file():
         raise UserError(f"robot.mjcf: no such file: {path}{nearest_file(path, '*.*')}")
     spec, fastest = read_spec(path, lock)
@@ -246,7 +246,7 @@ def _limits(
     q_home: list[float] | None,
     tau_max: list[float] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return q_min, q_max, q_home (n,) rad and tau_max (n,) Nm, checked; `each` takes None for the file's value."""
+    """Return q_min, q_max, q_home (n,) rad and tau_max (n,) Nm, checked; `each` replaces None by the file's value."""
     limited = model.jnt_limited.astype(bool)
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
     high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
@@ -262,7 +262,7 @@ def _limits(
 def _payload_max(
     model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
 ) -> tuple[float, float]:
-    """Return `Robot.payload_max`: the given value, or one in proportion to the reach from the second joint."""
+    """Return `Robot.payload_max`: given values, or estimates from torque limits and reach from the second joint."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     sites = [model.site(i).name for i in range(model.nsite)]
@@ -277,7 +277,7 @@ def _payload_max(
 
 
 def _tensors(model: mujoco.MjModel) -> np.ndarray:
-    """Return the tensors (n, 3, 3) kg m^2 of the moving links about their centres of mass, link axes."""
+    """Return the inertia tensors (n, 3, 3) kg m^2 of the moving links about their centres of mass, link axes."""
     rotation = np.zeros((model.njnt, 3, 3))
     for i, body in enumerate(model.jnt_bodyid):
         mujoco.mju_quat2Mat(rotation[i].reshape(9), model.body_iquat[body])

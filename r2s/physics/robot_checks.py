@@ -1,4 +1,4 @@
-"""Checks of an arm's file: a serial chain, nothing but its links between the joints, limits, plausible masses."""
+"""Checks of an arm's file: a serial chain without couplings, complete limits, plausible masses."""
 
 from pathlib import Path
 
@@ -7,18 +7,18 @@ import numpy as np
 
 from r2s.errors import UserError, choices
 
-LIGHTEST = 1 / 500  # of the arm's moving mass: real wrists weigh 1/170 (UR16e) to 1/20 of it, placeholders 1/10,000
-HEAVIEST = 2.0  # times all other links together: the upper arm of a real one weighs up to 0.8 times the rest
-DEGREES_FROM = 30.0  # rad: limits between this and 360 are degrees
-VIRTUAL = 0.01  # m: a link between joints so close is part of a universal joint and needs no mass
-WEIGHT = 2.0  # times tau_max: the torque that an arm may need to hold its own weight in the worst posture
-POSTURES = 200  # at which its weight is compared
-WIDEST = 2.0  # times the length of the arm: no link's mass lies so far from its centre
-DENSEST = 2e4  # kg/m^3, tungsten: no body of its mass has smaller moments than a ball of it
+LIGHTEST = 1 / 500  # least link mass / moving mass: real wrists have 1/170 (UR16e) to 1/20, placeholders 1/10,000
+HEAVIEST = 2.0  # largest link mass / mass of all other links: up to 0.8 for the upper arm of a real arm
+DEGREES_FROM = 30.0  # limits between 30 rad and 360 rad are taken for degrees
+VIRTUAL = 0.01  # m: a link with joints closer than this is part of a universal joint and needs no mass
+WEIGHT = 2.0  # in tau_max: torque that an arm may need to hold its own weight in the worst posture
+POSTURES = 200  # number of postures in which this torque is compared
+WIDEST = 2.0  # in arm lengths: no link's mass lies farther from its centre
+DENSEST = 2e4  # kg/m^3, tungsten: no link has smaller moments than a tungsten ball of its mass
 
 
 def check_arm(model: mujoco.MjModel, path: Path) -> None:
-    """Raise UserError unless the joints are hinges of one chain with nothing else between them."""
+    """Raise UserError unless the joints are hinges of one serial chain, one per body, without couplings."""
     name = f"robot.mjcf: {path.name}"
     if model.njnt == 0:
         raise UserError(f"{name} has no joints")
@@ -56,7 +56,7 @@ def _check_couplings(model: mujoco.MjModel, name: str) -> None:
         if kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
             bodies = [model.site_bodyid[k] if model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE else k for k in ends]
             welded = len({int(model.body_weldid[k]) for k in bodies}) == 1
-            if welded or any(model.body_mocapid[k] >= 0 for k in bodies):  # a mocap body drags, a user's handle
+            if welded or any(model.body_mocapid[k] >= 0 for k in bodies):  # a mocap body is a user's handle
                 continue
             what = " and ".join(f"'{model.body(k).name}'" for k in bodies)
         elif kind == mujoco.mjtEq.mjEQ_JOINT:
@@ -78,7 +78,7 @@ def _check_couplings(model: mujoco.MjModel, name: str) -> None:
 
 
 def gravity_of(model: mujoco.MjModel, path: Path) -> np.ndarray:
-    """Return the file's gravity (3,) m/s^2, also if a flag of the simulation disables it.
+    """Return the file's gravity (3,) m/s^2, even if a flag of the simulation disables it.
 
     Raises:
         UserError: it is zero.
@@ -104,7 +104,7 @@ def check_limits(
 
     Args:
         model, path: of the file. low, high, home: (n,) rad. torque: (n,) Nm.
-        unset: joints with limits of 0 to 0.
+        unset: joints whose limits in the file are 0 to 0.
     """
     if unset:
         raise UserError(
@@ -141,7 +141,7 @@ def check_limits(
 def check_masses(
     model: mujoco.MjModel, path: Path, gravity: np.ndarray, home: np.ndarray, torque: np.ndarray
 ) -> None:
-    """Raise UserError for a link whose mass or moments no arm has; gravity: (3,) m/s^2, torque: (n,) Nm limits."""
+    """Raise UserError for implausible masses or moments of links; gravity: (3,) m/s^2, torque: (n,) Nm limits."""
     each = np.bincount(model.body_weldid, model.body_mass, model.nbody)[model.jnt_bodyid]
     names = [model.body(k).name or f"link {i + 1}" for i, k in enumerate(model.jnt_bodyid)]
     data = mujoco.MjData(model)
@@ -180,7 +180,7 @@ def check_masses(
 
 
 def _weight(model: mujoco.MjModel, gravity: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """Return the largest gravity torque (n,) Nm in POSTURES within half a turn of home."""
+    """Return the largest gravity torque (n,) Nm in POSTURES random postures within pi of home."""
     data, out, most = mujoco.MjData(model), np.empty(model.nv), np.zeros(model.njnt)
     before = model.opt.gravity.copy(), model.opt.disableflags
     model.opt.gravity[:], model.opt.disableflags = gravity, 0

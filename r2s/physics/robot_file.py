@@ -1,7 +1,7 @@
-"""The arm in an MJCF or URDF file: what belongs to a simulation is left out, locked joints are welded.
+"""Reader of the arm in an MJCF or URDF file: it drops what only a simulation needs, and welds locked joints.
 
-A file of a scene also holds objects on free joints, a file with a gripper its fingers: the former are left out, the
-latter are welded where `robot.lock` puts them and become part of the link that carries them.
+Objects on free joints, as in the file of a scene, are dropped. A gripper's fingers are welded at the positions in
+`robot.lock` and become part of the link that carries them.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
         return read_urdf(path, lock)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        for joint in ET.parse(path).iter("joint"):  # MuJoCo takes a range of 0 to 0 for none
+        for joint in ET.parse(path).iter("joint"):  # MuJoCo reads 0 to 0 as no range
             if joint.get("range") and not any(float(x) for x in joint.get("range", "").split()) and joint.get("name"):
                 spec.joint(joint.get("name")).info = NO_RANGE
         if loose := [body for body in spec.worldbody.bodies if _is_loose(body)]:
@@ -48,9 +48,9 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
 
 
 def strip(spec: mujoco.MjSpec) -> None:
-    """Remove what describes a simulation and not the arm: motors, sensors, keyframes, switches of physics.
+    """Remove what describes a simulation and not the arm: motors, sensors, keyframes, physics switches.
 
-    The damping of a motor stays, at its joint; for its rotor see `rotors`. The file must have passed `check_arm`.
+    A motor's damping is added to its joint; for its rotor see `rotors`. The file must have passed `check_arm`.
     """
     for actuator in spec.actuators:
         joint = spec.joint(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
@@ -59,7 +59,7 @@ def strip(spec: mujoco.MjSpec) -> None:
     for item in [*spec.actuators, *spec.sensors, *spec.keys, *spec.equalities, *spec.tendons]:
         spec.delete(item)
     for body in spec.bodies:
-        body.gravcomp = 0.0  # a switch of the simulation: what is measured at the links contains gravity
+        body.gravcomp = 0.0  # gravcomp is a switch of the simulation: torque measured at the links contains gravity
     spec.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.option.density = spec.option.viscosity = 0.0
 
@@ -81,8 +81,8 @@ def _is_loose(body: mujoco.MjsBody) -> bool:
 
 
 def _remove(spec: mujoco.MjSpec, loose: list[mujoco.MjsBody]) -> None:
-    """Delete bodies with everything that names them."""
-    spec.compile()  # keyframes then lose the bodies' part of qpos, too
+    """Delete bodies with every element that refers to them."""
+    spec.compile()  # so that keyframes lose the bodies' part of qpos, too
     bodies = [below for body in loose for below in (body, *body.find_all("body"))]
     gone = {x.name for body in bodies for x in (body, *body.joints, *body.sites, *body.geoms) if x.name}
     _forget(spec, gone)
@@ -143,7 +143,7 @@ def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
 
 
 def _lump(spec: mujoco.MjSpec, welded: set[str | int]) -> None:
-    """Add the inertia of welded bodies, with all that they carry, to the moving links below them."""
+    """Add the inertia of welded bodies, and of all that they carry, to the moving links that carry them."""
     model = spec.compile()
     bodies, of = Bodies(model), {body.id: body for body in spec.bodies}
     carriers = {int(model.body_weldid[body.id]) for body in of.values() if (body.name or body.id) in welded}

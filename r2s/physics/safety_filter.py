@@ -1,16 +1,16 @@
-"""Safety filter: the last stage before an arm limits accelerations near speed and position limits.
+"""Safety filter: the last stage before the arm. It limits accelerations near the speed and position limits.
 
-The same compiled function runs in training and on every arm. Its input is a target torque behind the low-pass filter
-(r2s/physics/actuation.py); M is the arm's mass matrix. Three rules:
+The same compiled function runs in training and on every arm. Its input is the effort, the target torque after the
+low-pass (r2s/physics/actuation.py); M is the arm's mass matrix. It applies three rules:
 
 1. The policy's torque fades out as a joint approaches its velocity limit or a position limit.
 2. The acceleration a = M^-1 (tau - Coriolis torque) of each joint satisfies -RATE (v + dq) <= a <= RATE (v - dq),
-   where v is the speed allowed at q. Of all torques with this property the filter sends the nearest to the target, by
-   Gauss' principle of least constraint: the difference is the torque of stops at the joints. Friction widens the
-   bounds and does nothing else, so an overestimated friction never accelerates a joint.
+   where v is the speed allowed at q. Of all torques that satisfy this, the filter sends the one nearest to the effort
+   by Gauss' principle of least constraint: it adds the torques that stops at the joints would exert. Friction only
+   widens the bounds, so an overestimated friction never accelerates a joint.
 3. The torque is clipped to its range, and its rate is limited by one common factor for all joints: the command moves
-   along the straight line from the last command. The torques that satisfy rule 2 are a convex set, so rule 2 holds on
-   that line. A rate limit per joint would violate it if two joint axes are almost parallel.
+   on the straight line from the last command to the new torque. The torques that satisfy rule 2 are a convex set, so
+   rule 2 holds on that line. A rate limit per joint would violate rule 2 if two joint axes are almost parallel.
 
 Rule 2 is a control barrier function per joint (Ames et al., European Control Conference 2019). It is continuous in
 state and target, so it causes no chattering, and RATE tolerates the latency of an arm.
@@ -32,15 +32,15 @@ LATENCY_S = 0.012
 # 1/s. A first-order loop with delay d does not overshoot for rate * d <= 1/e: at equality s + rate exp(-s d) = 0 has
 # a double real root.
 RATE = round(1 / (math.e * LATENCY_S))
-APPROACH = 0.25 * RATE  # 1/s, approach to a position limit: critical damping of the second-order loop
+APPROACH = 0.25 * RATE  # 1/s, allowed speed per distance from a position limit: critical damping of the loop
 ALLOWED = 0.66  # share of dq_max that the filter allows; unmodelled friction adds to it (docs/explanation/safety.md)
 FADED = 0.82  # share of dq_max at which the policy's torque has faded out; it fades from ALLOWED on
 # Distance from a position limit at which the allowed speed towards it is 0: rad, but at most a tenth of the range.
 # From there on the policy's torque fades out over the share Q_FADE_SHARE of that distance.
 Q_MARGIN, Q_FADE_SHARE = 0.1, 0.6
 ENVELOPE_SHARE = 0.55  # share of the position-dependent velocity limit of an FR3 that the filter uses
-# s, duration of a braking ramp of the allowed speed. With 0.1 s the torque of the base reached 60 Nm, fell at 1 Nm/ms
-# too late, and threw a stretched elbow forward.
+# s, time in which the allowed speed ramps down while braking. With 0.1 s the torque of the base joint reached 60 Nm,
+# fell too late, at its rate limit of 1 Nm/ms, and threw a stretched elbow forward.
 BRAKE_S = 0.15
 TOLERANCE = 1e-9  # rad/s^2, tolerance of the acceleration bounds
 PIVOTS = 5  # block pivoting rounds before single pivots, which always terminate (Murty 1974)
@@ -52,7 +52,7 @@ DELAY_PHASE = 1.25  # rad, phase lag that the delay may cause in a loop; pi / 2 
 # Columns of the limits (n, COLUMNS), one row per joint.
 Q_LOW, Q_HIGH, Q_FADE, DQ_ALLOWED, DECELERATION, OFFSET, DQ_MAX, ADDED, TAU_MAX, STEP = range(10)
 COLUMNS = STEP + 1
-WORK = 10  # rows of `work` beside 2 n; the first of _INVERTED is whether `work` contains M^-1
+WORK = 10  # rows of `work` in addition to 2 n; [_INVERTED, 0]: whether `work` contains M^-1
 _DDQ, _LOW, _HIGH, _WIDE_LOW, _WIDE_HIGH, _STOP, _SIDE, _NEXT, _SLACK, _INVERTED = range(WORK)
 
 
@@ -68,8 +68,8 @@ class JointDynamics(NamedTuple):
 def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return the limits (n, COLUMNS) of `filter_torque`.
 
-    Light joints get added inertia (column ADDED), so that a full action of this joint or of a coupled one just passes
-    from rest. The added inertia makes the joint's loop faster than RATE, so DELAY_PHASE bounds it.
+    Light joints get added inertia (column ADDED), just enough that a full action of this joint or of a coupled one
+    passes the filter at rest. Added inertia makes the joint's loop faster than RATE, so DELAY_PHASE bounds it.
 
     Args:
         robot: position, velocity, torque and rate limits, and the mass matrix at home.
@@ -84,17 +84,17 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     mobility = InverseInertia(robot)(robot.q_home[None])[0]
     inertia = 1 / np.diag(mobility)
     most = (DELAY_PHASE / (RATE * LATENCY_S) - 1) * inertia
-    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm at the joint with the effect of any full action
+    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm at the joint that match the strongest action
     out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.step_max
     return out
 
 
 class SafetyFilter:
-    """The safety filter of one arm with the mass matrix of its model.
+    """The safety filter of one arm, with the mass matrix of a MuJoCo model.
 
     Attributes:
-        changed: number of cycles in which the filter changed the target.
+        changed: number of cycles in which rule 1 or 2 changed the effort.
 
     Args:
         model: one arm without gravity. robot, torque: see `filter_limits`. friction: (n,) Nm, see `filter_torque`.
@@ -123,8 +123,8 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
 
     Args:
         arm: `JointDynamics`, finite.
-        effort: (n,) Nm, target. last: (n,) Nm, the command that the arm applied last.
-        share: of the allowed speeds, 1 except while braking.
+        effort: (n,) Nm, input. last: (n,) Nm, the command that the arm applied last.
+        share: factor on the allowed speeds, 1 except while braking.
         friction: (n,) Nm, estimated friction, at least 0.
         limits: (n, COLUMNS) of `filter_limits`. work: (2 n + WORK, n), any content.
     """
@@ -136,7 +136,7 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def fade(q, dq, effort, limits, out):
-    """Write the effort (n,) Nm by rule 1 into `out`; return whether it is less."""
+    """Write the effort (n,) Nm, faded by rule 1, into `out`; return whether rule 1 reduced it."""
     kept = _torque_share(q, dq, limits)
     for j in range(len(q)):
         out[j] = kept * effort[j]
@@ -145,14 +145,14 @@ def fade(q, dq, effort, limits, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def limit_acceleration(arm, share, friction, limits, work, out):
-    """Change the torques `out` (n,) Nm by rule 2; return whether they were beyond it. See `filter_torque`."""
+    """Apply rule 2 to the torques `out` (n,) Nm; return whether they violated it. Args: see `filter_torque`."""
     joint_bounds(arm, share, limits, work)
     return bounded(arm, friction, limits, work, work[: len(out)], out)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def joint_bounds(arm, share, limits, work):
-    """Write the root of the mass matrix and the bounds of rule 2 into `work`, for all torques of a cycle."""
+    """Write the mass matrix's Cholesky root and the bounds of rule 2 into `work`, for all torques of a cycle."""
     q, dq, n = arm.q, arm.dq, len(arm.q)
     low, high, root = work[2 * n + _LOW], work[2 * n + _HIGH], work[:n]
     unpack(arm.mass, 1.0, limits[:, ADDED], root)
@@ -166,9 +166,9 @@ def joint_bounds(arm, share, limits, work):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def bounded(arm, friction, limits, work, desk, out):
-    """Change the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether they were beyond them.
+    """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether they exceeded them.
 
-    desk: (n, n), overwritten; with `work[:n]` the bounds serve for one call.
+    desk: (n, n), overwritten; if it is `work[:n]`, the bounds can be used only once.
     """
     n, dq = len(out), arm.dq
     ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]
@@ -192,7 +192,7 @@ def bounded(arm, friction, limits, work, desk, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def limit_rate(last, limits, out):
-    """Change the torques `out` (n,) Nm by rule 3, after the command `last` (n,) Nm."""
+    """Apply rule 3 to the torques `out` (n,) Nm; last: (n,) Nm, the previous command."""
     n, scale = len(out), 1.0
     for j in range(n):
         out[j] = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX]) - last[j]
@@ -223,7 +223,7 @@ def _speed_limit(distance, share, limits):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _widen(dq, out, friction, limits, work):
-    """Write the bounds, wider by the acceleration that friction of all joints can take, and M^-1 into `work`."""
+    """Write M^-1 and the bounds, widened by the acceleration that joint friction can cancel, into `work`."""
     n = len(out)
     root, mobility, slack = work[:n], work[n : 2 * n], work[2 * n + _SLACK]
     for j in range(n):
@@ -246,7 +246,7 @@ def _widen(dq, out, friction, limits, work):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _stop_torque(ddq, low, high, work, root):
-    """Write the torque (n,) Nm of stops at the joints into row _STOP of `work`, which contains M^-1.
+    """Write the torque (n,) Nm that stops at the joints exert into row _STOP of `work`, which contains M^-1.
 
     It solves the linear complementarity problem low <= ddq + M^-1 stop <= high, in which a stop pushes inwards and
     only at a bound, by block principal pivoting (Judice and Pires, Computers & Operations Research 21(5), 1994).

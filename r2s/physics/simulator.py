@@ -1,8 +1,8 @@
-"""Many copies of the arm at once: `mujoco.batch.Batch` with friction, control law and safety filter in each step.
+"""Simulator of many arms at once: `mujoco.batch.Batch` with friction, control law and safety filter in each step.
 
 The convention is libfranka's: a commanded torque excludes gravity, because the arm adds its own compensation. So the
-simulator has no gravity. The error of that compensation, which uses the nominal masses and centres, acts as a torque
-of its own (r2s/physics/friction.py).
+simulator has no gravity. The arm's compensation uses the nominal masses and centres of mass; its error acts as an
+additional torque (r2s/physics/mujoco_callback.py).
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ class Simulator:
         robot, dynamics: the arm; dynamics of one arm or of `nsim`. nsim: arms. nthread: threads.
             With `robot.tool`, each arm may have a surface (`Dynamics.surface`).
         dt: s, of a physics step.
-        control: law that turns commands into torques; None: `rollout` gives torques.
+        control: law that maps commands to torques; None: `rollout` takes torques.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Simulator:
         self._parameters = self._memory[:, self._kept + sizes[0] + sizes[1] : self._push_at]
         self._push, self._push_limit = self._memory[:, self._push_at : self._contact_at], np.zeros(pushing)
         self._contact = self._memory[:, self._contact_at :]
-        self._surfaces = np.zeros((nsim, self._touching))  # what `reset` puts into the memory
+        self._surfaces = np.zeros((nsim, self._touching))  # contacts that `reset` copies into the memory
         self._xanchor, self._xaxis = self.batch.bind("xanchor"), self.batch.bind("xaxis")
         self._xpos, self._xmat = self.batch.bind("xpos"), self.batch.bind("xmat")
         self._site_xpos = self.batch.bind("site_xpos")
@@ -122,14 +122,14 @@ class Simulator:
         soft_start_s: float = 0.0,
         push_limit: PushLimit | None = None,
     ) -> None:
-        """Put control law, conditioning, safety filter, delay and lag between `rollout` and the joints.
+        """Put control law, low-pass and limits, safety filter, delay and lag between `rollout` and the joints.
 
         Without a control law the torques of `rollout` are efforts: they enter the safety filter directly.
 
         Args:
             limits: (n, COLUMNS), see `r2s.physics.safety_filter.filter_limits`.
-            torque_limit: (n,) Nm, largest target. cutoff_hz: low-pass on the target. soft_start_s: s, of an episode.
-            push_limit: of a robot with a tool; None: pushes are not limited.
+            torque_limit: (n,) Nm, largest target. cutoff_hz: low-pass on it. soft_start_s: s, in each episode.
+            push_limit: limit for a robot with a tool; None: pushes are not limited.
         """
         u = native
         self._user[:, :, u.LIMITS : u.LIMITS + limits.shape[1]] = limits
@@ -211,7 +211,7 @@ class Simulator:
 
     @property
     def effort(self) -> np.ndarray:
-        """(nsim, n) Nm, the target after low-pass, clip and rate limit."""
+        """(nsim, n) Nm, the target torque after low-pass, clip and rate limit."""
         n = self.robot.n
         return self._memory[:, native.EFFORT * n : (native.EFFORT + 1) * n]
 
@@ -232,7 +232,7 @@ class Simulator:
 
     @property
     def depth(self) -> np.ndarray:
-        """(nsim,) m, penetration of the tool at the beginning of the last step; negative: its distance."""
+        """(nsim,) m, penetration of the tool at the beginning of the last step; negative: distance to the surface."""
         return self._contact[:, DEPTH]
 
     def contact_torque(self) -> np.ndarray:
@@ -266,7 +266,7 @@ def _jacobian(axis, anchor, ee):
 
 
 def single_arm(robot: Robot, dynamics: Dynamics) -> mujoco.MjModel:
-    """Return one arm's model without gravity: its links and rotors, and its friction law; it touches nothing."""
+    """Return the model of one arm without gravity and contact: its links, rotors and friction law."""
     native.install()
     memory = native.KEPT * robot.n + (0 if robot.tool is None else COLUMNS)
     model = robot.model(gravity=False, user=native.WIDTH, memory=memory)

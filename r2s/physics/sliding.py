@@ -1,20 +1,20 @@
-"""A box that slides on a table when a tip pushes it: three velocities more in the implicit contact of contact.py.
+"""A box that slides on a table when a tip pushes it; it adds three velocities to the implicit contact of contact.py.
 
-Friction of the table: the limit surface of a body on a plane as an ellipsoid (Goyal, Ruina and Papadopoulos, Wear
-143, 1991; Lynch, Maekawa and Tanie, IROS 1992). With the velocity v of the centre, the spin w and u = (v, r w), the
-force on (v, r w) is -mu N u / |u|; r = moment / force is the mean distance of the base's points from the centre
-(uniform pressure). At rest it is elastic up to the same limit: the deflection z follows dz/dt = u - |u| z / `RIGID`,
-with backward Euler, and the force is -mu N z / RIGID. In sliding both are the same.
+Table friction: the limit surface is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
+Tanie, IROS 1992). With the velocity v of the centre, the spin w, the normal force N and u = (v, r w), the generalized
+force on u is -mu N u / |u|. The ratio r of moment to force is the mean distance of the base's points from the centre
+(uniform pressure). Friction of a resting box is elastic up to the same limit: the deflection z follows dz/dt = u -
+|u| z / `RIGID`, with backward Euler, and the force is -mu N z / RIGID. In sliding both laws agree.
 
-Why not MuJoCo's solver for this body: one compiled law then serves training, twins and engines, joint friction holds
-against the box in the same solution, and arms without a box do not change. The box stays on its base: it neither
-tilts nor lifts (`check_size` in box.py), the vertical force of the tip only loads the base, and the tip does not feel
-the table.
+MuJoCo's solver does not simulate this body, so that one compiled law serves training, twins and engines, one solution
+contains joint friction and box, and arms without a box do not change. The box stays on its base: it neither
+tilts nor lifts (`check_size` in box.py). The vertical force of the tip only loads the base, and the tip does not
+touch the table.
 
-The tip's force F of a step depends linearly on both velocities, and the box's velocity after the step linearly on F.
-So the box is eliminated: F0 - K d, with d the change of the tip's velocity relative to the box, and the mobility h W
-of the box at the contact give F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), with d_0 the change of the box's velocity
-without F. The joints meet this softer contact.
+In a step the force F on the tip is linear in the velocities of tip and box: F = F0 - K d, where d is the change of
+the tip's velocity relative to the box. The box's velocity after the step is linear in F, with the mobility h W at the
+contact. So the box is eliminated: F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is the change of the tip's
+velocity and d_0 that of the box's velocity without F. The joints meet this softer contact.
 """
 
 import numpy as np
@@ -45,10 +45,10 @@ from r2s.physics.contact_layout import (
     WEIGHT,
 )
 
-RIGID = 1e-6  # m, elastic deflection of a box on its table
-STILL = 1e-6  # m/s, at which an untouched box has come to rest: its friction stops it within 1 ms from 4e-3 m/s
-ROUNDS = 30  # most guesses of the speed
-CLOSE = 1e-4  # of the speed, at which they end
+RIGID = 1e-6  # m, largest elastic deflection of a box on its table
+STILL = 1e-6  # m/s, below which an untouched box is at rest: its friction stops it within 1 ms from 4e-3 m/s
+ROUNDS = 30  # largest number of guesses of the box's speed
+CLOSE = 1e-4  # relative error of the speed at which the guesses end
 
 
 @njit(cache=True, error_model="numpy")
@@ -79,14 +79,14 @@ def contact_point_velocity(contact, motion, out):
 
 @njit(cache=True, error_model="numpy")
 def _grip(contact, speed, h):
-    """Return spring N/m and damper N s/m of the table's friction: -(spring z + damper u') with u' after the step."""
+    """Return spring, N/m, and damper, N s/m, of table friction -(spring z + damper u'), with u' after the step."""
     stiff = contact[LOAD] / RIGID / (1.0 + h * speed / RIGID)
     return stiff, h * stiff
 
 
 @njit(cache=True, error_model="numpy")
 def _free_change(contact, speed, h, out):
-    """Write what a step changes of the box's motion (4,) without a tip's force; return mobilities times h, s/kg."""
+    """Write the box's change of motion (4,) in a step without tip; return mobilities times h, s/kg, s/(kg m^2)."""
     spring, damper = _grip(contact, speed, h)
     reach, strain = contact[REACH], contact[STRAIN : STRAIN + 4]
     along = h / (contact[MASS] + h * damper)
@@ -99,7 +99,7 @@ def _free_change(contact, speed, h, out):
 
 @njit(cache=True, error_model="numpy")
 def _pushed(contact, force, change, along, about, out):
-    """Write the box's motion (4,) after a step under the force (3,) N on the tip."""
+    """Write the box's motion (4,) after a step in which the force (3,) N acts on the tip, and minus it on the box."""
     up, lever = contact[UP : UP + 3], np.empty(3)
     _cross(up, contact[ARM : ARM + 3], lever)
     upwards, moment = 0.0, 0.0
@@ -119,7 +119,7 @@ def _speed(contact, motion):
 
 @njit(cache=True, error_model="numpy")
 def _next_speed(contact, old, found, h):
-    """Return the next guess of the speed. Along a line, found = free old / (old + d) with d = h load / mass."""
+    """Return the next guess. On a line, found = free old / (old + h load / mass), free: speed without friction."""
     if old <= 0.0:
         return found
     slowing = h * contact[LOAD] / contact[MASS]
@@ -128,15 +128,15 @@ def _next_speed(contact, old, found, h):
 
 @njit(cache=True, error_model="numpy")
 def start_box(contact, guess):
-    """Write the guess that the box keeps its speed."""
+    """Write the first guess: the speed of the box does not change."""
     guess[BOX_SPEED] = _speed(contact, contact[VELOCITY : VELOCITY + 4])
 
 
 @njit(cache=True, error_model="numpy")
 def yielding(contact, force, h, guess):
-    """Write force (3,) N and resistance (3, 3) N s/m of the contact with a box that yields.
+    """Write FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m of the contact with a box that yields.
 
-    force: (3,) N, on the tip if its velocity relative to the box does not change.
+    force: (3,) N, on the tip if the tip's velocity relative to the box did not change.
     """
     change, lever, point = np.empty(4), np.empty(3), np.empty(3)
     along, about = _free_change(contact, guess[BOX_SPEED], h, change)
@@ -162,7 +162,7 @@ def yielding(contact, force, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _divide(a, vector, matrix):
-    """Replace a vector (3,) and a matrix (3, 3) by a^-1 times them (Cramer)."""
+    """Multiply a vector (3,) and a matrix (3, 3) by a^-1 from the left, in place (Cramer's rule)."""
     inverse = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -181,9 +181,9 @@ def _divide(a, vector, matrix):
 
 @njit(cache=True, error_model="numpy")
 def yielded(contact, tip, h, guess, point):
-    """Write the box's velocity (3,) m/s at the contact for a tip's velocity (3,) m/s after the step; return an error.
+    """Write the box's velocity at the contact to `point` for the tip's (3,) m/s, after the step; return an error.
 
-    The error is that of the guessed speed of the box, as a share of the table's friction.
+    The error is that of table friction due to the guessed speed of the box, as a share of the friction.
     """
     force, change = np.empty(3), np.empty(4)
     for i in range(3):
@@ -201,7 +201,7 @@ def yielded(contact, tip, h, guess, point):
 
 @njit(cache=True, error_model="numpy")
 def move_box(contact, motion, h):
-    """Move the box by a step with the motion (4,) after it, and write its motion and elastic deflection."""
+    """Move the box for h s with its motion (4,) after the step; write this motion and the elastic deflection."""
     share, length = 1.0 / (1.0 + h * _speed(contact, motion) / RIGID), 0.0
     for k in range(4):
         rate = motion[k] if k < 3 else contact[REACH] * motion[3]
@@ -227,7 +227,7 @@ def move_box(contact, motion, h):
 
 @njit(cache=True, error_model="numpy")
 def slide(contact, h):
-    """Move the box by a step under the force on the tip in the contact, which is known."""
+    """Move the box for a step in which the force of the contact is known."""
     force, motion, change = contact[FORCE : FORCE + 3], np.empty(4), np.empty(4)
     touched = force[0] != 0.0 or force[1] != 0.0 or force[2] != 0.0
     speed = _speed(contact, contact[VELOCITY : VELOCITY + 4])

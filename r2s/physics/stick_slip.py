@@ -1,11 +1,11 @@
 """Stick and slip of coupled joints within one step: which joints stick, break away, stop or reverse, and when.
 
 A joint at rest sticks while the net torque on it lies within its breakaway edges; the net torque includes the
-coupling to other joints, but not the joint's own friction. Beyond the edges it slides against the friction of its
-direction. Torques are constant for a step, so accelerations are constant between events, and each event is located
-exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Time
-stepping would apply the friction at the end of a step to the whole step: at each reversal, an error of up to h times
-that friction.
+coupling to other joints, but not the joint's own friction. Beyond an edge the joint slides, against the friction of
+that direction. Torques are constant during a step, so accelerations are constant between events, and each event is
+located exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996).
+Time stepping would apply the friction at the end of a step to the whole step: at each reversal, an error of up to h
+times that friction.
 
 Joint limits are MuJoCo's own: their force adds to the result of this module.
 """
@@ -26,7 +26,7 @@ class JointForces(NamedTuple):
 
     dq: (n,) rad/s. drive: (n,) Nm, all torques but friction. friction: (n,) Nm at dq. rest: (2, n) Nm, kinetic
     friction at zero speed in the negative and the positive direction. edges: (2, n) Nm, breakaway, at least `rest`;
-    0, 0: no stiction.
+    edges of 0: no stiction.
     """
 
     dq: np.ndarray
@@ -38,7 +38,7 @@ class JointForces(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def any_reversal(mass, damping, h, dq, net, work):
-    """Return whether a joint reverses if all joints slide on with the net torque `net` (n,) Nm, friction included.
+    """Return whether a joint reverses if all joints keep sliding under the net torque (n,) Nm, friction included.
 
     The other arguments are those of `coming_velocity`.
     """
@@ -74,20 +74,20 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
         return True
     took_part, left, events = False, h, 0
     while True:
-        while True:  # of the sticking joints, the one farthest beyond its edges breaks away
+        while True:  # the sticking joint that is farthest beyond its edges breaks away
             for j in range(n):
                 acceleration[j] = forces.drive[j] - friction[j]
             unpack(mass, h, damping, root)
             factor(root, root, side)
             solve(root, acceleration, side)
             j, direction = _farthest_beyond(mass, acceleration, forces, side)
-            if j < 0 or events > 4 * n:  # a joint with so many stops within a step sticks until its end
+            if j < 0 or events > 4 * n:  # after so many stops no joint breaks away in this step
                 break
             side[j] = direction if coming[j] == 0.0 else np.sign(coming[j])
             on = side[j] * forces.dq[j] > 0.0  # it slides in its old direction
             friction[j] = forces.friction[j] if on else forces.rest[int(side[j] > 0.0), j]
             took_part |= not on
-        if slow:  # an impulse stops the slow sticking joints; the coupling transmits it
+        if slow:  # an impulse stops the slow sticking joints; the coupling transmits it to the others
             slow = False
             for j in range(n):
                 impulse[j] = 0.0

@@ -1,8 +1,8 @@
-"""A tool's tip and the surface that it touches: parameters of a contact, for simulation and identification.
+"""A tool's tip and the surface that it touches: contact parameters, for simulation and identification.
 
-Normal force (Hunt and Crossley, ASME J. Appl. Mech. 1975): F = K d^e (1 + c d') >= 0, of the penetration d of the
-tip, with K = k / (1 mm)^(e - 1), so that k d is the force at 1 mm for every exponent. Tangential force: mu F in
-sliding, against the velocity.
+Normal force (Hunt and Crossley, ASME J. Appl. Mech. 1975): F = K d^e (1 + c d') >= 0, with the penetration depth d
+of the tip. K = k / (1 mm)^(e - 1), so that k d is the undamped force at d = 1 mm for every exponent. Tangential
+force: mu F in sliding, against the velocity.
 """
 
 import json
@@ -16,7 +16,7 @@ from r2s.errors import UserError, nearest, nearest_file
 from r2s.files import located
 
 TINY = np.finfo(float).tiny
-UNIT_DEPTH = 1e-3  # m, the penetration at which stiffness is stated
+UNIT_DEPTH = 1e-3  # m, penetration depth at which `stiffness` is force per depth
 TOOL_KEYS = ("tip_in_flange_m", "radius_m", "mass_kg", "frame")
 
 
@@ -40,8 +40,8 @@ class Surface:
 
     Attributes:
         point: (3,) m, on the plane, or the centre of the box.
-        normal: (3,) unit vector, out of the material; of a box, its third axis.
-        stiffness: N/m, k: force per penetration at 1 mm. exponent: e, 1 (linear) to 1.5 (Hertz).
+        normal: (3,) unit vector, out of the material; for a box, its third axis.
+        stiffness: N/m, k, force per depth at 1 mm. exponent: e, 1 (linear) to 1.5 (Hertz).
         damping: s/m, c. friction: mu. bristle: m, tangential deflection at which friction reaches mu F; 0: rigid.
         half: (3,) m, half edges of a box; None: a plane. axes: (3, 3), its axes in columns.
         mass: kg, of a box that slides on a table when it is pushed (sliding.py); None: the surface is fixed.
@@ -62,7 +62,7 @@ class Surface:
 
     @property
     def reach(self) -> np.ndarray:
-        """Mean distance, m, of the points of a box's base from its centre."""
+        """Mean distance, m, of the points of a box's base from the base's centre."""
         a, b = np.moveaxis(np.asarray(self.half), -1, 0)[:2]
         return np.hypot(a, b) / 3 + a**2 / (6 * b) * np.arcsinh(b / a) + b**2 / (6 * a) * np.arcsinh(a / b)
 
@@ -72,7 +72,7 @@ class Surface:
         return self.stiffness / UNIT_DEPTH ** (self.exponent - 1.0)
 
     def depth(self, centre: np.ndarray, radius: float) -> np.ndarray:
-        """Return the penetration (...,) m of a sphere at centre (..., 3) m; negative: its distance."""
+        """Return the penetration (...,) m of a sphere at centre (..., 3) m; negative: distance to the surface."""
         if self.half is None:
             return radius - ((centre - self.point) * self.normal).sum(-1)
         beyond = np.abs(((centre - self.point)[..., None] * self.axes).sum(-2)) - self.half

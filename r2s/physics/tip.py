@@ -1,4 +1,4 @@
-"""Where a tool's tip is, which posture brings it to a place, and the nominal place of a surface."""
+"""Forward and inverse kinematics of a tool's tip, and the nominal plane of a surface."""
 
 import mujoco
 import numpy as np
@@ -6,10 +6,10 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.robot import Robot
 
-BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the nominal surface
-POSTURE = 1e-3  # m^2, weight of the start posture in the inverse kinematics
-MARGIN = 0.1  # rad, that inverse kinematics keeps from the position limits
-CLOSE = 1e-4  # m, at which inverse kinematics ends
+BELOW = 0.15  # gap from tip to nominal surface over the end effector's distance from the base, at home
+POSTURE = 1e-3  # m^2, damping of the steps of inverse kinematics
+MARGIN = 0.1  # rad, distance of inverse kinematics from the position limits
+CLOSE = 1e-4  # m, position error at which inverse kinematics ends
 ROUNDS = 60
 
 
@@ -29,7 +29,7 @@ class Tip:
         self._site = self._model.site(robot.ee_site).id
 
     def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the place (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
+        """Return the tip's place (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
         d = self._data
         d.qpos = q
         mujoco.mj_kinematics(self._model, d)
@@ -51,7 +51,7 @@ class Tip:
 
 
 def tilted(normal: np.ndarray, about: np.ndarray | float, tilt: np.ndarray | float) -> np.ndarray:
-    """Return a normal (3,) tilted by `tilt` rad in the direction `about` rad; of (m, 1) angles: (m, 3)."""
+    """Return a normal (3,) tilted by `tilt` rad in the direction `about` rad; for angles (m, 1): (m, 3)."""
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     across /= np.linalg.norm(across)
     aside = np.cos(about) * across + np.sin(about) * np.cross(normal, across)
@@ -68,7 +68,7 @@ def default_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nominal_plane(robot: Robot, point: object = None, normal: object = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return point (3,) m and normal (3,); None: of `default_plane`."""
+    """Return point (3,) m and unit normal (3,) of a plane; None: the value of `default_plane`."""
     default = default_plane(robot)
     values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), default, strict=True)]
     for name, value in zip(("point", "normal"), values, strict=True):

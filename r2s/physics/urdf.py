@@ -1,7 +1,7 @@
 """URDF reader: links, joints, limits, rotor inertia and primitive shapes.
 
-Meshes, materials and elements of simulators are ignored. The base and links fixed to it do not move, so their inertia
-does not count. A link fixed to a moving one becomes part of it.
+Meshes, materials and elements for simulators are ignored. The base and links fixed to it do not move, so their
+inertia does not count. A link fixed to a moving one becomes part of it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,11 +15,11 @@ from r2s.errors import UserError, choices, nearest
 from r2s.physics.welds import Inertia, about, combined
 
 MOVING, FIXED = ("revolute", "continuous"), "fixed"
-ROUNDED = 1e-9  # share of a tensor's largest moment, round-off of the file
-DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements, for which URDF has none
+ROUNDED = 1e-9  # tolerated round-off of a tensor in the file, as a share of its largest moment
+DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements; URDF itself has none
 ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
 ET.register_namespace("drake", DRAKE)
-NO_RANGE = "limits 0 to 0"  # `info` of such a joint
+NO_RANGE = "limits 0 to 0"  # `info` of a joint with this range
 COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers in an attribute; 1 in all others
 
 
@@ -37,8 +37,8 @@ def is_urdf(path: Path) -> bool:
 def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
-    Bodies and joints keep their names, joints their damping and friction. The joints in `lock` ({name: rad or m}) are
-    fixed, and so are those that mimic them.
+    Bodies and joints keep their names, joints their damping and friction. The joints in `lock` ({name: rad or m})
+    become fixed at these positions, and so do joints that mimic them.
 
     Raises:
         UserError: no XML, no URDF, or not an arm of revolute joints.
@@ -58,7 +58,7 @@ class _Reader:
         if any("xacro" in element.tag for element in root.iter()):
             raise self._error("expected URDF, got xacro: convert it with `xacro FILE > arm.urdf`")
         self.name = root.get("name") or path.stem
-        self.placed: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # of locked joints
+        self.placed: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # poses of locked joints
         self.links = self._named(root, "link")
         self.joints = self._named(root, "joint")
         self._lock({str(name): float(value) for name, value in lock.items()})
@@ -98,7 +98,7 @@ class _Reader:
         return UserError(f"robot.mjcf: {self.path.name}: {message}")
 
     def _named(self, root: ET.Element, tag: str) -> dict[str, ET.Element]:
-        """Return the elements of a kind by name."""
+        """Return the elements with a tag, by name."""
         out: dict[str, ET.Element] = {}
         for element in root.findall(tag):
             name = element.get("name")
@@ -108,7 +108,7 @@ class _Reader:
         return out
 
     def _lock(self, at: dict[str, float]) -> None:
-        """Turn joints, and those that mimic them, into fixed ones at a position, rad or m."""
+        """Fix joints at positions, rad or m, and with them the joints that mimic them."""
         for name in at:
             if name not in self.joints:
                 joints = choices(self.joints)
@@ -145,7 +145,7 @@ class _Reader:
         return along / np.linalg.norm(along)
 
     def _attach(self, joint: ET.Element) -> None:
-        """Register the links of a joint."""
+        """Check a joint and register it with its parent and child links."""
         kind, child = joint.get("type"), self._end(joint, "child")
         lock = f"; robot.lock={{{joint.get('name')}: 0}} welds it there"
         if kind not in (*MOVING, FIXED):
@@ -159,7 +159,7 @@ class _Reader:
         self.children[self._end(joint, "parent")].append(joint)
 
     def _rotor(self, transmission: ET.Element) -> tuple[str, float]:
-        """Return the joint of a transmission and its rotor inertia reflected to the joint, kg m^2."""
+        """Return a transmission's joint name and rotor inertia, kg m^2, reflected to the joint."""
         what, joint = f"transmission '{transmission.get('name')}'", transmission.find("joint")
         inertia = 0.0
         for actuator in transmission.findall("actuator"):
@@ -177,7 +177,7 @@ class _Reader:
         return name
 
     def _tree(self, link: str, *, fixed: bool = False) -> Iterator[tuple[ET.Element, str]]:
-        """Yield the joints beyond a link with their child links, parents first; `fixed`: only fixed joints."""
+        """Yield each joint beyond a link and its child link, parents first; fixed: follow only fixed joints."""
         for joint in self.children[link]:
             if not fixed or joint.get("type") == FIXED:
                 child = self._end(joint, "child")
@@ -210,7 +210,7 @@ class _Reader:
         return self._numbers(origin, "xyz", "0 0 0", owner), _rotation(angles)
 
     def _move(self, body: mujoco.MjsBody, joint: ET.Element) -> float:
-        """Add the joint of a body; return its velocity limit, rad/s, or nan."""
+        """Add a joint to a body; return the joint's velocity limit, rad/s, or nan."""
         what = _what(joint)
         limit, dynamics = (joint.find(tag) for tag in ("limit", "dynamics"))
         hinge = body.add_joint(name=joint.get("name"), type=mujoco.mjtJoint.mjJNT_HINGE, axis=self._axis(joint))
@@ -222,7 +222,7 @@ class _Reader:
         )
         if low > high:
             raise self._error(f"{what}: expected lower below upper, got {low:g} and {high:g} rad")
-        # some files declare a continuous joint as revolute without a range; 0 to 0 is a mistake
+        # some files declare a continuous joint as revolute without a range; an explicit range of 0 to 0 is a mistake
         hinge.limited = int(joint.get("type") == "revolute" and low < high)
         if joint.get("type") == "revolute" and low == high and limit is not None and limit.get("upper"):
             hinge.info = NO_RANGE
@@ -249,7 +249,7 @@ class _Reader:
         return combined(parts)
 
     def _inertial(self, name: str) -> Inertia | None:
-        """Return a link's own inertia in its frame, or None."""
+        """Return a link's own inertia in its frame, None if it has no mass."""
         what, element = f"link '{name}'", self.links[name].find("inertial")
         if element is None:
             return None

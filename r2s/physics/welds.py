@@ -1,4 +1,4 @@
-"""Poses, and bodies that are welded to moving ones: their poses, masses, centres and tensors."""
+"""Poses, and the masses, centres of mass and tensors of bodies that are welded to moving ones."""
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ def combined(parts: list[Inertia]) -> Inertia:
 
 
 class Bodies:
-    """Masses, centres and tensors of all bodies, and the poses of welded bodies on the moving ones."""
+    """Masses, centres of mass and tensors of all bodies, and the poses of welded bodies in the moving ones."""
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model
@@ -37,7 +37,7 @@ class Bodies:
         return body, pose
 
     def lumped(self, body: int) -> Inertia:
-        """Return mass, centre and tensor about the centre of `body` with all bodies welded to it."""
+        """Return mass, centre of mass and tensor about it for `body` together with all bodies welded to it."""
         parts = [(self.mass[body], self.com[body], self.inertia[body])]
         for other in range(1, self.model.nbody):
             anchor, pose = self.moving_parent(other)

@@ -1,20 +1,20 @@
-"""The clock of a recording, compared with its own speeds: dq integrated over t must give the change of q."""
+"""Check the clock of a recording against its velocities: dq integrated over t must equal the change of q."""
 
 import numpy as np
 
 from r2s.errors import UserError
 from r2s.recordings.recording import Recording
 
-LEAST = 0.02  # rad RMS, motion about its straight trend from which a factor is judged
-UNEXPLAINED = 0.03  # share of that motion's square that may remain
-WRONG = 0.1  # a clock this far from 1; filters of dq and elastic gears change slow motion by 1 to 2 %
-ALIKE = 0.05  # spread of the joints' factors if the clock is their cause
+LEAST = 0.02  # rad RMS, least motion about a linear trend that determines a factor
+UNEXPLAINED = 0.03  # largest share of that motion's mean square that the factor may leave unexplained
+WRONG = 0.1  # a factor this far from 1 is an error; filters of dq and elastic gears change it by 1 to 2 %
+ALIKE = 0.05  # largest relative spread of the joints' factors if the clock is their cause
 
 
 def speed_factors(recording: Recording) -> np.ndarray:
     """Return the ratio (n,) of the change of q to the integral of dq; nan where motion does not determine it.
 
-    A straight trend is taken out of both in each trajectory, so that a biased dq does not count.
+    A linear trend is removed from both in each trajectory, so that a bias of dq has no effect.
     """
     square, cross, own = np.zeros((3, recording.n_joints))
     for s in recording.stretches:
@@ -34,7 +34,7 @@ def speed_factors(recording: Recording) -> np.ndarray:
 
 
 def check_clock(recording: Recording) -> np.ndarray:
-    """Return `speed_factors` (n,).
+    """Return `speed_factors` (n,), all near 1 or nan.
 
     Raises:
         UserError: t runs too fast or too slow for the speeds, or dq of a joint has another scale than q.

@@ -1,4 +1,4 @@
-"""Which columns of a file are t, q, dq, tau and trajectory: by default names, numbers or the names of joints."""
+"""Find the columns of t, q, dq, tau and trajectory in a file: by default names, numbers or joint names."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,18 +10,18 @@ from r2s.recordings.csv_table import bare_name
 from r2s.recordings.robot_logs import Table, choose_joints
 
 Spec = str | list[str] | None
-DEFAULT_COLUMNS = {  # the first name in the file counts
+DEFAULT_COLUMNS = {  # of these names, the first that the file has counts
     "t": ("t",),
     "q": ("q",),
     "dq": ("dq",),
     "tau": ("tau",),
     "trajectory": ("segment", "trajectory"),
 }
-TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # preferred to the column tau
-NAMES = ("joint_names", "joints", "names", "name")  # of an array of names in .npz or HDF5
-CURRENT = ("current", "i")  # used with a torque constant
+TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # tried before a column tau
+NAMES = ("joint_names", "joints", "names", "name")  # possible names of an array of joint names, as in .npz or HDF5
+CURRENT = ("current", "i")  # read instead of torque if there is a torque constant
 OPTIONAL = ("dq", "trajectory")
-WORDS = {  # for a field, beside a joint's name
+WORDS = {  # for a field, in a column name that also has the name of a joint
     "q": ("q", "position", "positions", "pos", "angle"),
     "dq": ("dq", "qd", "velocity", "velocities", "vel", "speed"),
     "tau": ("tau", "effort", "efforts", "torque"),
@@ -29,7 +29,7 @@ WORDS = {  # for a field, beside a joint's name
 
 
 def specs_of(columns: Mapping[str, Spec]) -> dict[str, Spec]:
-    """Return the user's names of each field, None if there are none."""
+    """Return the column names that the user gives for each field; None for a field without."""
     for key in columns:
         if key not in DEFAULT_COLUMNS:
             raise UserError(f"unknown key '{key}' in data.columns; {instead_of(key, DEFAULT_COLUMNS)}")
@@ -57,9 +57,9 @@ def find_columns(
     constant: np.ndarray | None = None,
     robot_joints: Sequence[str] | None = None,
 ) -> list[str]:
-    """Return the columns of a field; [] if an optional one is absent.
+    """Return the names of a field's columns; [] if an optional field has none.
 
-    robot_joints: names of the robot's joints; columns named after them are put in this order.
+    robot_joints: names of the robot's joints. Columns that are named after joints are returned in this order.
     """
     candidates = DEFAULT_COLUMNS[field]
     if field == "tau":
@@ -89,7 +89,7 @@ def find_columns(
 
 
 def _match(table: Table, field: str, name: str) -> list[str]:
-    """Return the columns that a name stands for."""
+    """Return the columns that a name denotes: one, or numbered ones."""
     if field in ("t", "trajectory"):
         return [name] if name in table else []
     if name in table and table[name].ndim > 1:
@@ -104,7 +104,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
-    """Return the robot's joint that a column is named after, or -1, and the rest of its name in small letters."""
+    """Return the index of the joint that a column is named after, or -1, and the rest of its name in lower case."""
     lower = column.lower()
     cores = [re.sub(r"^joint_|_joint$", "", joint.lower()) for joint in robot_joints]
     for k in sorted(range(len(cores)), key=lambda k: -len(cores[k])):
@@ -115,7 +115,7 @@ def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
 
 
 def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -> list[str]:
-    """Return a column for each of the robot's joints, named after it and one of `words`, or []."""
+    """Return one column per joint of the robot, named after the joint and one of `words`; [] if one is missing."""
     found: dict[str, dict[int, str]] = {}
     for column in table:
         joint, rest = _joint_of(column, robot_joints)
@@ -141,11 +141,11 @@ def _check_order(names: list[str], field: str, robot_joints: Sequence[str]) -> N
 
 
 def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[str] | None, n: int | None) -> Table:
-    """Return a table whose (T, m) arrays have the robot's joints in its order, by the names of joints in the file.
+    """Return the table with the robot's joints in each (T, m) array, in the robot's order, as found by name.
 
     Args:
-        table: columns of the file; `joint_names` (m,) or one of NAMES are the names, if they are text.
-        user: data.joints. robot_joints, n: of the robot.
+        table: columns of the file. The joint names (m,) are the first text array with a name in NAMES.
+        user: data.joints. robot_joints, n: names and number of the robot's joints.
 
     Raises:
         UserError: the user names joints, but the file does not, or a joint is missing.
@@ -167,7 +167,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return the columns numbered by `pattern` without a gap, from `first` (None: 0 if present, else 1)."""
+    """Return the columns with numbers at {} in `pattern`, from `first` (None: 0 if present, else 1) without a gap."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)
@@ -181,12 +181,12 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Return the error for a missing column; another kind of torque is never suggested as a typo."""
+    """Return the error for a missing column; it does not suggest another kind of torque as if it were a typo."""
     if field == "tau" and _match(table, "q", "ddq"):
         return UserError(
             "no torque, but ddq: this is a planned motion; let the arm follow it, and give the arm's own log"
         )
-    inside = {key: key.rsplit("/", 1)[-1] for key in table}  # HDF5: what a group holds
+    inside = {key: key.rsplit("/", 1)[-1] for key in table}  # in HDF5: the last part of the path
     nested = [key for key, last in inside.items() if last == name]
     hint = f"; did you mean '{nested[0]}'?" if nested else nearest(name, table)
     for other, column in TAU.items():

@@ -1,4 +1,4 @@
-"""CSV files as spreadsheets, NumPy, ROS and vendors write them: separators, comments, units, decimal commas."""
+"""Read CSV files of spreadsheets, NumPy, ROS and vendors: separators, comments, units, decimal commas."""
 
 import csv
 import re
@@ -9,8 +9,8 @@ import pandas as pd
 
 from r2s.errors import UserError
 
-HEAD = 1 << 16  # bytes in which the header must be
-MARKS = "#%"  # at the start of a comment, or of the header (NumPy, rostopic echo -p)
+HEAD = 1 << 16  # bytes at the start of a file, in which the header must be
+MARKS = "#%"  # begin a comment line, or the header (NumPy, rostopic echo -p)
 UNITS = {
     "rad": 1.0, "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180, "mrad": 1e-3,
     "rad/s": 1.0, "deg/s": np.pi / 180, "°/s": np.pi / 180, "mrad/s": 1e-3, "rpm": np.pi / 30,
@@ -23,7 +23,7 @@ EXAMPLE = "t,q1,q2,...,dq1,dq2,...,tau1,tau2,..."
 def read_csv(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a CSV file by name, (T,) each.
 
-    The header is the line above the first line of numbers, also behind `#` or `%`; lines before it are skipped.
+    The header is the line above the first line of numbers; it may begin with `#` or `%`. Lines above it are skipped.
 
     Raises:
         UserError: no header, or rows of another length than the header.
@@ -37,7 +37,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
         raise UserError("cannot be read as csv: No columns to parse from file")
     plain = [k for k in filled if lines[k].lstrip()[0] not in MARKS]
     first: int | None = next((k for k in plain if _is_numeric(lines[k])), None)
-    if first is None:  # a column of text: the header is the first line
+    if first is None:  # no line is numeric, as a column is text: the header is the first line
         title = plain[0] if plain and plain[0] == filled[0] else filled[0]
         first = next((k for k in filled if k > title), title + 1)
     above = [k for k in filled if k < first]
@@ -59,13 +59,13 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     )  # fmt: skip
     table: dict[str, np.ndarray] = {}
     for k, name in enumerate(x.strip() for x in names):
-        if name:  # the first column of a name counts
+        if name:  # of columns with one name, only the first keeps it
             table[name if name not in table else f"{name}.{k}"] = _numbers(frame[k]).to_numpy()
     return table
 
 
 def _numbers(column: pd.Series) -> pd.Series:
-    """Return a column of text as numbers if only its last row is the beginning of one, such as "-" or "1.2e"."""
+    """Return a column as numbers if it is text only because its last number is cut off, such as "-" or "1.2e"."""
     text = column.dtype.kind not in "iufb" and len(column) > 1
     if not text or not re.fullmatch(r"[+-]?[\d.]*(e[+-]?)?", str(column.iloc[-1])):
         return column
@@ -74,7 +74,7 @@ def _numbers(column: pd.Series) -> pd.Series:
 
 
 def without_units(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return columns with units in their names, such as `q1 [deg]` or `t (ms)`, by their bare names in SI units."""
+    """Return the table in SI units, with units in names such as `q1 [deg]` or `t (ms)` removed."""
     out = {}
     for name, column in table.items():
         bare, factor = bare_name(name)
@@ -98,12 +98,12 @@ def _encoding(head: bytes) -> str:
     try:
         head[: head.rfind(b"\n") + 1].decode("utf-8-sig")
     except UnicodeDecodeError:
-        return "latin-1"  # a degree sign of a German spreadsheet
+        return "latin-1"  # such as the degree sign in a German spreadsheet
     return "utf-8-sig"
 
 
 def _separator(line: str) -> str:
-    """Return the separator of a line, "" for spaces; a semicolon or tab leaves the comma to decimals."""
+    """Return the separator of a line, "" for spaces; in a line with a semicolon or tab, commas are decimal commas."""
     return next((mark for mark in ";\t," if mark in line), "")
 
 

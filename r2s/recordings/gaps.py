@@ -4,19 +4,19 @@ import numpy as np
 
 from r2s.errors import UserError
 
-LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s; median steps: no shorter pause separates trajectories, so frames may be lost
-SLOWEST_S = 0.2  # s, longest median step taken for seconds: below 5 Hz unit_checks.py judges nothing
-SLACK = 1e-6  # relative, of a rounded clock: 20 Hz have steps of 0.05 s plus or minus round-off
+LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; shorter pauses (lost frames) separate no trajectories
+SLOWEST_S = 0.2  # s, longest median step of a clock in seconds: below 5 Hz unit_checks.py checks nothing
+SLACK = 1e-6  # relative tolerance for round-off: steps of a 20 Hz clock are not exactly 0.05 s
 
 
 def longest_step(steps: np.ndarray, max_gap_s: float | None = None) -> float:
-    """Return the longest step that is no pause, s, with SLACK.
+    """Return the longest step that does not count as a pause, s, with a tolerance of SLACK.
 
     Args:
         steps: (T,) s, of a log. max_gap_s: the user's; None: five times the median step, and at least 0.05 s.
 
     Raises:
-        UserError: most steps are longer, so t is not in seconds.
+        UserError: the median step exceeds `max_gap_s` (None: 0.2 s), so t is probably not in seconds.
     """
     median = float(np.median(steps)) if len(steps) else 0.0
     allowed = SLOWEST_S if max_gap_s is None else max_gap_s

@@ -1,4 +1,4 @@
-"""Several recordings of one arm and one kind of torque as one: each keeps its clock and its trajectories."""
+"""Join recordings of one arm and one kind of torque into one; each keeps its clock and its trajectories."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,17 +8,17 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.recordings.recording import FIELDS, Recording
 
-SAME_RATE = 0.01  # relative difference of two rates that are one
-DT = 1e-3  # s, grid on which recordings of different rates meet, and on which r2s filters all of them
+SAME_RATE = 0.01  # largest relative difference of rates that count as equal
+DT = 1e-3  # s, common grid of recordings with different rates; r2s filters every recording on this grid
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
-    """Return recordings one after another; recordings of different rates are resampled to 1 kHz first.
+    """Return one recording of all rows; if rates or command periods differ, each part is resampled to 1 kHz first.
 
-    Signals that not all recordings have are dropped, and so is the period; `Recording.in_phase` finds the common one.
+    Signals that not all recordings have are dropped. So is the period; `Recording.in_phase` finds a common one.
 
     Raises:
-        UserError: different kinds of torque or numbers of joints.
+        UserError: the recordings differ in kind of torque or number of joints.
     """
     first = recordings[0]
     if len(recordings) == 1:

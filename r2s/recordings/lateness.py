@@ -1,4 +1,4 @@
-"""How much later the logged dq of a recording is than its q."""
+"""Lateness: the delay of the logged dq of a recording relative to its q."""
 
 from dataclasses import dataclass, replace
 
@@ -10,9 +10,9 @@ from r2s.recordings.recording import Recording
 
 COMPARED_S = 60.0  # s of a recording in which dq is compared with q
 EDGE = 100  # ms, dropped at both ends of a trajectory, where the filter has transients
-BLOCK = 500  # ms, whose errors count as independent
-LATE_S, SURE = 5e-4, 3.0  # s, half a step; standard deviations: less is no lateness
-OFF = 0.05  # share of the speed: a dq that is farther off is another signal
+BLOCK = 500  # ms, length of blocks whose errors count as independent
+LATE_S, SURE = 5e-4, 3.0  # s (half a step) and standard deviations; lateness below either is not corrected
+OFF = 0.05  # share of the speed; a dq whose remaining RMS error is larger is another signal
 
 
 @dataclass(frozen=True)
@@ -30,30 +30,30 @@ class Lateness:
 
     @property
     def sure(self) -> np.ndarray:
-        """(n,) s, 0 where it is too small or uncertain to be corrected."""
+        """Lateness to correct, (n,) s: 0 where `s` is too small or too uncertain, nan where `s` is nan."""
         seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
         return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
 
     @property
     def as_logged(self) -> "Lateness":
-        """The same without a correction of dq where it is a derivative of q."""
+        """Lateness that leaves dq as logged, except where `s` is nan: there, q still replaces dq."""
         return replace(self, s=0.0 * self.s)
 
     def corrected(self, smooth: Recording) -> np.ndarray:
-        """Return (T, n) rad/s: the velocity without the lateness, from dq or, where that is nan, from q."""
+        """Return the velocity (T, n) rad/s without the lateness: from dq, or from q where the lateness is nan."""
         return _corrected(smooth, self.sure, self.filtered)
 
 
 def from_q(joints: int) -> Lateness:
-    """Return the lateness with which the derivative of q replaces dq."""
+    """Return a lateness of nan for all joints, so that the derivative of q replaces dq."""
     return Lateness(np.full(joints, np.nan), np.zeros(joints))
 
 
 def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
-    """Return the lateness of dq, by least squares below `cutoff_hz`, where a filter acts like a delay.
+    """Return the lateness of dq, by least squares on motion below `cutoff_hz`, where a filter acts like a delay.
 
-    dq is often smoother than q, so correcting its lateness beats differentiating q. The correction inverts a filter
-    or a delay, whichever fits better.
+    dq is often smoother than the derivative of q, so correcting its lateness is better than differentiating q. The
+    correction inverts a filter or a delay, whichever fits better.
     """
     smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
     slope, ddq, n = smooth.derivative(smooth.q), smooth.derivative(smooth.dq), recording.n_joints
@@ -80,7 +80,7 @@ def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
 
 
 def _corrected(smooth: Recording, late: np.ndarray, filtered: bool) -> np.ndarray:
-    """Return (T, n) rad/s, dq as it was before a filter or a delay of `late` (n,) s; nan: the derivative of q."""
+    """Return dq (T, n) rad/s without a filter or delay of `late` (n,) s; where that is nan, the derivative of q."""
     if filtered:
         out = smooth.dq + np.nan_to_num(late) * smooth.derivative(smooth.dq)
     else:

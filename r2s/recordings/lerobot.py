@@ -1,7 +1,7 @@
 """Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet beside meta/info.json.
 
-Torque is an unusual feature there. `write_dataset` puts a command into `action` and other torque into
-`observation.effort`; a reader finds angles, velocities and torques by the words in names of features and elements.
+Torque is unusual in such datasets. `write_dataset` stores commands as `action`, other torque as `observation.effort`.
+`lerobot_table` finds angles, velocities and torques by words in the names of features and of their elements.
 """
 
 import json
@@ -25,16 +25,16 @@ INFO = "meta/info.json"
 VERSION = "v3.0"
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 QUANTILES = (1, 10, 50, 90, 99)  # %, of lerobot's stats.json
-CLOCK_TOLERANCE = 1e-4  # s, lerobot's own between a timestamp, float32, and frame_index / fps
+CLOCK_TOLERANCE = 1e-4  # s, lerobot's own tolerance between a timestamp (float32) and frame_index / fps
 FILE = "chunk-000/file-000.parquet"
-WORDS = {  # of a feature's or an element's name -> field
+WORDS = {  # word in the name of a feature or of its element -> field
     **dict.fromkeys(("effort", "efforts", "torque", "torques", "tau"), "tau"),
     **dict.fromkeys(("current", "currents"), "current"),
     **dict.fromkeys(("vel", "velocity", "velocities", "speed", "dq", "qd", "qvel"), "dq"),
     **dict.fromkeys(("pos", "position", "positions", "angle", "angles", "q", "qpos"), "q"),
 }
 DEGREES = ("deg", "degree", "degrees")
-OTHERS = ("gripper", "finger", "fingers", "hand", "jaw", "cartesian", "ee", "eef", "tcp", "pose")  # not of joints
+OTHERS = ("gripper", "finger", "fingers", "hand", "jaw", "cartesian", "ee", "eef", "tcp", "pose")  # not arm joints
 RADIANS = np.pi / 180
 
 
@@ -51,8 +51,8 @@ def dataset_files(folder: Path) -> list[Path]:
 def lerobot_table(folder: Path) -> Table:
     """Return t (T,) s, trajectory (T,), q, dq, tau, tau_J_d or current (T, m), and the names of their joints.
 
-    t is nominal, frame_index / fps, where the timestamps are; `trajectory` is the episode. Torque of an action is
-    tau_J_d. Elements named after a gripper are left out. The scalar `reader_note` says which features were read.
+    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode. Torque in an action
+    becomes tau_J_d. Features of a gripper, hand or pose are left out. The scalar `reader_note` names the sources.
 
     Raises:
         UserError: no torque in the dataset, another version, or a damaged file.
@@ -62,7 +62,7 @@ def lerobot_table(folder: Path) -> Table:
     channels = _channels(features)
     found: dict[str, dict[str, tuple[str, int, float]]] = {}
     for field, joint, place in channels:
-        found.setdefault(field, {}).setdefault(joint, place)  # the first feature that has it counts
+        found.setdefault(field, {}).setdefault(joint, place)  # of several features with this value, the first counts
     torques = [field for field in ("tau", "tau_J_d", "current") if field in found]
     joints = [j for j in found.get("q", {}) if any(j in found[field] for field in torques)]
     if not joints:
@@ -111,7 +111,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, int, float]]]:
-    """Return (field, joint, (feature, element, factor to SI units)) of each number that is of a joint."""
+    """Return (field, joint, (feature, element's index, factor to SI units)) of each element that is of a joint."""
     out = []
     for feature, spec in features.items():
         shape = spec["shape"]
@@ -120,7 +120,7 @@ def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, in
         of = re.findall(r"[a-z]+", feature.lower())
         for k, element in enumerate(_elements(spec.get("names"), shape[0])):
             words = re.findall(r"[a-z]+", element.lower())
-            # a feature may be named after its field and have the elements of another: effort of `elbow.pos`
+            # the feature's own words go first: a feature of effort may have elements such as `elbow.pos`
             field = next((WORDS[w] for w in [*reversed(of), *reversed(words)] if w in WORDS), None)
             field, action = field or ("q" if "state" in of else None), "action" in of
             if field is None or set(OTHERS) & {*words, *of} or (action and field != "tau"):
@@ -132,7 +132,7 @@ def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, in
 
 
 def _elements(names: Any, size: int) -> list[str]:
-    """Return the names of a feature's elements: a list, or a mapping to one; joint1, joint2 ... without names."""
+    """Return the names of a feature's elements, from a list or a mapping to a list; else joint1, joint2 ..."""
     if isinstance(names, Mapping):
         names = next((x for x in names.values() if isinstance(x, list)), None)
     if isinstance(names, list) and len(names) == size:
@@ -141,7 +141,7 @@ def _elements(names: Any, size: int) -> list[str]:
 
 
 def _joint(element: str) -> str:
-    """Return an element's name without words of field and unit: `elbow` of `elbow.pos`, `joint2` of `tau_2`."""
+    """Return an element's name without words for field and unit: `elbow` of `elbow.pos`, `joint2` of `tau_2`."""
     known = {*WORDS, *DEGREES, "rad", "nm"}
     numbered = re.fullmatch(r"([a-z]+)[._ -]?(\d+)", element.lower())
     if numbered and numbered[1] in known:
@@ -184,18 +184,18 @@ def write_dataset(
     so.
 
     Args:
-        joints: names of the n joints. robot: name of the arm. more: {feature: (T, k)} beside state and torque; not
-            resampled. task: the text of every episode's task.
+        joints: names of the n joints. robot: name of the arm. more: {feature: (T, k)} beside state and torque; it
+            is never resampled. task: text that describes the task of every episode.
 
     Raises:
-        UserError: the folder exists, or `more` does not fit the clock.
+        UserError: the folder exists, or `more` is given and the recording must be resampled.
     """
     if folder.exists():
         raise UserError(f"to: {folder} exists; a LeRobotDataset needs a new folder")
     steps, notes = len(recording.t) - len(recording.stretches), []
     if not steps:
         raise UserError("every trajectory is a single row: the recording has no rate")
-    fps = max(1, round(steps / recording.duration))  # the mean: steps may alternate
+    fps = max(1, round(steps / recording.duration))  # from the mean step, because steps may alternate
     nominal = [(recording.t[s] - recording.t[s][0]) * fps for s in recording.stretches]
     if max(np.abs(x - np.arange(len(x))).max() for x in nominal) / fps > CLOCK_TOLERANCE:
         if more:

@@ -9,11 +9,11 @@ import numpy as np
 
 from r2s.recordings.recording import Recording
 
-LONG_S = 600.0  # s, of a recording whose intermediate results take hundreds of MB
+LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of MB
 
 
 def give_back(recording: Recording) -> None:
-    """Give freed memory back to the system after work on a long recording: glibc keeps blocks of up to 32 MB."""
+    """Return freed memory to the system after work on a long recording; glibc would keep blocks of up to 32 MB."""
     if recording.duration > LONG_S and sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # musl has none
         if trim is not None:
@@ -23,7 +23,7 @@ def give_back(recording: Recording) -> None:
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:
     """Yield pieces of about `seconds` in the order of the log; neighbours in one trajectory share `overlap_s`.
 
-    The last one is longer by what remains, which may be too short to be filtered alone.
+    A remainder is appended to the last piece, because alone it may be too short to be filtered.
     """
     if recording.duration <= 1.5 * seconds:
         yield recording
@@ -49,7 +49,7 @@ def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iter
 def spread(recording: Recording, seconds: float, each_s: float = 10.0) -> Recording:
     """Return stretches of `each_s`, evenly spread over the recording, that last `seconds` in total.
 
-    A recording that is not longer is returned unchanged.
+    A recording of at most `seconds` is returned unchanged.
     """
     if recording.duration <= seconds:
         return recording

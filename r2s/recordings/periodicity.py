@@ -11,15 +11,15 @@ import numpy as np
 
 STEP = 0.02  # s, grid of the comparison
 TOLERANCE = 0.01  # rad RMS, tracking difference between two repetitions of one motion
-MIN_MOTION = 3.0  # standard deviation of a joint's motion, in tolerances: ten peak to peak
+MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances: about ten peak to peak
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
-MAX_COMPARED = 60  # tracks compared with each track, and pieces searched for; bounds the computing time
-PIECE_S, PIECE_MOTION = 1.0, 2.0  # s, and deviations of the motion: least duration and range of a piece in `overlap`
+MAX_COMPARED = 60  # most tracks that a track is compared with, and most pieces of `overlap`; limits computing time
+PIECE_S, PIECE_MOTION = 1.0, 2.0  # least duration (s) and range (standard deviations of the motion) of a piece
 TRACKING = 0.02  # rad RMS, tracking error of a slow or soft arm
-# deviations of the motion: least and largest tolerance; single joints of other Fourier motions pass from 0.2 on
+# smallest and largest tolerance, in standard deviations; at 0.2 single joints of other Fourier motions would pass
 SIMILAR = 0.04, 0.12
-STILL = 0.25  # of the largest joint's deviation: least one of a joint that hardly moves
+STILL = 0.25  # of the largest joint's deviation: lower bound on the deviation of a joint that hardly moves
 
 
 class Track:
@@ -42,7 +42,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return a track per run of the clock t (T,) s, or per stretch if `each`; drop tracks shorter than OVERLAP_S."""
+    """Return a track per stretch if `each`, else per run of the clock t (T,) s; drop tracks below OVERLAP_S."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -57,8 +57,8 @@ def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
 def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
     """Return the period of the motion, s, and the shift (K,) s that aligns the clock of each of K tracks.
 
-    With these shifts, the same motion has the same phase in all tracks. The period is None without a repetition. If
-    motion repeats between tracks only, the period spans all aligned tracks: no phase then occurs twice within one.
+    With these shifts, the same motion has the same phase in all tracks. The period is None if nothing repeats. If
+    motion repeats only between tracks, the period spans all aligned tracks, so no phase occurs twice in a track.
     """
     shift, found, period = np.zeros(len(tracks)), False, None
     for k, b in enumerate(tracks):
@@ -78,8 +78,8 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
 
-    It occurs if each joint's RMS distance is within a tracking error, or SIMILAR standard deviations of its motion in
-    `other`, of a large or small motion.
+    A piece of motion occurs there if each joint's RMS distance is below its tolerance. The tolerance is TRACKING,
+    limited to SIMILAR times the standard deviation of the joint in `other`.
     """
     deviation = np.nanstd(np.concatenate([track.q for track in other]), axis=0) if other else np.zeros(1)
     tolerance = np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -138,9 +138,9 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the RMS distance per joint (L,) rad and the number of common rows (L,) at every lag.
+    """Return the RMS distance over rows and joints (L,) rad, and the number of common rows (L,), at every lag.
 
-    The distance is inf where the common part is shorter than OVERLAP_S or moves less than MIN_MOTION.
+    The distance is inf where the common part is shorter than OVERLAP_S or no joint moves by MIN_MOTION.
     """
     square, variance, count = _distances(a, b)
     counts = (count >= OVERLAP_S / STEP) & (variance.max(1) > (MIN_MOTION * TOLERANCE) ** 2)
@@ -148,7 +148,7 @@ def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _own_lag(track: Track) -> int | None:
-    """Return the first lag, in rows, after which a track repeats itself."""
+    """Return the first lag, in rows, at which a track repeats itself, or None."""
     q, least = track.q, round(OVERLAP_S / STEP)
     error = _errors(q, q)[0][len(q) - 1 :]  # from lag 0
     error[:least] = np.inf
@@ -160,7 +160,7 @@ def _own_lag(track: Track) -> int | None:
 
 
 def _lag(a: Track, b: Track) -> int | None:
-    """Return the lag, in rows, at which b repeats a; of several, the one with the most common rows."""
+    """Return the lag, in rows, at which b repeats a, or None; of several, the one with the most common rows."""
     error, count = _errors(a.q, b.q)
     runs = _runs(error < TOLERANCE)
     if not runs:

@@ -16,7 +16,7 @@ from r2s.recordings.recording import FIELDS, Recording, save_npz
 from r2s.recordings.robot_logs import Table
 
 OWN = {*FIELDS, "torque", "name", "joint", "sign", "pose"}  # the arrays of `Ramps.save`
-MIN_RISE = 1e-3  # Nm, a smaller change is not the beginning of a ramp
+MIN_RISE = 1e-3  # Nm, a smaller change of the command does not begin a ramp
 BREAKAWAY = 2e-3  # rad, a joint that has moved this far has broken away or is about to
 
 
@@ -26,10 +26,10 @@ class Ramps:
 
     Attributes:
         recording: with commanded torque; identification uses t, and q and tau of the ramped joint.
-        joint: the ramped joint, from 0. sign: direction, 1 or -1. pose: posture, from 0. Each (K,) or one.
+        joint: the ramped joint, from 0. sign: direction, 1 or -1. pose: posture, from 0. Each is (K,) or one for all.
 
     Raises:
-        UserError: the torque is not the command, or the numbers do not fit the recording.
+        UserError: the torque is not commanded, or joint, sign or pose does not fit the recording.
     """
 
     recording: Recording
@@ -70,8 +70,8 @@ def read_ramps(
     """Read ramps from a file of `Ramps.save`, or from a log in any format of `readers.read`.
 
     A log has the columns of a commanded recording (t s, q rad, dq rad/s or none, tau_J_d or tau Nm), and `joint`
-    (from 1) and `sign` (1 or -1) per row or per ramp. A new ramp begins where one of these or a column trajectory or
-    segment changes, where t restarts, and after a gap.
+    (from 1) and `sign` (1 or -1) per row or per ramp. A new ramp begins where joint, sign or a column trajectory or
+    segment changes from one row to the next, where t restarts, and after a gap.
 
     Args:
         path: the file.
@@ -152,14 +152,14 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError if another joint's command changes more, or the ramped one's against its sign."""
+    """Raise UserError if commands change, but that of the ramped joint not mainly in the direction of `sign`."""
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY
         until = int(moved.argmax()) + 1 if moved.any() else len(moved)  # after breakaway the arm may brake
         change = r.tau[rows][:until] - r.tau[rows.start]
         up, down = (sign * change).max(0), (-sign * change).max(0)
-        if up[j] > down[j] or np.maximum(up, down).max() < MIN_RISE:  # or the joint moved before the ramp began
+        if up[j] > down[j] or np.maximum(up, down).max() < MIN_RISE:  # no change: it moved before the ramp
             continue
         other = int(np.maximum(up, down).argmax())
         got = "the opposite" if other == j else f"a change of joint {other + 1}"

@@ -23,7 +23,7 @@ from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_
 HDF5 = (".h5", ".hdf5")
 SUFFIXES = (".csv", ".npz", ".parquet", *HDF5, *BAGS)
 NO_BAG = dict.fromkeys(("topic", "joints", "model_joints", "n_joints"))
-RESTART_S = 0.1  # s, a clock that goes back to within this of its first value has restarted
+RESTART_S = 0.1  # s, a clock that jumps back to within this time of its first value has restarted
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Options:
     period: float | None = None
     name: str = ""
     torque_constant: np.ndarray | None = None
-    restarts: bool = False  # a clock that goes back to its start begins a new trajectory
+    restarts: bool = False  # whether a clock that goes back to its start begins a new trajectory
     robot_joints: Sequence[str] | None = None
     limits: tuple[np.ndarray, np.ndarray] | None = None
-    repair: bool = True  # rows may be left out
+    repair: bool = True  # whether the reader may sort rows or leave rows out
 
 
 def read(
@@ -58,34 +58,34 @@ def read(
     torque_constant: ArrayLike | None = None,
     limits: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Recording:
-    """Read the recording in `path`; the logs of libfranka and of Franka's ROS messages hold several torques.
+    """Read the recording in `path`, with one kind of torque; logs of a Franka arm contain several kinds.
 
     Args:
         path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
             LeRobotDataset.
         torque: "measured", "commanded" or "motor", see `Recording`; None only if the file declares it.
-        columns: names in the file of t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
-            DEFAULT_COLUMNS, with TAU before tau. A name of q, dq or tau denotes a (T, n) array, or numbered columns
-            q1 q2 ..., q_1 q_2 ... or q[1] q[2] ..., from 1 or 0. `{j}` (from 1) or `{i}` (from 0) in a name is the
-            joint number; a list names the joints one by one. In HDF5 a name is a path: robot/q.
+        columns: the file's names for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
+            DEFAULT_COLUMNS; for tau, the column in TAU is tried first. A name for q, dq or tau denotes a (T, n)
+            array, or numbered columns q1 q2 ..., q_1 q_2 ... or q[1] q[2] ..., from 1 or 0. In a name, `{j}` (from
+            1) or `{i}` (from 0) stands for the joint number. A list has one name per joint. In HDF5 a name is a
+            path: robot/q.
         n_joints: expected number of joints.
         max_gap_s: a longer pause in time begins a new trajectory; None: see `longest_step`; inf: no splitting.
         period: s, see `Recording`.
-        name: of the recording; the default is the file's.
+        name: of the recording; None: the name of the file without its suffix.
         topic: of a bag, see `bag_table`.
-        joints, model_joints: the robot's joint names in the file and in its description; they select and order the
-            file's joints, see `by_names` and `choose_joints`.
+        joints, model_joints: the robot's joint names in the file and in the robot description; they select and
+            order the file's joints, see `by_names` and `choose_joints`.
         torque_constant: Nm/A at the joint, gear ratio included, (n,) or one for all; tau is then a motor current.
+        limits: lowest and highest q of the robot, (n,) rad; angles outside are shifted into them by revolutions.
 
-        limits: lowest and highest q of the robot (n,) rad: angles that differ by whole turns are turned into them.
-
-    Without a column dq, dq is the central difference of q over the logged time. Without a column trajectory, gaps
-    separate trajectories, and (not in a bag) so does a clock that goes back to its start. Faults with one remedy are
-    repaired (r2s/recordings/repairs.py), and the recording's notes say so. A file of `Recording.save` is restored
-    unchanged.
+    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories; without
+    a column trajectory, so does a clock that goes back to its start (not in a bag). Faults with only one remedy are
+    repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file of `Recording.save` is
+    restored unchanged.
 
     Raises:
-        UserError: the file or a column is missing or damaged, or the values do not make a recording.
+        UserError: the file or a column is missing or damaged, or its values are no valid recording.
     """
     constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
@@ -102,8 +102,8 @@ def read(
 
 
 def from_table(table: Table, how: Options) -> Recording:
-    """Return the recording in a file's columns; error messages do not name the file."""
-    notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars of `Recording.save`
+    """Return the recording in the columns of a file; error messages do not name the file."""
+    notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars of `Recording.save` or of a reader
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(how.torque, notes.get("torque"))
     constant = how.torque_constant
@@ -139,7 +139,7 @@ def from_table(table: Table, how: Options) -> Recording:
     held = notes.get("command_period") if saved else None
     arrays = {k: x.view() for k, x in arrays.items()}
     for x in arrays.values():
-        x.flags.writeable = False  # `Recording` need not copy arrays that do not change
+        x.flags.writeable = False  # so that `Recording` makes no copy
     recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals)  # type: ignore[arg-type]
     recording = replace(recording, notes=tuple(repairs), command_period=held)
     if how.max_gap_s != np.inf and not saved:
@@ -150,7 +150,7 @@ def from_table(table: Table, how: Options) -> Recording:
 
 
 def _without_holds(recording: Recording) -> Recording:
-    """Return the rows that have values of their own, of a log that repeats slower values."""
+    """Drop the rows that only repeat values, if the log has more rows than the arm sent values (see `held`)."""
     rows = held(recording.t, recording.q, recording.dq, recording.stretches)
     if rows is None:
         return recording
@@ -160,9 +160,9 @@ def _without_holds(recording: Recording) -> Recording:
 
 
 def restart_index(t: np.ndarray) -> np.ndarray | None:
-    """Return the trajectory index (T,) of a clock t (T,) s that restarts, or None.
+    """Return the trajectory index (T,) of each row if the clock t (T,) s restarts, else None.
 
-    A restart goes back to the first value. Any other step back is an error in the log, and `Recording` reports it.
+    A restart goes back to about the first value. `Recording` reports any other step back as an error in the log.
     """
     if t.ndim != 1 or not len(back := np.flatnonzero(np.diff(t) < 0) + 1):
         return None
@@ -199,7 +199,7 @@ def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
 
 
 def _vector(table: Table, names: list[str], n_joints: int | None, field: str) -> np.ndarray:
-    """Return the columns as (T, n)."""
+    """Return the columns of a field as one array (T, n)."""
     parts = [_numbers(table, name) for name in names]
     if len(parts) > 1 and {part.shape for part in parts} != {parts[0].shape[:1]}:
         shapes = choices(f"{name} {part.shape}" for name, part in zip(names, parts, strict=True))
@@ -235,7 +235,7 @@ def _numbers(table: Table, name: str) -> np.ndarray:
 
 
 def files_of(path: str | os.PathLike) -> list[Path]:
-    """Return the files of a recording: one, or all files of a ROS 2 bag or a LeRobotDataset."""
+    """Return the files that make up a recording: one, or all that are read of a ROS 2 bag or a LeRobotDataset."""
     path = Path(path).expanduser()
     if is_dataset(path):
         return dataset_files(path)
@@ -300,7 +300,7 @@ def _load_npz(path: Path) -> Table:
 
 
 def _load_hdf5(path: Path) -> Table:
-    """Return the datasets of up to two dimensions by their paths."""
+    """Return all datasets of at most two dimensions, keyed by their paths."""
     h5py = optional_import("h5py", "reading this file", "recordings")
     table: Table = {}
 

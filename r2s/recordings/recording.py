@@ -16,9 +16,9 @@ from r2s.recordings.periodicity import find_period, overlap, tracks_of
 
 TORQUES = ("measured", "commanded", "motor")
 MIN_ROWS = 10
-SPLIT_GUARD_S = 0.1  # s, rows so close to a held-out row are almost copies of it and belong to neither side
+SPLIT_GUARD_S = 0.1  # s; rows this close to a validation row are almost copies of it, so neither side gets them
 FIELDS = ("t", "q", "dq", "tau", "trajectory")
-SIGNALS = (  # what an arm may know beside its motion, by libfranka's names; `ArmState` in r2s/arm/interface.py
+SIGNALS = (  # what an arm may measure or estimate besides its motion, named as in libfranka; see `ArmState`
     "tau_ext_hat_filtered", "O_F_ext_hat_K", "joint_contact", "cartesian_contact", "joint_collision",
     "cartesian_collision", "control_command_success_rate", "O_T_EE", "m_ee", "m_load",
 )  # fmt: skip
@@ -28,18 +28,18 @@ SIGNALS = (  # what an arm may know beside its motion, by libfranka's names; `Ar
 class Recording:
     """Motion and torque of n joints in T rows, checked on construction; the arrays are read-only.
 
-    Every operation returns a new recording. No difference, filter or window crosses from one trajectory to the next.
+    Every operation returns a new recording. No difference, filter or window spans two trajectories.
 
     Attributes:
-        t: (T,) s, as logged: increasing within a trajectory, with any steps; it may restart in the next trajectory.
+        t: (T,) s, as logged. It increases within a trajectory, with any steps, and may restart in the next one.
         q, dq, tau: (T, n) rad, rad/s, Nm.
-        torque: "measured" by a link-side sensor, contains gravity; "commanded", without gravity; or "motor", the
-            motor torque times the gear ratio, which contains gravity, all friction and rotor inertia.
-        signals: {name of `SIGNALS`: (T,) or (T, k)}, what the arm knew in each row; None: nothing.
-        trajectory: (T,) index of the continuous stretch of each row; None: all rows are one stretch.
-        period: s, the excitation repeats itself in `t` with this period (see `split`); None: it does not.
-        notes: what the reader repaired, a line each.
-        command_period: s, for which a command is held; None: from row to row.
+        torque: "measured" by a link-side sensor, with gravity; "commanded", without gravity; or "motor", the motor
+            torque times the gear ratio, which contains gravity, all friction and rotor inertia.
+        signals: {name in `SIGNALS`: (T,) or (T, k)}, further values that the arm reported in each row; None: none.
+        trajectory: (T,) index of the continuous stretch to which each row belongs; None: all rows are one stretch.
+        period: s, period with which the excitation repeats itself in `t` (see `split`); None: it does not repeat.
+        notes: one line per repair or remark of the reader.
+        command_period: s, for which the arm holds each command; None: until the next row.
     """
 
     t: np.ndarray
@@ -133,7 +133,7 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """One over the median logged step within a trajectory."""
+        """Rate of the log, Hz: one over the median time step within trajectories."""
         steps = self._steps()
         if not len(steps):
             raise UserError("every trajectory is a single row: the recording has no rate")
@@ -152,7 +152,7 @@ class Recording:
         return self.rows(rows, np.concatenate([[0], np.cumsum(cut)])[: len(rows)])
 
     def split_at_gaps(self, max_gap_s: float | None = None) -> "Recording":
-        """Start a new trajectory after each pause; drop rows with one on both sides. See `longest_step`."""
+        """Start a new trajectory after each pause (see `longest_step`); drop single rows between two pauses."""
         if max_gap_s is not None:
             _positive("max_gap_s", max_gap_s, "s")
         steps = self._steps()
@@ -166,9 +166,9 @@ class Recording:
     def resample(self, dt: float) -> "Recording":
         """Interpolate each trajectory linearly onto a uniform grid of `dt` s from its first logged time.
 
-        A command acts until the next one: of commands, `tau` is the mean over each step of the grid.
-        No anti-aliasing: for a lower rate, resample at the logged rate, `smooth`, then resample again. Signals keep
-        their last logged value, because flags and poses cannot be interpolated.
+        Commanded torque is averaged over each grid step instead, because a command acts until the next one.
+        There is no anti-aliasing filter: to lower the rate, resample at the logged rate, `smooth`, then resample
+        again. Signals take their last logged value, because flags and poses cannot be interpolated.
         Trajectories shorter than `dt` are dropped.
         """
         _positive("dt", dt, "s")
@@ -193,9 +193,9 @@ class Recording:
         return replace(self, signals=signals, **{f: np.concatenate(parts) for f, parts in columns.items()})  # type: ignore[arg-type]
 
     def _held(self, s: slice, grid: np.ndarray, dt: float) -> np.ndarray:
-        """Return (G, n) Nm, means over [grid, grid + dt) of the commands in rows `s`, each held until the next one.
+        """Return the mean command (G, n) Nm over each step [grid, grid + dt) of rows `s`.
 
-        Between rows that are several command periods apart, the commands are interpolated.
+        A command holds until the next one. Between rows several command periods apart, commands are interpolated.
         """
         t, tau, period = self.t[s], self.tau[s], self.command_period or 1.0 / self.rate_hz
         if len(grid) == len(t) and np.abs(grid - t).max() < 1e-6 * dt and period > 0.9 * dt:
@@ -215,7 +215,7 @@ class Recording:
     def smooth(self, cutoff_hz: float) -> "Recording":
         """Low-pass q, dq and tau with a zero-phase filter: a Butterworth of order 4, run forwards and backwards.
 
-        The attenuation at the cutoff is -6 dB. The grid must be uniform (`resample`).
+        The two passes have a gain of -6 dB at the cutoff. The time steps must be uniform (`resample`).
         """
         _positive("cutoff_hz", cutoff_hz, "Hz")
         steps, rate = self._steps(), self.rate_hz
@@ -241,19 +241,19 @@ class Recording:
         return out
 
     def acceleration(self) -> np.ndarray:
-        """Return the `derivative` of dq (T, n) rad/s^2; `resample` and `smooth` raw data first."""
+        """Return the acceleration (T, n) rad/s^2, the `derivative` of dq; `resample` and `smooth` raw data first."""
         return self.derivative(self.dq)
 
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        It repeats if, at some lag, at least 0.5 s recur within 0.01 rad RMS per joint while the arm moves by ten
-        times that. If the clock restarts, a trajectory may be a repetition: see `in_phase`.
+        Motion repeats if, at some lag, at least 0.5 s of it recur within 0.01 rad RMS over the joints, and a joint
+        moves about ten times as far. If the clock restarts, one trajectory may repeat another: see `in_phase`.
         """
         return self._period_and_clock()[0]
 
     def in_phase(self) -> "Recording":
-        """Return the recording with its `find_period`, and clocks shifted so that equal motion has equal phase.
+        """Return the recording with its period set, and clocks shifted so that equal motion has equal phase.
 
         A recording without a repetition is returned unchanged.
         """
@@ -267,7 +267,7 @@ class Recording:
             period, shift = find_period(tracks)
             if period is None:
                 continue
-            # a period of the log's clock may not hold for trajectories that were started by hand
+            # trajectories that were started by hand may not keep a period found on the log's clock
             if best is None or np.abs((shift + 0.5 * best) % best - 0.5 * best).max() > SPLIT_GUARD_S / 2:
                 best, clock = period, self.t.copy()
                 for track, late in zip(tracks, shift, strict=True):
@@ -278,21 +278,21 @@ class Recording:
     def overlap(self, training: "Recording") -> float:
         """Return the share (0 to 1) of this motion that also occurs in `training`; see `periodicity.overlap`.
 
-        Phases of little motion do not count, and the time of a motion does not matter.
+        Only pieces with enough motion count. It does not matter at which time a motion occurs.
         """
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
-        """Return (train, validation) without shared motion, about `validation_fraction` of the rows in validation.
+        """Return (train, validation), which share no motion; validation has about `validation_fraction` of the rows.
 
-        1. With a period (argument or attribute), validation is the last block of phase, `t` modulo the period, in
-           every repetition. A chronological split of a repeated excitation leaks: gaz2019 has a period of 13.33 s,
-           and its segment 1 partly repeats segment 0.
-        2. With several trajectories, validation is the last of them.
+        1. With a period (argument or attribute), validation is the end of every repetition: the largest phases, `t`
+           modulo the period. A chronological split would put repeated motion on both sides: gaz2019 has a period
+           of 13.33 s, and its segment 1 partly repeats segment 0.
+        2. With several trajectories, validation consists of the last trajectories.
         3. Otherwise validation is the end of the recording.
 
-        In 1 and 3 training loses the rows within 0.1 s of the validation block. Single rows between two cuts are
-        dropped.
+        In cases 1 and 3, rows within 0.1 s of validation rows are dropped from training. Single rows between two
+        cuts are dropped from both sides.
         """
         if not 0 < validation_fraction < 1:
             raise UserError(f"validation_fraction: expected a number in (0, 1), got {validation_fraction}")
@@ -326,15 +326,15 @@ class Recording:
         save_npz(path, self.arrays())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of the file, by name."""
+        """Return the arrays that `save` writes, by name."""
         period = {k: np.asarray(v) for k in ("period", "command_period") if (v := getattr(self, k)) is not None}
         own = {field: np.asarray(getattr(self, field)) for field in (*FIELDS, "torque", "name")}
         return {**own, **period, **self.signals}
 
     def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
-        """Return these rows (K,) with their trajectory index (K,); drop_lone: without trajectories of one row.
+        """Return a recording of these rows (K,) with this trajectory index (K,).
 
-        Consecutive rows share the memory of this recording: an hour of a log is large.
+        drop_lone removes trajectories of one row. Consecutive rows are views, because an hour of a log is large.
         """
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1
@@ -375,7 +375,7 @@ def declared_torque(torque: str | None) -> str:
 def _floats(field: str, value) -> np.ndarray:
     own = np.int64 if field == "trajectory" else np.float64
     if isinstance(value, np.ndarray) and value.dtype == own and not value.flags.writeable:
-        return np.ascontiguousarray(value)  # of another recording, or of a reader
+        return np.ascontiguousarray(value)  # an array of another recording, or of a reader, needs no copy
     try:
         return np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):

@@ -1,7 +1,7 @@
-"""Faults of logs that have one remedy: swapped and repeated rows, zero stamps, wrapped angles, held values.
+"""Repair faults of logs with only one remedy: swapped or repeated rows, zero stamps, wrapped angles, held values.
 
-Each repair returns what it changed and a line about it, which the recording keeps in its notes. Where several
-remedies are possible nothing is repaired, and `Recording` or the checks of an identification name the fault.
+Each repair also returns a line that describes it, for the notes of the recording. A fault with several possible
+remedies is not repaired; `Recording` or the checks of an identification report it.
 """
 
 from itertools import pairwise
@@ -10,19 +10,19 @@ import numpy as np
 
 Arrays = dict[str, np.ndarray]  # t (T,), trajectory (T,), q, dq, tau (T, n)
 
-MOST_SWAPPED = 10  # rows that a late row is out of its place; more are two interleaved logs
-JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: no joint moves so far in a row and back
-AWAY, MOST_FAILED = 10, 0.01  # rows in a row, and share of the rows, in which reading may fail
-FIRST_STEP = 100  # median steps from the stamp 0 to the first real one
-REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad: a wrapped joint jumps by a turn, and moves less than this in a row meanwhile
-SLACK = 0.05  # rad beyond the limits, as logs of arms at their limits have
-LEAST_HELD = 2.0  # rows for which a value is held, at least
-REGULAR = 0.8  # share of the holds of the same length, give or take a row: a coarse encoder's vary with speed
-MOVES = 0.2  # rad, of motion in which holds are counted, at least
+MOST_SWAPPED = 10  # most rows by which a row may be out of place; more indicate two interleaved logs
+JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: a step beyond all three, and back, is no motion
+AWAY, MOST_FAILED = 10, 0.01  # most successive rows, and share of all rows, in which reading q may fail
+FIRST_STEP = 100  # median steps: the first real stamp is farther than this from 0
+REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad: a wrapped angle jumps by a revolution plus or minus its motion, below NEAR
+SLACK = 0.05  # rad, by which logs of arms at their limits may exceed them
+LEAST_HELD = 2.0  # least number of rows for which a value is held
+REGULAR = 0.8  # least share of holds with equal length (give or take a row); a coarse encoder's vary with speed
+MOVES = 0.2  # rad, least motion over which holds are judged
 
 
 def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
-    """Return the rows in order, without zero stamps, repeated rows and an incomplete last row; a line for each."""
+    """Return the rows sorted by time, without zero stamps, repeated, failed or incomplete rows; a line per repair."""
     notes: list[str] = []
     whole = all(x.dtype.kind in "iuf" and len(x) == len(arrays["t"]) for x in arrays.values())
     if not whole or arrays["t"].ndim != 1 or len(arrays["t"]) < 3:
@@ -52,7 +52,7 @@ def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
 
 
 def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the rows (T,) of up to AWAY in which a joint's q jumps away and back, as where reading it failed."""
+    """Return a mask (T,) of the rows whose q was misread: a joint jumps away, and back within AWAY rows."""
     out, fast = np.zeros(len(q), dtype=bool), FASTEST * np.maximum(np.diff(t), 0.0)
     for x in q.T:  # one joint at a time: an hour of a log is large
         step = np.abs(np.diff(x))
@@ -65,7 +65,7 @@ def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _order(arrays: Arrays) -> np.ndarray | None:
-    """Return the order (T,) in which the time of each trajectory increases, or None if no rows are swapped."""
+    """Return the order (T,) that sorts each trajectory by time; None if it is sorted or a row is too far off."""
     t, index = arrays["t"], arrays.get("trajectory", np.zeros(len(arrays["t"])))
     run = np.concatenate([[0], np.cumsum(np.diff(index) != 0)])
     if not np.any((np.diff(t) < 0) & (np.diff(run) == 0)):
@@ -75,9 +75,9 @@ def _order(arrays: Arrays) -> np.ndarray | None:
 
 
 def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Arrays, list[str]]:
-    """Return the rows with joints that jump by a turn continued beyond it, within each trajectory.
+    """Return the arrays with q continued across jumps by a revolution, per trajectory, and a line per repair.
 
-    limits: (low, high) (n,) rad; a joint beyond them is turned into them where whole turns can do it.
+    limits: (low, high) (n,) rad each. A trajectory of a joint beyond them is shifted if revolutions bring it inside.
     """
     q, index = arrays["q"], arrays.get("trajectory")
     if q.ndim != 2 or q.dtype.kind not in "iuf" or len(q) != len(arrays["t"]):
@@ -104,7 +104,7 @@ def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) 
 
 
 def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Return q (T, n) with whole turns added to trajectories beyond the limits, and the joints that have some."""
+    """Return q (T, n) with trajectories beyond the limits shifted by revolutions, and the list of shifted joints."""
     if (q.min(0) >= low - SLACK).all() and (q.max(0) <= high + SLACK).all():
         return q, []
     out, turned = q.copy(), set()
@@ -121,16 +121,16 @@ def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -
 
 
 def held(t: np.ndarray, q: np.ndarray, dq: np.ndarray, stretches: list[slice]) -> np.ndarray | None:
-    """Return a mask (T,) of the rows in which held values change, or None if each row has its own.
+    """Return a mask (T,) of the rows with new values if the log holds each value over several rows, else None.
 
-    A log of 1 kHz may repeat what arrives at 30 Hz. Such holds have one length while the arm moves, at any speed.
+    A log at 1 kHz may repeat values that arrive at 30 Hz. While the arm moves, holds are equally long at any speed.
     """
     new = np.ones(len(t), dtype=bool)
     lengths, moved = [], 0.0
     for s in stretches:
         change = (q[s][1:] != q[s][:-1]).any(1) | (dq[s][1:] != dq[s][:-1]).any(1)
         new[s] = np.concatenate([[True], change])
-        if 1.5 * new[s].sum() * LEAST_HELD > 2 * len(change):  # most rows have values of their own
+        if 1.5 * new[s].sum() * LEAST_HELD > 2 * len(change):  # most rows have new values
             return None
         at = np.flatnonzero(new[s])
         travel = np.abs(np.diff(q[s][at], axis=0)).max(1, initial=0.0)

@@ -13,9 +13,9 @@ Table = dict[str, np.ndarray]  # column name -> (T,) or (T, n)
 Layouts = dict[tuple[str, ...], list[int] | None]  # names in a message -> indices of the robot's joints; None: all
 
 BAGS = (".bag", ".db3", ".mcap")
-TYPES = ("JointState", "FrankaRobotState", "FrankaState")  # of sensor_msgs and franka_msgs
+TYPES = ("JointState", "FrankaRobotState", "FrankaState")  # message types of sensor_msgs and franka_msgs
 CYCLE = 1e-3  # s, control cycle of a Franka arm
-MAX_LATENESS_NS = 10**9  # ns, a message of a network arrives at most so late; a larger step back is a clock restart
+MAX_LATENESS_NS = 10**9  # ns, largest delay of a network message; a larger step back is a clock restart
 
 
 def is_bag(path: Path) -> bool:
@@ -32,7 +32,7 @@ def libfranka_table(table: Table) -> Table:
     if not {"time", "success_rate", "state.q[0]"} <= table.keys():
         return table
     time = table["time"]
-    numeric = time.dtype.kind in "iuf"  # `readers` reports a column of text by its name
+    numeric = time.dtype.kind in "iuf"  # text stays as it is: `readers` reports its column by name
     t = time * CYCLE if numeric else time
     found = {"t": t}
     for field, name in (("q", "state.q"), ("dq", "state.dq"), ("tau_J", "state.tau_J"), ("tau_J_d", "cmd.tau_J_d")):
@@ -47,7 +47,7 @@ def libfranka_table(table: Table) -> Table:
 def rostopic_table(table: Table) -> Table:
     """Add t, q, dq, tau and joint_names to a JointState log of `rostopic echo -p`; return other tables unchanged.
 
-    Its stamps are in ns; `field.name0` and so on hold the names, which some drivers sort by the alphabet.
+    The stamps of such a log are in ns. The columns `field.name0` ... contain the joint names; some drivers sort them.
     """
     fields = {"q": "field.position", "dq": "field.velocity", "tau": "field.effort"}
     stamp = table.get("field.header.stamp")
@@ -69,11 +69,11 @@ def _last_number(name: str) -> int:
 
 
 def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-    """Return the command (T, n) Nm that was sent in the cycle of each row, from the logged commands.
+    """Return the command (T, n) Nm that was sent in response to the state of each row, from the logged tau_J_d.
 
-    A Franka state at t (T,) s holds the command of the cycle before; in a recording (`r2s.arm.recorder`) the command
-    follows the state. So the result is tau_J_d one cycle later, interpolated if the log is slower than the arm; the
-    last row is kept.
+    A Franka state at t (T,) s contains the command of the previous cycle. A `Recording` (`r2s.arm.recorder`) pairs a
+    state with the command that follows it. So the result is tau_J_d of one cycle later, interpolated if the log is
+    slower than the arm. The last row keeps its own command, because no later one is known.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
 
@@ -97,13 +97,13 @@ def bag_table(
 ) -> Table:
     """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) of one topic of a bag.
 
-    t counts from the first message, by header stamps, or by bag time if all stamps are zero. Messages without one of
-    the joints (a gripper on the same topic) are ignored, late ones sorted, repeated ones dropped. The scalar
-    `reader_note` counts messages that were left out: with a stamp of 0, or without values at the start.
+    t starts at the first message. It comes from header stamps, or from bag time if all stamps are zero. Messages
+    without all joints (of a gripper on the same topic) are ignored, late ones sorted, repeated ones dropped. The
+    scalar `reader_note` counts left-out messages: those with stamp 0, and those at the start without values.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap, or the folder of a ROS 2 bag.
-        topic: of sensor_msgs/JointState, franka_msgs/FrankaState or FrankaRobotState; None: the only such topic.
+        topic: its type is sensor_msgs/JointState, franka_msgs/FrankaState or FrankaRobotState; None: the only one.
         joints, model_joints, n_joints: see `choose_joints`.
 
     Raises:
@@ -112,7 +112,7 @@ def bag_table(
     topic, samples = _read(path, topic)
     kept, pick = _pick_joints(topic, samples, joints, model_joints, n_joints)
     table = {field: _stack(topic, kept, field, pick) for field in kept[0].values}
-    table = {field: x for field, x in table.items() if x.size and not np.isnan(x).all()}  # ROS 2: NaN is absent
+    table = {field: x for field, x in table.items() if x.size and not np.isnan(x).all()}  # ROS 2: NaN means absent
     if "q" not in table or not {"tau", "tau_J", "tau_J_d"} & table.keys():
         missing = "position" if "q" not in table else "effort"
         raise UserError(f"expected position and effort in the messages on '{topic}', got no {missing}")
@@ -129,7 +129,7 @@ def bag_table(
     stamp, table = _in_order(stamp[use], {field: x[use] for field, x in table.items()})
     if notes:
         table["reader_note"] = np.array("; ".join(notes))
-    table["t"] = (stamp - stamp[0]) * 1e-9  # integer difference: an epoch in seconds has a resolution of 0.2 us
+    table["t"] = (stamp - stamp[0]) * 1e-9  # subtracts integers: as floats, seconds since 1970 resolve only 0.2 us
     if "tau_J_d" in table:
         table["tau_J_d"] = shift_command(table["t"], table["tau_J_d"])
     return table
@@ -140,9 +140,9 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    Messages may order joints differently: some ROS 2 drivers sort the names, others do not. The rules, in turn:
-    `joints` as given; `model_joints`, if each occurs once (also behind a prefix: panda_joint1); n names that differ
-    in one number, sorted by it; the first n names, but only without `model_joints`.
+    Messages may order joints differently: some ROS 2 drivers sort the names, others do not. The first rule that
+    applies counts: `joints` as given; `model_joints`, if each occurs once (perhaps with a prefix: panda_joint1); n
+    names that differ in one number, sorted by it; the first n names, if n is 1 or there are no `model_joints`.
 
     Args:
         logged: names in the messages.
@@ -185,7 +185,7 @@ def choose_joints(
 
 
 def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
-    """Return a topic and its messages."""
+    """Return the topic that was read, and its messages."""
     rosbag1, rosbag2 = (optional_import(f"rosbags.rosbag{k}", "reading this file", "recordings") for k in (1, 2))
     try:
         # only this topic is decoded: others may have unknown message types
@@ -205,7 +205,7 @@ def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
 
 
 def _pick_topic(connections: Sequence[Any], topic: str | None) -> tuple[str, list[Any]]:
-    """Return a topic and its connections."""
+    """Return the topic to read (None: the only readable one), and its connections."""
     types = {c.topic: c.msgtype.replace("/msg/", "/") for c in connections}
     readable = [t for t, kind in types.items() if kind.rsplit("/")[-1] in TYPES]
     listed = choices(f"{t} ({kind})" for t, kind in types.items()) or "none"
@@ -272,7 +272,7 @@ def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _pick_joints(topic: str, samples: list[Sample], joints, model_joints, n_joints) -> tuple[list[Sample], Layouts]:
-    """Return the messages with all joints of the robot, and the indices of these joints."""
+    """Return the messages with all joints of the robot, and {names in a message: indices of these joints}."""
     layouts = dict.fromkeys(s.names for s in samples)
     logged = list(dict.fromkeys(name for names in layouts for name in names))
     if not logged:
@@ -307,7 +307,7 @@ def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.n
 
 
 def _in_order(stamp: np.ndarray, table: Table) -> tuple[np.ndarray, Table]:
-    """Sort late messages and drop repeated ones; `Recording` reports a clock that restarted."""
+    """Sort late messages and drop repeated ones; leave a restarted clock as it is, for `Recording` to report."""
     if len(stamp) < 2 or np.diff(stamp).min() < -MAX_LATENESS_NS:
         return stamp, table
     order = np.argsort(stamp, kind="stable")

@@ -19,7 +19,7 @@ from r2s.recordings.recording import Recording
 
 START_NS = 10**9  # ns, stamp of the first row: readers take a stamp of 0 for a missing one
 PAUSE_NS = 10**9  # ns, between trajectories: longer than any data.max_gap_s in use
-TF_PERIOD = 0.02  # s, at least, between the frames of tf: 50 Hz suffice to look at
+TF_PERIOD = 0.02  # s, period of /tf: 50 Hz suffice for viewing
 BASE = "base"  # the frame of the robot's base, as in r2s's URDF
 TOPICS = {
     "/joint_states": "sensor_msgs/msg/JointState",
@@ -32,7 +32,7 @@ Message = tuple[int, str, Any]  # ns, topic, message
 
 
 def stamps(recording: Recording) -> np.ndarray:
-    """Return the stamp (T,) ns of each row: t of each trajectory, with a pause between trajectories."""
+    """Return the stamp (T,) ns of each row, on one clock: trajectories follow each other with pauses between them."""
     out, begin = np.empty(len(recording.t), dtype=np.int64), START_NS
     for s in recording.stretches:
         t = recording.t[s]
@@ -54,11 +54,11 @@ def write_mcap(
     given; /tf, the links at 50 Hz or less; /robot_description, the URDF, latched.
 
     Args:
-        robot, dynamics: of the URDF. recording: of this robot. reference: t (T,) s, q, dq, ddq (T, n) of the planned
+        robot, dynamics: for the URDF. recording: of this robot. reference: t (T,) s, q, dq, ddq (T, n) of the planned
             motion, which begins with the recording.
 
     Raises:
-        UserError: rosbags is not installed, or the recording is of another number of joints.
+        UserError: rosbags is not installed, or robot and recording differ in their number of joints.
     """
     optional_import("rosbags", str(path), "recordings")
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -100,7 +100,7 @@ def write_mcap(
 
 
 class _Messages:
-    """Messages of ROS 2 with their times; `types` are the classes of a rosbags typestore."""
+    """Makes ROS 2 messages with their stamps; `types` are the message classes of a rosbags typestore."""
 
     def __init__(self, types: Mapping[str, Any]):
         self._types = types
@@ -129,7 +129,7 @@ class _Messages:
         ]
 
     def frames(self, recording: Recording, ns: np.ndarray, links: list[Link]) -> list[Message]:
-        """Return the frame of each link in the link before it, as in the URDF."""
+        """Return the pose of each link in the frame of its parent link, as in the URDF."""
         transform, stamped, message = (
             self._types[x]
             for x in ("geometry_msgs/msg/Transform", "geometry_msgs/msg/TransformStamped", TOPICS["/tf"])
@@ -167,7 +167,7 @@ class _Messages:
 
 
 def layout(n: int, topics: set[str]) -> dict[str, Any]:
-    """Return a Foxglove layout: the frames in 3D beside plots of position, velocity, effort and, if there, wrench."""
+    """Return a Foxglove layout: the frames in 3D beside plots of position, velocity, effort and, if any, wrench."""
     paths = {
         f"Plot!{field}": [f"/joint_states.{field}[{j}]" for j in range(n)]
         for field in ("position", "velocity", "effort")

@@ -9,14 +9,14 @@ from r2s.errors import UserError
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-HALF_S = 0.02  # s, half window of the Savitzky-Golay cubic: position noise of 1e-5 rad leaves 3e-4 rad/s
-MAX_HALF_S = 0.05  # s, half window of coarse recordings: at 80 Hz the slope of a swing of 2 Hz is off by 0.04 %
+HALF_S = 0.02  # s, half window of the Savitzky-Golay cubic; position noise of 1e-5 rad then causes 3e-4 rad/s
+MAX_HALF_S = 0.05  # s, largest half window: at 80 Hz the slope of a 2 Hz oscillation then errs by 0.04 %
 PIECE_S = 0.05  # s, length of the pieces among which the calm ones are chosen
-CALM = 0.1  # share of the pieces that counts: those with the smallest acceleration
-LONGEST_S = 600.0  # s of a recording that are used
+CALM = 0.1  # share of the pieces that are used: those with the smallest acceleration
+LONGEST_S = 600.0  # s, longest part of a recording that is used
 MAX_NOISE = 1.0  # rad/s, more than any velocity sensor adds
 MIN_ROWS = 8  # samples that a cubic needs to give a velocity
-UNEVEN = 0.25  # of the median step: a step that differs by more ends a piece, as where a sample was lost
+UNEVEN = 0.25  # share of the median step; a step that differs by more, as after a lost sample, ends a piece
 
 
 def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
@@ -24,10 +24,10 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
 
     The reference velocity is the slope of a cubic through the positions (Savitzky and Golay, Analytical Chemistry
     36(8), 1964). At low acceleration that slope is accurate, and a delay of the velocity filter has no effect. So the
-    result is the median over the calmest tenth of all 50 ms pieces, selected by the positions instead of dq.
+    result is the median over the tenth of all 50 ms pieces with the least acceleration, judged by q instead of dq.
 
     Raises:
-        UserError: a joint has more than MAX_NOISE, so dq is not the velocity of q.
+        UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.
     """
     found: list[tuple[np.ndarray, np.ndarray]] = []
     joints = recordings[0].n_joints

@@ -1,4 +1,4 @@
-"""report.md and report.html of the same sections: paragraphs, bullets, tables and pictures."""
+"""Write report.md and report.html from the same sections: paragraphs, bullets, tables and pictures."""
 
 import os
 from base64 import b64encode
@@ -18,7 +18,7 @@ def doubtful(cell: str) -> bool:
 
 
 def report_markdown(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
-    """Write report.md from {heading: items}; the first heading is the title, links to figures are relative."""
+    """Write report.md from {heading: items}; the first heading is the title; links to figures are relative."""
     lines: list[str] = []
     for i, (heading, items) in enumerate(sections.items()):
         lines += [f"{'#' if i == 0 else '##'} {heading}", ""]
@@ -100,7 +100,7 @@ PAGE = """\
 
 
 def report_html(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
-    """Write report.html as one file with its pictures; it has no script and loads nothing."""
+    """Write report.html as one file with embedded pictures, without scripts or external resources."""
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
     parts = [(heading, [_for_template(item) for item in items]) for heading, items in sections.items()]
     path.write_text(page.render(sections=parts, style=STYLE, doubtful=doubtful), encoding="utf-8")

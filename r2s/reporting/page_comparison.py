@@ -1,6 +1,6 @@
-"""Two versions of a page of benchmarks/results: which cells of its tables differ, and whether by more than intervals.
+"""Compare the table cells of two versions of a page of benchmarks/results, also by the intervals in the cells.
 
-A cell is found by section, row and column, so that added rows and changed paragraphs do not matter.
+Cells are matched by section, row and column, so that added rows and changed paragraphs do not matter.
 """
 
 import re
@@ -17,7 +17,7 @@ Cell = tuple[str, str, str]  # section, row, column
 
 
 def table_cells(page: str) -> dict[Cell, str]:
-    """Return {(section, row, column): cell} of the tables of a markdown page; equal names get a number."""
+    """Return {(section, row, column): cell} of the tables of a markdown page; repeated names are numbered."""
     cells: dict[Cell, str] = {}
     for section, head, rows in _tables(page):
         columns, names = _numbered(head), _numbered([row[0] for row in rows])
@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Return a page whose tables keep their heads only, so that tables which are not made again stay empty."""
+    """Return the page without the rows of its tables, so that a table that is not made again has only its head."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -40,8 +40,8 @@ def without_rows(page: str) -> str:
 def compare_pages(before: str, now: str) -> pd.DataFrame:
     """Return a row (section, row, column, committed, now, verdict, change) per cell of either page.
 
-    verdict is one of VERDICTS; "last digit": each number by at most one unit of its last digit. A cell with intervals
-    differs if one of them does not overlap with its successor.
+    verdict is one of VERDICTS. "last digit": each number differs by at most one unit of its last digit. "beyond
+    intervals": at least one interval of the cell does not overlap with its new version.
     change is the largest relative change of a number of the cell; NaN where the numbers cannot be paired.
     """
     old, new = table_cells(before), table_cells(now)
@@ -54,7 +54,7 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
 
 
 def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
-    """Return `compare_pages` of {page: text}, joined; of several, a section begins with its page."""
+    """Return `compare_pages` of all {page: text} in one table; with several pages, sections begin with the page."""
     parts = []
     for page, text in before.items():
         cells = compare_pages(text, now[page])
@@ -77,7 +77,7 @@ def _tables(page: str) -> Iterator[tuple[str, list[str], list[list[str]]]]:
 
 
 def _numbered(names: list[str]) -> list[str]:
-    """Return names of which the second of equal ones ends with (2)."""
+    """Return the names with repeated ones numbered: the second of equal names ends with (2)."""
     seen: Counter[str] = Counter()
     numbered = []
     for name in names:

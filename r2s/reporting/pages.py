@@ -26,7 +26,7 @@ PREDICTED = "predicted: simulation with the training's model without randomizati
 
 
 def training(run: Run, robot: Robot) -> None:
-    """Draw the learning curves of a training."""
+    """Draw the learning curves of a training and write its recording.rrd."""
     measures = measures_of(run.folder)
     curves = {run.folder.name: pd.read_csv(run.folder / "evaluations.csv")}
     learning = learning_figure(run.figure("learning"), curves, [measures[key] for key in measures.curves])
@@ -44,12 +44,12 @@ def transfer(
     stops: Sequence[Stop] = (),
     halted: str | None = None,
 ) -> None:
-    """Save all episodes and the second before each stop; show four episodes; write the report.
+    """Save all episodes and the last second before each stop; draw four episodes; write the report.
 
     Args:
-        run, robot: of the transfer. episodes, rows: {simulator or arm: episodes, or their measures}.
-        torque: (n,) Nm, the policy's torque limits. timing: of the arm's cycles, None without an arm.
-        stops: reasons of the arm's stops. halted: why the arm did not run all episodes, or None.
+        run, robot: of the transfer. episodes: {simulator or arm: its episodes}. rows: {the same: their measures}.
+        torque: (n,) Nm, the policy's torque limits. timing: of the arm's cycles; None without an arm.
+        stops: stops of the arm, with their reasons. halted: why the arm did not run all episodes, or None.
     """
     measures = measures_of(run.folder)
     shown = {label: first(e) for label, e in episodes.items()}
@@ -100,7 +100,7 @@ def pipeline(
     transferred: Mapping[str, Path],
     rows: Mapping,
 ) -> MeasureTable:
-    """Write one recording and one report of the whole chain; return its measure table.
+    """Write one recording.rrd and one report of the whole pipeline; return the measure table of its task.
 
     Args:
         run, robot: of the pipeline. identified: run folder. trained, transferred: {label: run folder}.

@@ -16,12 +16,12 @@ from r2s.runs import status_of
 
 LOST = ("failed", "killed")
 COLUMNS = ["status", "age", "result"]
-LONGEST = 46  # letters of a run's name in a terminal; the time at its beginning tells runs apart
-LEAST = 20  # letters of a result
+LONGEST = 46  # most letters of a run's name in a terminal; names begin with the time, which distinguishes runs
+LEAST = 20  # fewest letters to which a result is cut
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
-    """Return a row of strings per run folder below `root`, the youngest last.
+    """Return a row of strings per run folder below `root`, the newest last.
 
     Args:
         root: parent of <stage>/<name>. stage: only runs of this stage. failed: only failed or killed runs.
@@ -43,7 +43,7 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
 
 
 def print_runs(console: Console, runs: pd.DataFrame, title: str) -> None:
-    """Print `run_rows`, one line each: cut at the width of a terminal, whole in a file or pipe."""
+    """Print `run_rows`, one line each, cut to the width of a terminal but complete in a file or pipe."""
     rows = [("run", *runs.columns), *((str(name), *map(str, row)) for name, row in runs.iterrows())]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     if console.is_terminal:
@@ -67,7 +67,7 @@ def ago(seconds: float) -> str:
 
 
 def _result(folder: Path, meta: Mapping[str, Any]) -> str:
-    """Return the key figures of a run; of an unfinished run its progress or its error."""
+    """Return the key figures of a finished run, or the error or progress of another."""
     summary = folder / "summary.json"
     try:
         if summary.is_file():
@@ -106,7 +106,7 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
         count = len({row[name] for row in summary[what]})
         return f"{count} {'groups of runs' if what == 'scores' else 'adapters'} compared"
     rows = summary["reach"] if stage == "pipeline" else summary
-    if stage == "pipeline":  # the arm, for which it was done
+    if stage == "pipeline":  # only the arm, which is the goal of a pipeline
         rows = {where: row for where, row in rows.items() if not where.endswith((", mujoco", ", predicted"))}
     table = measures_of(folder)
     measure = table[table.transfer[0]]

@@ -30,7 +30,7 @@ def diagnostic_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.D
 
 
 def _table(columns: Sequence[Measure], rows: Mapping[str, Mapping], corner: str, decimals: int) -> pd.DataFrame:
-    """Return the cells with at least this many decimals."""
+    """Return a table of these columns; numbers have at least `decimals` decimals."""
     cells = {
         _counted(label, row): {m.column: m.cell(row.get(m.key), max(decimals, m.digits)) for m in columns}
         for label, row in rows.items()
@@ -45,7 +45,7 @@ def _counted(label: str, row: Mapping) -> str:
 
 
 def scores_rows(measures: MeasureTable, scores: pd.DataFrame) -> pd.DataFrame:
-    """Return a row per group of a `summary_table`: interquartile mean over [95 % interval] if it has two seeds."""
+    """Return a row per group of a `summary_table`: interquartile mean and, with two seeds or more, 95 % interval."""
     out: dict[str, dict[str, str]] = {}
     for r in scores.to_dict("records"):
         m = measures[r["measure"]]
@@ -63,7 +63,7 @@ def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, 
 def print_table(
     console: Console, frame: pd.DataFrame, title: str, caption: str | None = None, sentences: bool = False
 ) -> None:
-    """Print a table of strings: of numbers, of which uncertain ones are dimmed, or of sentences."""
+    """Print a table of strings: either sentences, or numbers, of which uncertain ones are dimmed."""
     how = {"title_justify": "left", "caption_justify": "left", "padding": (0, 1, 0, 0)}
     table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **how)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))

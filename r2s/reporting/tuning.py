@@ -1,4 +1,4 @@
-"""Report of stage=tune: trials, and the best so far against a grid at equal compute."""
+"""Report of stage=tune: trials, and the best value so far compared with that of a grid at equal compute."""
 
 from collections.abc import Sequence
 from glob import glob
@@ -14,7 +14,7 @@ from r2s.reporting.document import Item, report_markdown
 from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
-ORDERS = 2000  # random orders of a grid: its mean then varies by 1 / 45 of the spread over orders
+ORDERS = 2000  # random orders of a grid: the mean over them then varies by 1 / 45 of their spread
 SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # of the search's compute
 
 
@@ -32,9 +32,9 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) after each compute `at` (K,) s of trials that run one after another.
+    """Return the best value (K,) of trials that run one after another, after `at` (K,) s of compute.
 
-    A trial counts from its end; a nan trial (pruned, failed) only uses compute. sign: 1 if larger is better, else -1.
+    A trial counts from its end; a nan (pruned, failed) only spends compute. sign: 1 if larger is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))
@@ -43,7 +43,7 @@ def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray,
 
 
 def read_grid(against: str, measure: str) -> list[Trained]:
-    """Return the finished trainings of a glob that log a measure.
+    """Return the finished trainings that match a glob and have this measure.
 
     Raises:
         UserError: there is none.
@@ -58,7 +58,7 @@ def read_grid(against: str, measure: str) -> list[Trained]:
 
 
 def against_table(trials: pd.DataFrame, measure: str, against: str | None, larger: bool) -> pd.DataFrame | None:
-    """Return the best so far of the search and of a grid at `SHARES` of the search's compute.
+    """Return the best values that search and grid reach within `SHARES` of the search's compute; None without a grid.
 
     The grid's value is the mean over `ORDERS` random orders of its jobs, because its order is arbitrary.
 
@@ -72,7 +72,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     sign = 1.0 if larger else -1.0
     at = np.array(SHARES) * trials["wall_clock_s"].sum()
     searched = best_so_far(trials["wall_clock_s"].tolist(), trials["value"].tolist(), at, sign)
-    # the last evaluation, as for a trial: the summary is of other goals
+    # the last evaluation counts, as for a trial; summary.json is of other goals
     spent, values = (np.array([r.curve[k].iloc[-1] for r in grid]) for k in ("wall_clock_s", measure))
     rng = np.random.default_rng(0)
     orders = [rng.permutation(len(grid)) for _ in range(ORDERS)]
@@ -84,7 +84,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
 
 
 def tuning_page(run: Run, trials: pd.DataFrame, against: pd.DataFrame | None, measure: str) -> None:
-    """Write report.md with a figure of all trials and the best so far."""
+    """Write report.md with a figure of all trials and of the best values so far."""
     ended = trials[trials["state"] == "complete"]
     spent = trials["wall_clock_s"].cumsum() / 60
     path = run.figure("tune")

@@ -18,20 +18,20 @@ from r2s.reporting.viewer.layout import log_series, rgb
 DRAWN_HZ = 100.0
 FORCES = [f"force_{c}_N" for c in "xyz"]
 FRANKA = "Franka's O_F_ext_hat_K"
-METRES = 0.01  # of the arrow per N
+METRES = 0.01  # m, length of the arrow per N
 CONE = 24  # points of the cone's edge
 TOUCH, NONE = "#cc0018", "#7f8790"
 
 
 def force_of(wrench: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return force and half widths of its 95 % intervals (T, 3) N of a table of `observe_recording`."""
+    """Return the force and half widths of its 95 % intervals, (T, 3) N each, from a table of `observe_recording`."""
     return wrench[FORCES].to_numpy(), wrench[[f"{name}_half" for name in FORCES]].to_numpy()
 
 
 def franka_force(recording: Recording) -> np.ndarray | None:
-    """Return the force (T, 3) N on the arm by the arm's own estimate, None if the recording has none.
+    """Return the arm's own estimate of the force (T, 3) N on it, None if the recording has none.
 
-    O_F_ext_hat_K has the sign of what the arm exerts.
+    The sign is reversed: O_F_ext_hat_K is the force that the arm exerts.
     """
     own = recording.signals.get("O_F_ext_hat_K")
     return None if own is None or not own.any() else -own[:, :3]
@@ -59,7 +59,7 @@ def draw_wrench(path: Path, wrench: pd.DataFrame, recording: Recording, contacts
 
 
 def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, wrench: pd.DataFrame) -> None:
-    """Log the moving arm, its force as an arrow with a cone of 95 % at the tip, and Franka's own estimates."""
+    """Log the moving arm, the force on it as an arrow with a 95 % cone at the tip, and Franka's own estimates."""
     rows = at_rate(recording.t, FRAMES_HZ)
     t, index = recording.t[rows], [rr.TimeColumn("time", duration=recording.t[rows])]
     log_moving_robot(stream, robot, "arm", colours(["estimate"])["estimate"], t, recording.q[rows])
@@ -84,9 +84,9 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 
 
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
-    """Return lines of the cone in which the force's direction lies: its edge, and four lines to the tip.
+    """Return lines of the 95 % cone of the force's direction: its edge, and four lines from the tip to the edge.
 
-    Its edge is the ellipsoid with half axes `half`, projected along the force.
+    The edge is the ellipsoid with half axes `half`, projected along the force.
     """
     size = max(float(np.linalg.norm(force)), 1e-9)
     across = np.linalg.svd(force[None] / size)[2][1:]

@@ -1,4 +1,4 @@
-"""The adapter of conf/adapt, made with the identified model of the arm."""
+"""Make the adapter of conf/adapt with the identified model of the arm."""
 
 import filecmp
 from dataclasses import replace
@@ -8,14 +8,14 @@ from r2s.errors import UserError
 from r2s.stages.build import part, plain
 from r2s.stages.run_config import checked, loaded, modules
 
-RECORDINGS = ("train.npz", "validation.npz")  # of an identification
+RECORDINGS = ("train.npz", "validation.npz")  # files of an identification that recorded an arm
 PARAMETERS = "parameters.yaml"
 TORQUE = "commanded"  # adapters compare the commanded torque with the motion
-BESIDE = ("calibration",)  # key of conf/adapt that is no argument of the adapter
+BESIDE = ("calibration",)  # keys of conf/adapt that are no arguments of the adapter
 
 
 def calibrated(calibration, robot, trust=()):
-    """Return the identified dynamics, and posterior draws and recordings without a payload, each None if missing."""
+    """Return identified dynamics, (space, posterior draws) or None, and recordings without payload or None."""
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
 
@@ -29,9 +29,9 @@ def calibrated(calibration, robot, trust=()):
 
 
 def free_recordings(calibration):
-    """Return the recordings without contact that an identification was made from, if they still exist.
+    """Return the recordings without contact from which the arm was identified, if they still exist.
 
-    They are read as stage=identify read them. Recordings that give no contact threshold are left out, with a line.
+    They are read as in stage=identify. If they cannot give a contact threshold, print why and return [].
     """
     from r2s.adaptation.wrench import unfit_for_threshold
     from r2s.recordings.readers import read
@@ -52,10 +52,10 @@ def free_recordings(calibration):
 
 
 def _given_recordings(folder):
-    """Return the recordings of commanded torque in the files of a run of stage=identify, without a payload.
+    """Return the user's recordings of a run of stage=identify that have commanded torque and no payload.
 
     Raises:
-        UserError: a file cannot be read as the run's config says.
+        UserError: a file cannot be read with the settings of the run's config.
     """
     from omegaconf import OmegaConf
 
@@ -75,7 +75,7 @@ def _given_recordings(folder):
 
 
 def with_declared_payload(cfg, robot, dynamics):
-    """Return the dynamics with arm.declared_payload in the gravity compensation."""
+    """Return the dynamics of an arm whose gravity compensation includes arm.declared_payload."""
     from r2s.physics.payload import mass_and_moment, payload_of
 
     if not (value := plain(cfg.arm).get("declared_payload")):
@@ -85,12 +85,12 @@ def with_declared_payload(cfg, robot, dynamics):
 
 
 def make_adapter(cfg, robot, source):
-    """Return the adapter of conf/adapt under the policy of the run folder `source`, or None for adapt=none.
+    """Return the adapter of conf/adapt for the policy of the run folder `source`, or None for adapt=none.
 
-    Its model is adapt.calibration=, or the one the policy was trained on.
+    The adapter's model is that of adapt.calibration=, or the one on which the policy was trained.
 
     Raises:
-        UserError: no arm, no identified model, or a model identified from another torque than the commanded one.
+        UserError: no arm, no identified model, or a model that was not identified from commanded torque.
     """
     from r2s.adaptation.adapters import AdapterContext
 
@@ -111,9 +111,9 @@ def make_adapter(cfg, robot, source):
 
 
 def calibration_of(cfg, source):
-    """Return the run folder with the adapter's model: adapt.calibration, or the one of the policy's training.
+    """Return the run folder with the adapter's model: adapt.calibration, or the calibration of the policy's training.
 
-    A training keeps the model without the recordings; the identification's own folder has both, if it still exists.
+    Prefer the identification's own folder, which has recordings, to the copy of its model in the training's folder.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)
@@ -132,5 +132,5 @@ def calibration_of(cfg, source):
 
 
 def run_folder(path):
-    """Return the run folder, from its path or that of a file in it."""
+    """Return the run folder whose path, or the path of a file in it, is given."""
     return Path(path) if Path(path).is_dir() else Path(path).parent

@@ -14,17 +14,17 @@ from r2s.errors import FAILED, Stopped, UserError, check_number, choices, instea
 from r2s.stages.parts import called, check_types, part, plain, target
 from r2s.stages.run_config import CONF, modules
 
-DRIVE_KEYS = ("soft_start_s", "live")  # of conf/arm; the policy runner reads them, not the arm
+DRIVE_KEYS = ("soft_start_s", "live")  # keys of conf/arm that the policy runner reads, not the arm
 STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "estimate", "excite", "results")
 COMMON = (
     *("stage", "root", "name", "skip_completed", "resume", "experiment", "grid", "seed", "threads", "tracker"),
     "trust",
 )
-GROUP = "R2S_GROUP"  # environment variable: name that the jobs of a sweep share in trackers
+GROUP = "R2S_GROUP"  # environment variable: name of the group of a sweep's jobs in trackers
 
 
 def unread(name: str, cfg: Any) -> str | None:
-    """Return why the stage of `cfg` does not read the key or group `name`; None if it does."""
+    """Return why the stage of `cfg` does not read the key or group `name`, or None if it reads it."""
     from importlib import import_module
 
     stage = import_module(f"r2s.stages.{cfg.stage}")
@@ -55,7 +55,7 @@ def make_robot(cfg):
 
 
 def make_dynamics(cfg, robot):
-    """Return the dynamics of conf/friction and conf/inertia, or those that `calibration=` identified."""
+    """Return the dynamics of conf/friction and conf/inertia, or the identified ones of `calibration=`."""
     from r2s.identification.parameter_file import load_parameters
 
     if cfg.calibration:
@@ -66,7 +66,7 @@ def make_dynamics(cfg, robot):
 
 
 def dynamics_of(robot, friction, inertia):
-    """Return the dynamics of a file of conf/friction and a file of conf/inertia."""
+    """Return the dynamics from the settings of a file of conf/friction and a file of conf/inertia."""
     from r2s.physics.dynamics import nominal_dynamics
 
     for group, settings in (("friction", friction), ("inertia", inertia)):
@@ -79,15 +79,15 @@ def dynamics_of(robot, friction, inertia):
 
 
 def make_task(cfg, robot, dynamics, safety=None):
-    """Return the task of conf/task with the model of the arm, the controller of conf/control and `safety`.
+    """Return the task of conf/task with the model of the arm, the controller of conf/control and the safety limits.
 
-    safety: settings of a later run, which replace the config's.
+    safety: settings of a later run, such as a transfer, which replace those of the config; None: no later run.
     """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items() if k != "_target_"}
     task = called(target(cfg.task, "task"), "task", settings).with_model(robot, dynamics)
-    if "_target_" in cfg.control:  # not of control=default: the task's own
+    if "_target_" in cfg.control:  # control=default keeps the task's own controller
         task = task.controlled_by(part(cfg.control, "control", robot, task, dynamics))
     given = {k: v for k, v in (plain(safety) or {}).items() if v is not None}
     safety = {**(plain(cfg.get("safety")) or {}), **given}
@@ -101,12 +101,12 @@ def make_task(cfg, robot, dynamics, safety=None):
 
 
 def make_draw(cfg, robot, center):
-    """Return the domain randomization of conf/dr about `center`: (rng, m) -> Dynamics."""
+    """Return the domain randomization of conf/dr about `center`: a function (rng, m) -> Dynamics of m arms."""
     return part(cfg.dr, "dr", robot, center)
 
 
 def _arm_target(cfg) -> Callable[..., Any]:
-    """Return the target of conf/arm; raise UserError for arm=none."""
+    """Return the class or function that makes the arm of conf/arm; raise UserError for arm=none."""
     if "_target_" not in cfg.arm:
         allowed = sorted(p.stem for p in (CONF / "arm").glob("*.yaml") if p.stem != "none")
         raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(allowed)}")
@@ -114,7 +114,7 @@ def _arm_target(cfg) -> Callable[..., Any]:
 
 
 def _arm_settings(cfg, robot, task=None):
-    """Return the settings of conf/arm, with the thresholds of its reflexes that the task's contacts need."""
+    """Return the settings of conf/arm; unset reflex thresholds become those that the task's contacts need."""
     settings = plain(cfg.arm)
     if "collision_force" in settings and None in (settings["collision_torque"], settings["collision_force"]):
         from r2s.arm.clients.collision_thresholds import thresholds_of
@@ -129,17 +129,17 @@ def _arm_settings(cfg, robot, task=None):
 def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
     """Yield the arm of conf/arm; close it afterwards if it is a context manager.
 
-    A signal ends the motion of an arm with an operator.
+    Unless the arm is a twin, a signal such as Ctrl-C ends its motion.
 
     Args:
-        noise: number of the sensor-noise stream of a twin. task, adapter: of the motions to come, if not recordings.
+        noise: number of the sensor-noise stream of a twin. task, adapter: of the policy's motion; None: recordings.
         more: further arguments of the arm.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.stop_request import handled_signals, pipeline
     from r2s.arm.warm_up import warm_up
 
-    if not is_twin(cfg):  # the clock of a twin waits
+    if not is_twin(cfg):  # a twin's clock waits while code compiles
         warm_up(robot, task, adapter)
     stream = {"noise": noise} if "noise" in inspect.signature(_arm_target(cfg)).parameters else {}
     with ExitStack() as stack:
@@ -156,9 +156,9 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
 
 @contextmanager
 def ends_sweep(cfg):
-    """End a whole sweep, not only its job, if an error leaves the block while an arm that is no twin is open.
+    """End the whole sweep, not only the job, if the block raises an error and the arm is no twin.
 
-    The next job would move the arm again before the operator knows why this one failed.
+    The next job would move the arm again before the operator knows why this job failed.
     """
     try:
         yield
@@ -169,22 +169,22 @@ def ends_sweep(cfg):
 
 
 def is_simulated(cfg):
-    """Return whether conf/arm is made from a seed: a twin, or an emulated arm with a twin behind it."""
+    """Return whether the arm of conf/arm is simulated from a seed: a twin, or an emulated arm with a twin."""
     made = {"_target_", "seed"} <= cfg.arm.keys()
     return made and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is a twin in this process, without operator: copies of it can run in parallel."""
+    """Return whether conf/arm is a twin in this process without operator, so that copies can run in parallel."""
     return is_simulated(cfg) and "operator" not in cfg.arm
 
 
 @contextmanager
 def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
-    """Yield a `PolicyRunner` of the arm of conf/arm, or a `RealtimeRunner` if `live` is set; stop the arm afterwards.
+    """Yield a `PolicyRunner` for the arm of conf/arm, or with arm.live a `RealtimeRunner`; stop the arm afterwards.
 
     Args:
-        dynamics: the model of one arm that the policy was trained on. noise: see `opened_arm`. adapter: or None.
+        dynamics: of one arm, on which the policy was trained. noise: see `opened_arm`. adapter: None without one.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.policy_runner import PolicyRunner
@@ -198,7 +198,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
             finally:
                 arm.stop()
         return
-    _arm_target(cfg)  # errors appear here, not in the process of the arm
+    _arm_target(cfg)  # raise its errors here, not in the process of the arm
     make = partial(part, _arm_settings(cfg, robot, task), "arm", robot, beside=list(DRIVE_KEYS))
     with ExitStack() as stack:
         try:
@@ -214,9 +214,9 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
 
 @contextmanager
 def opened_source(cfg, robot, noise):
-    """Yield the arm to record: conf/arm, or with data=simulated an arm with known parameters.
+    """Yield the arm to record: that of conf/arm, or with data=simulated a simulated arm with known parameters.
 
-    noise: 0, 1, 2, ... for the recordings of a run, so that each has its own sensor noise.
+    noise: 0, 1, 2, ... for the recordings of one run, so that each has other sensor noise.
     """
     if cfg.data.kind != "simulated":
         with opened_arm(cfg, robot, noise) as arm:
@@ -230,24 +230,24 @@ def opened_source(cfg, robot, noise):
 
 
 def within_speed_share(cfg, robot):
-    """Return the robot for which to plan the motion to record: its speed limits times arm.speed_share."""
+    """Return the robot with speed limits multiplied by arm.speed_share, to plan a motion for a recording."""
     share = cfg.arm.get("speed_share", 1.0) if cfg.data.kind == "arm" else 1.0
     check_number("arm.speed_share", share, "(0, 1]")
     return replace(robot, dq_max=share * robot.dq_max)
 
 
 def check_source(cfg, robot):
-    """Raise UserError if a simulated arm to record cannot be made; does not touch a real one."""
+    """Raise UserError if a simulated arm for a recording cannot be made; a physical arm is not connected."""
     if cfg.data.kind == "simulated" or is_simulated(cfg):
         with opened_source(cfg, robot, 0):
             pass
 
 
 def make_truth(cfg, robot):
-    """Return the dynamics of the files of conf/friction and conf/inertia that data.truth names.
+    """Return the true dynamics of a simulated arm: data.truth names a file of conf/friction and of conf/inertia.
 
     Raises:
-        UserError: a file is missing.
+        UserError: one of the files is missing.
     """
     from omegaconf import OmegaConf
 
@@ -261,7 +261,7 @@ def make_truth(cfg, robot):
 
 
 def is_learner(cfg):
-    """Return whether conf/algo is trained; otherwise it is a controller made of robot, task and dynamics."""
+    """Return whether conf/algo is a learner; otherwise it is a controller that needs no training."""
     from r2s.learning.learner import Learner
 
     kind = target(cfg.algo, "algo")
@@ -269,21 +269,21 @@ def is_learner(cfg):
 
 
 def training_keys():
-    """Return the keys of conf/algo that only trainings use; an experiment may set them for a controller, too."""
+    """Return the keys of conf/algo that only trainings use; an experiment may set them for a controller as well."""
     from r2s.learning.train import Loop
 
     return ("n_envs", "demonstrations", "hidden", *(f.name for f in fields(Loop)))
 
 
 def make_controller(cfg, robot, task, dynamics):
-    """Return the controller of conf/algo, with these dynamics as its model."""
+    """Return the controller of conf/algo with `dynamics` as its model of the arm."""
     return part(cfg.algo, "algo", robot, task, dynamics, beside=training_keys())
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):
-    """Return the open run folder of this job, with its trackers started; a resumed run keeps its group.
+    """Return the open run folder of this job, with its trackers started; a resumed run keeps its tracker group.
 
-    inputs: files that it reads. parents: run folders that it starts from. Both are in addition to the config's.
+    inputs: files that the job reads, and parents: run folders that it uses, in addition to those of the config.
     """
     from omegaconf import OmegaConf
 
@@ -319,12 +319,12 @@ def console():
 
 
 def all_threads(cfg):
-    """Return the threads that a stage may use."""
+    """Return the number of threads that a stage may use."""
     return cfg.threads or os.cpu_count() or 1
 
 
 def set_threads(cfg, threads=None):
-    """Set torch's threads, all by default, and its seed; the physics takes its threads itself."""
+    """Set torch's seed and number of threads, all by default. The physics has its own threads."""
     import torch
 
     torch.set_num_threads(threads or all_threads(cfg))
@@ -332,7 +332,7 @@ def set_threads(cfg, threads=None):
 
 
 def device(cfg):
-    """Return the device of learner and replay buffer; the physics stays on the processor."""
+    """Return the device of learner and replay buffer, cpu or cuda; the physics always runs on the CPU."""
     import torch
 
     if cfg.device not in ("cpu", "cuda"):

@@ -1,4 +1,4 @@
-"""The verdict on recordings before a fit, `r2s check data=...`; stage=identify begins with the same."""
+"""`r2s check data=...`: judge recordings before an identification. stage=identify begins with the same verdict."""
 
 from pathlib import Path
 
@@ -12,10 +12,10 @@ from r2s.stages.recordings import labels_of, of_one_reader, recording_files
 def check_data(cfg, to):
     """Print the verdict on each recording of `cfg`, and write it to a JSON file.
 
-    to: of one recording; None: runs/check/NAME.json. Of several recordings each has its own file.
+    to: file for a single recording; None: ROOT/check/NAME.json. With several recordings each has its own file.
 
     Raises:
-        UserError: a file that cannot be read, or a fail.
+        UserError: a file cannot be read, or a verdict is fail.
     """
     if cfg.data.kind != "recording":
         raise UserError("check: expected data=recording data.path=FILE, or data=kinova_gen3")
@@ -35,7 +35,7 @@ def check_data(cfg, to):
 
 
 def judged(cfg, robot, file, validation):
-    """Return the verdict on the recording of a `FileData`, and the recording."""
+    """Return the verdict on the recording of a `FileData`, and the recording itself."""
     from r2s.identification.checks import check_recording
     from r2s.identification.verdict import judge, with_validation
 
@@ -56,7 +56,7 @@ def judged(cfg, robot, file, validation):
 
 
 def write_verdict(robot, verdict, recording, path, to):
-    """Print the tables of a verdict, and write its JSON file."""
+    """Print the tables of a verdict, and write it to the JSON file `to`."""
     from r2s.reporting.identification.verdict import print_verdict
     from r2s.runs import write_json
 

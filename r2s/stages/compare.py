@@ -1,4 +1,4 @@
-"""stage=compare: trainings side by side, or transfers as an adapter comparison."""
+"""stage=compare: compare trainings with each other, or transfers with different adapters."""
 
 from r2s.stages.build import console, make_robot, open_run
 
@@ -7,12 +7,12 @@ HINT = "stage=compare compares adapters if runs= has transfers only: runs='runs/
 
 
 def reads(cfg):
-    """Return the config keys of this stage."""
+    """Return the config keys that this stage reads."""
     return {"runs", "robot"}
 
 
 def compare(cfg, overrides):
-    """Compare the trainings of `runs=`; if it has transfers only, compare their adapters."""
+    """Compare the trainings among the folders `runs=`; if these are transfers only, compare their adapters."""
     from glob import glob
 
     from r2s.errors import UserError
@@ -38,7 +38,7 @@ def compare(cfg, overrides):
 
 
 def compare_trainings(cfg, overrides, trained, others):
-    """Write tables with intervals over seeds, and learning curves."""
+    """Write the comparison of trainings: tables with intervals over seeds, and learning curves."""
     from r2s.reporting.comparison.grouping import group
     from r2s.reporting.comparison.page import comparison_page
     from r2s.reporting.comparison.scores import at_edges
@@ -62,7 +62,7 @@ def compare_trainings(cfg, overrides, trained, others):
 
 
 def compare_transfers(cfg, overrides, transferred, others):
-    """Write the adapter comparison: a row per adapter, a column per condition, paired intervals."""
+    """Write the comparison of adapters: one row per adapter, one column per condition, with paired intervals."""
     from r2s.reporting.comparison.adapter_comparison import compare_adapters
     from r2s.reporting.comparison.adapter_comparison_page import heading, lines, write
     from r2s.reporting.comparison.trainings import by_reason
@@ -85,6 +85,6 @@ def compare_transfers(cfg, overrides, transferred, others):
 
 
 def print_lines(out, lines):
-    """Print lines without markup."""
+    """Print lines on the console `out` without markup."""
     for line in lines:
         out.print(line, markup=False, highlight=False)

@@ -1,4 +1,4 @@
-"""stage=identify data.contact=FILE or data.presses=N: presses on a surface -> contact.yaml, its table and figure."""
+"""stage=identify data.contact=FILE or data.presses=N: identify a surface from presses; write contact.yaml."""
 
 import shutil
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ ARM = ("parameters.yaml", "posterior.npz")
 
 @dataclass(frozen=True)
 class ContactData:
-    """Recordings with contact: to fit, and to validate or None. `files`: their paths."""
+    """Recordings with contact: `recording` for the fit, `held_out` for validation or None, and their `files`."""
 
     recording: Any
     held_out: Any
@@ -25,10 +25,10 @@ class ContactData:
 def contact_data(cfg, robot, file):
     """Return the `ContactData` of data.contact and data.contact_validation; None without data.contact.
 
-    file: `FileData` of the config, for the columns.
+    file: `FileData` of the config; its columns are read.
 
     Raises:
-        UserError: no tool, no commanded torque, no free motion to identify the arm, or a wrong file.
+        UserError: no tool, no commanded torque, a validation without data.contact, or a wrong file.
     """
     from r2s.identification.checks import check_recording
 
@@ -48,10 +48,10 @@ def contact_data(cfg, robot, file):
 
 
 def press_parts(cfg, robot, arm):
-    """Return the `PressPlan` of data.presses, checked before there is a run folder.
+    """Return the `PressPlan` of data.presses, after checks that need no run folder.
 
     Raises:
-        UserError: no tool or surface, or a wrong setting.
+        UserError: no tool, no surface of a simulated arm, or a wrong setting.
     """
     from r2s.arm.presses import press_plan
     from r2s.stages.build import check_source, is_simulated
@@ -69,10 +69,10 @@ def press_parts(cfg, robot, arm):
 
 
 def pressed_surface(cfg, run, arm, plan):
-    """Return the `ContactData` of presses on the arm of the config; a resumed run reads the file that it has.
+    """Let the arm press on the surface, and return the `ContactData`; a resumed run reads an existing recording.
 
     Raises:
-        Stopped: the arm was stopped; the paths so far are contact_until_stop.npz.
+        Stopped: the arm stopped; contact_until_stop.npz has the motion until then.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.presses import record_presses
@@ -103,7 +103,7 @@ def pressed_surface(cfg, run, arm, plan):
 
 
 def calibrated_arm(cfg, robot):
-    """Return the `Arm` of `calibration=`."""
+    """Return the identified arm of `calibration=` with its posterior, an `Arm`."""
     from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.stages.run_config import modules
@@ -113,7 +113,7 @@ def calibrated_arm(cfg, robot):
 
 
 def identify_surface(cfg, run, arm, data):
-    """Write contact.yaml and figure of a surface; return its entry of summary.json and print its table."""
+    """Identify a surface; write contact.yaml, model and figure, print tables, return its entry of summary.json."""
     from r2s.identification.contact.contact_file import save_contact
     from r2s.identification.contact.estimate import identify_contact
     from r2s.identification.contact.exchange import write_surface
@@ -141,7 +141,7 @@ def identify_surface(cfg, run, arm, data):
 
 
 def keep_calibration(cfg, run):
-    """Copy the arm of `calibration=` into the run folder, so that calibration=RUN gives arm and surface."""
+    """Copy the arm of `calibration=` into the run folder, which then has everything for a later calibration=."""
     folder = Path(cfg.calibration)
     folder = folder if folder.is_dir() else folder.parent
     for name in ARM:

@@ -1,4 +1,4 @@
-"""Training motion, validation motion and breakaway ramps of stage=identify, from files or recorded on an arm."""
+"""Read or record the training motion, validation motion and breakaway ramps of stage=identify."""
 
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
@@ -10,26 +10,26 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
-SLOW_MS = 1.5  # ms between rows, from which the hold of a command is printed
+SLOW_MS = 1.5  # ms between rows of commands, above which their hold is printed
 LEAST_PRESSES = 4
-MAX_OVERLAP = 0.2  # share of a validation motion that may repeat training motion, such as the path to a start
+MAX_OVERLAP = 0.2  # share of a validation motion that may repeat training motion, such as an approach to the start
 
 
 @dataclass(frozen=True)
 class ArmData:
-    """Motion to record on an arm: data=arm.
+    """Settings of data=arm: the motion to record on an arm.
 
     Attributes:
-        torque: kind of the recorded torque, commanded or measured.
-        seconds: duration of each of the two motions.
-        excitation_seed: seed of the first motion; the second has the next one.
-        excitation: file of the first motion; None: it is optimized.
-        ramp_poses: postures at which every joint is ramped both ways; 0: no ramps.
-        presses: number of surface paths to record instead; 0: none. press_point: (3,) m, press_normal: (3,), of
-            its plane, roughly; None: a table below the tip at home.
+        torque: kind of the recorded torque, "commanded" or "measured".
+        seconds: duration of each of the two motions, s.
+        excitation_seed: seed of the training motion; the validation motion has the next seed.
+        excitation: file of the training motion; None: it is optimized.
+        ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
+        presses: number of paths on a surface to record instead; 0: none. press_point: (3,) m, and press_normal:
+            (3,), of its approximate plane; None: a table below the tip in the home posture.
 
     Raises:
-        UserError: a number outside its range.
+        UserError: a value is outside its range.
     """
 
     kind: str
@@ -60,11 +60,11 @@ class ArmData:
 
 @dataclass(frozen=True)
 class SimulatedData(ArmData):
-    """Motion to record on a simulated arm of known dynamics: data=simulated.
+    """Settings of data=simulated: the motion to record on a simulated arm with known dynamics.
 
     Attributes:
-        truth: its dynamics (`make_truth`). delay, lag: s, of its actuation.
-        position_noise, velocity_noise: standard deviations of sensor noise, rad and rad/s.
+        truth: name of the dynamics, see `make_truth`. delay, lag: of the actuation, s.
+        position_noise, velocity_noise: standard deviations of the sensor noise, rad and rad/s.
     """
 
     truth: str
@@ -81,10 +81,10 @@ class SimulatedData(ArmData):
 
 @dataclass(frozen=True)
 class FileData:
-    """The user's own recording: data=recording; see `read` of r2s/recordings/readers.py and conf/data/recording.yaml.
+    """Settings of data=recording, the user's recording: see conf/data/recording.yaml and r2s/recordings/readers.py.
 
     Raises:
-        UserError: a number outside its range.
+        UserError: a number is outside its range.
     """
 
     kind: str
@@ -114,7 +114,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return a recording of commands with the period of data.command_hz."""
+        """Return a recording with the command period of data.command_hz; without it, print the assumed hold."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -123,7 +123,7 @@ class FileData:
 
     @property
     def files(self) -> list[Path | str]:
-        """All files of the recordings and ramps."""
+        """All files of training motion, validation motion and ramps."""
         from r2s.recordings.readers import files_of
 
         motion = [f for path in (self.path, self.validation) if path for f in files_of(path)]
@@ -131,9 +131,9 @@ class FileData:
 
 
 def file_data(cfg, path=None):
-    """Return the `FileData` of a config; keys that only other kinds of data have are ignored.
+    """Return the `FileData` of a config; keys of other kinds of data are ignored.
 
-    path: instead of data.path, which may be missing then.
+    path: replaces data.path, which may then be missing.
     """
     from omegaconf import OmegaConf
 
@@ -150,9 +150,9 @@ def file_data(cfg, path=None):
 
 
 def read_file(robot, file, path, torque=None):
-    """Return the recording at `path`, with the columns of a `FileData`; `torque`: its kind, if not data.torque.
+    """Return the recording at `path`, read with the settings of a `FileData`; `torque` replaces data.torque.
 
-    What the reader repaired is printed. A second recording in another format need not have the first one's topic.
+    Print what the reader repaired. If data.path is a bag and `path` is not, topic and joints of the bag do not apply.
     """
     from r2s.recordings.readers import is_bag, read
 
@@ -170,10 +170,10 @@ def read_file(robot, file, path, torque=None):
 
 
 def read_episodes(path):
-    """Return the episodes of a transfer (`Episodes`) as a recording of commands, and the rest by LeRobot's names.
+    """Return the episodes of a transfer as a recording of commands, and {LeRobot name: rows} of the other signals.
 
     Raises:
-        UserError: the file is not one of a transfer.
+        UserError: the file has no episodes of a transfer.
     """
     import numpy as np
 
@@ -197,7 +197,7 @@ def read_episodes(path):
 
 
 def read_reference(path, n):
-    """Return the motion that a recording of stage=identify follows, by names t, q, dq, ddq, or None without one."""
+    """Return {t, q, dq, ddq} of the reference motion that a recording of stage=identify followed, or None."""
     import numpy as np
 
     from r2s.recordings.csv_table import read_csv
@@ -212,10 +212,10 @@ def read_reference(path, n):
 
 
 def check_other_motion(recording, validation):
-    """Raise UserError if a validation recording repeats training motion."""
+    """Raise UserError if a validation recording repeats rows or motion of the training recording."""
     import numpy as np
 
-    mix = np.random.default_rng(0).standard_normal((2, recording.q.shape[1]))  # equal rows have equal sums
+    mix = np.random.default_rng(0).standard_normal((2, recording.q.shape[1]))  # equal rows have equal weighted sums
     sums = [np.einsum("tn,n", r.q, mix[0]) + np.einsum("tn,n", r.dq, mix[1]) for r in (validation, recording)]
     same = int(np.isin(*sums).sum())
     if same > 0.01 * len(validation.t):
@@ -231,7 +231,7 @@ def check_other_motion(recording, validation):
 
 
 def check_cutoff(cutoff_hz, recordings):
-    """Raise UserError unless identify.cutoff_hz is below the Nyquist rate of each recording."""
+    """Raise UserError unless identify.cutoff_hz is below 500 Hz and each recording's Nyquist frequency."""
     from r2s.identification.checks import check_rate
 
     check_number("identify.cutoff_hz", cutoff_hz, "(0, 500)")  # r2s works at 1 kHz
@@ -240,7 +240,7 @@ def check_cutoff(cutoff_hz, recordings):
 
 
 def read_user_ramps(robot, file):
-    """Return the ramps of a `FileData`, or None; their columns have the names of the recording's."""
+    """Return the ramps of a `FileData`, or None; their columns have the same names as in the recording."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
 
@@ -248,7 +248,7 @@ def read_user_ramps(robot, file):
         return None
     columns = dict(file.columns)
     if file.torque != "commanded":
-        columns["tau"] = None  # it names another torque; ramps are of the command
+        columns["tau"] = None  # the name is of another kind of torque; ramps need the commanded one
     ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
     check_ramps(robot, ramps)
     return replace(ramps, recording=file.held(ramps.recording))
@@ -260,7 +260,7 @@ def check_data(cfg):
 
 
 def ramp_poses(cfg, robot):
-    """Return the postures (., n) rad of the ramps; raise UserError if no path leads there."""
+    """Return the postures (k, n) rad of the ramps; raise UserError if no safe path leads to one of them."""
     from r2s.arm.ramp import check_paths, poses_about
 
     poses = poses_about(robot, cfg.data.ramp_poses if cfg.data.torque == "commanded" else 0)
@@ -270,9 +270,9 @@ def ramp_poses(cfg, robot):
 
 
 def record_motion(cfg, robot, motion, k, label, timing):
-    """Return the k-th motion of an arm, given or optimized for data.seconds, and its recording.
+    """Record motion number k on the arm; return the motion, given or optimized for data.seconds, and the recording.
 
-    timing: receives the durations of its cycles.
+    timing: receives the durations of the cycles.
     """
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
@@ -290,9 +290,9 @@ def record_motion(cfg, robot, motion, k, label, timing):
 
 
 def record_ramps(cfg, robot, timing):
-    """Return the ramps of the breakaway protocol about the home posture, or None for data.ramp_poses=0.
+    """Record breakaway ramps in postures about home; return them, or None if there are no ramp postures.
 
-    timing: receives the durations of its cycles.
+    timing: receives the durations of the cycles.
     """
     from r2s.arm.ramp import ramp
     from r2s.progress import Progress
@@ -308,15 +308,15 @@ def record_ramps(cfg, robot, timing):
 
 
 def record_arm(cfg, robot, run, motion):
-    """Return training motion, validation motion and ramps of an arm; a resumed run reads the files that it has.
+    """Record training motion, validation motion and ramps on an arm, and return them.
 
-    timing.csv gets the durations of the cycles, also of a stopped motion.
+    A resumed run reads files that exist. timing.csv gets the cycle durations, also those of a stopped motion.
 
     Args:
-        run: the run folder of the files. motion: the first excitation; None: it is optimized.
+        run: open run folder for the files. motion: the training motion; None: it is optimized.
 
     Raises:
-        Stopped: the arm was stopped; the motion so far is <name>_until_stop.npz.
+        Stopped: the arm stopped; <name>_until_stop.npz has the motion until then.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.realtime import Timing

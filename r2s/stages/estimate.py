@@ -1,4 +1,4 @@
-"""stage=estimate: payload, friction, offsets and external wrench of a working arm or of a recording."""
+"""stage=estimate: estimate payload, friction, offsets and external wrench from an arm's motion or a recording."""
 
 from dataclasses import replace
 
@@ -24,13 +24,13 @@ LIMIT_SHARE = 0.6  # of the speed and acceleration limits, for motion with an un
 
 
 def reads(cfg):
-    """Return the keys of the config that this stage reads."""
+    """Return the config keys that this stage reads."""
     keys = {"robot", "calibration", "data", "estimate"} | (set() if cfg.calibration else {"friction", "inertia"})
     return keys | ({"arm"} if cfg.data.kind == "arm" else set())
 
 
 def estimate(cfg, overrides):
-    """Recording or arm -> estimate.csv, wrench.csv, figures: payload, friction, offsets, wrench, with intervals."""
+    """Estimate payload, friction, offsets and wrench with intervals; write estimate.csv, wrench.csv and figures."""
     from r2s.adaptation.adapters import AdapterContext
     from r2s.adaptation.estimator import Estimator
     from r2s.adaptation.offline_estimation import format_estimate, table
@@ -98,7 +98,7 @@ def estimate(cfg, overrides):
 
 
 def identified_surface(cfg, robot):
-    """Return the `IdentifiedSurface` of estimate.surface, None without; raise UserError if no tip could touch it."""
+    """Return the `IdentifiedSurface` of estimate.surface, or None; raise UserError if the robot has no tool."""
     if not cfg.estimate.surface:
         return None
     from r2s.identification.contact.contact_file import load_contact
@@ -109,7 +109,7 @@ def identified_surface(cfg, robot):
 
 
 def wrench_observer(cfg, robot, dynamics, surface):
-    """Return the wrench observer of the arm, and what its contact threshold comes from: "recordings" or "noise"."""
+    """Return the wrench observer, and the origin of its contact threshold: "recordings" or "noise"."""
     from r2s.adaptation.wrench import WrenchObserver, contact_threshold
     from r2s.adaptation.wrench_fusion import FusedWrench
 
@@ -123,7 +123,7 @@ def wrench_observer(cfg, robot, dynamics, surface):
 
 
 def format_contacts(touched):
-    """Return the contacts in one line."""
+    """Return one line that describes the contacts."""
     if not touched:
         return "no contact"
     most = max(c["force_max_N"] for c in touched)
@@ -132,10 +132,10 @@ def format_contacts(touched):
 
 
 def given_recording(cfg, robot):
-    """Return the recording of data=recording, with a row per millisecond; None if an arm makes one.
+    """Return the recording of data=recording with one row per millisecond, or None if an arm will be recorded.
 
     Raises:
-        UserError: no such file, another torque than the commanded one, or an arm that cannot be moved.
+        UserError: no such file, no commanded torque, or wrong settings of the arm.
     """
     from r2s.adaptation.offline_estimation import at_rate
 
@@ -151,10 +151,10 @@ def given_recording(cfg, robot):
 
 
 def record_arm(cfg, robot):
-    """Return the recording of an arm that moves for data.seconds or along data.excitation, and why it stopped.
+    """Record an arm along data.excitation or for data.seconds; return the recording and why the arm stopped, or None.
 
     Raises:
-        Stopped: a signal stopped the arm, or it stopped before it moved.
+        Stopped: a signal stopped the arm, or it stopped before anything was recorded.
     """
     from r2s.arm.interface import ArmStopped, StopRequested
     from r2s.arm.recorder import record
@@ -182,8 +182,8 @@ def record_arm(cfg, robot):
 
 
 def summary(last, changes):
-    """Return the last estimate and the times of payload changes, for summary.json."""
-    centre = [None if c != c else round(float(c), 5) for c in (*last.centre, *last.centre_half)]  # nan is no JSON
+    """Return the entries of summary.json: the last estimate and the times of payload changes."""
+    centre = [None if c != c else round(float(c), 5) for c in (*last.centre, *last.centre_half)]  # JSON has no nan
     return {
         "mass_kg": last.mass,
         "mass_kg_half": last.mass_half,

@@ -1,4 +1,4 @@
-"""stage=excite: a motion worth recording on an arm that somebody else drives, as CSV and as a ROS 2 trajectory."""
+"""stage=excite: design an excitation for an arm that another program drives; write CSV and a ROS 2 trajectory."""
 
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,7 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the keys of the config that this stage reads."""
+    """Return the config keys that this stage reads."""
     return {"robot", "calibration", "identify", "excite"} | (
         {"friction.family"} if cfg.calibration else {"friction", "inertia"}
     )
@@ -26,7 +26,7 @@ class Excite:
     """Settings of conf/stage/excite.yaml.
 
     Raises:
-        UserError: a value outside its range.
+        UserError: a value is outside its range.
     """
 
     seconds: float
@@ -63,7 +63,7 @@ class Excite:
 
 
 def make_design(cfg, robot, how):
-    """Return the `PlannedWidths` that the motion is chosen for."""
+    """Return the `PlannedWidths`: the expected interval widths that the motion should make small."""
     from r2s.identification.planned_width import PlannedWidths
     from r2s.stages.prior import make_settings
 
@@ -77,7 +77,7 @@ def make_design(cfg, robot, how):
 
 
 def excite(cfg, overrides):
-    """Robot -> excitation.csv, trajectory.yaml, a table of expected widths, a picture."""
+    """Design an excitation; write excitation.csv, trajectory.yaml, a table of expected widths and a picture."""
     import numpy as np
 
     from r2s.excitation.design import designed, trajectory_yaml

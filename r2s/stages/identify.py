@@ -1,4 +1,4 @@
-"""stage=identify: recording -> parameters.yaml, errors on training and validation motion, figures."""
+"""stage=identify: identify the arm from recordings; write parameters.yaml, prediction errors and figures."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +29,7 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the keys of the config that this stage reads."""
+    """Return the config keys that this stage reads."""
     keys = {"robot", "calibration", "identify", "search", "data"}
     keys |= {"friction.family"} if cfg.calibration else {"friction", "inertia"}
     return keys | ({"arm"} if cfg.data.kind == "arm" else set())
@@ -37,9 +37,9 @@ def reads(cfg):
 
 @dataclass(frozen=True)
 class Parts:
-    """Inputs of an identification, made and checked before there is a run folder.
+    """Inputs of an identification, checked before a run folder is made.
 
-    With an arm, `groups` and `ramps` are recorded later, along `motion`. earlier: of identify.from=, or None.
+    With data=arm, `groups` and `ramps` are recorded later, along `motion`. earlier: from identify.from=, or None.
     """
 
     robot: Any
@@ -55,10 +55,10 @@ class Parts:
 
 
 def make_parts(cfg):
-    """Return the inputs of an identification; a real arm is not touched.
+    """Return the inputs of an identification without connecting to a physical arm.
 
     Raises:
-        UserError: the config contradicts itself, or a file is missing or wrong.
+        UserError: settings contradict each other, or a file is missing or wrong.
     """
     from r2s.excitation.motion import load
     from r2s.identification.stated import check_stated
@@ -96,10 +96,10 @@ def make_parts(cfg):
 
 
 def with_known_arm(cfg):
-    """Return the data option to identify on top of the arm that `calibration=` gives, or None.
+    """Return which data option (presses, contact, loaded) to identify with the known arm of `calibration=`, or None.
 
     Raises:
-        UserError: neither `calibration=` nor data.path= gives the arm.
+        UserError: the option needs a known arm, but neither `calibration=` nor data.path= is given.
     """
     from omegaconf import OmegaConf
 
@@ -117,7 +117,7 @@ def with_known_arm(cfg):
 
 
 def identify_with_known_arm(cfg, overrides, key):
-    """Presses -> contact.yaml, or a loaded recording -> payload.yaml, on top of the arm of `calibration=`."""
+    """Identify a surface (contact.yaml) or a payload (payload.yaml) with the known arm of `calibration=`."""
     robot = make_robot(cfg)
     if key == "presses":
         arm = calibrated_arm(cfg, robot)
@@ -142,7 +142,7 @@ def identify_with_known_arm(cfg, overrides, key):
 
 
 def identify(cfg, overrides):
-    """Recordings -> parameters.yaml, errors on training and validation motion, figures."""
+    """Identify the arm; write parameters.yaml, errors on training and validation motion, and figures."""
     if key := with_known_arm(cfg):
         identify_with_known_arm(cfg, overrides, key)
         return
@@ -158,7 +158,7 @@ def identify(cfg, overrides):
             made = replace(made, groups=(group,), ramps=ramps)
         judge_recordings(cfg, run, made)
         earlier, kinds = [made.earlier] if made.earlier else [], dict[str, Any]()
-        for group in made.groups[:-1]:  # what all kinds of torque share is known better to the next
+        for group in made.groups[:-1]:  # each result is a prior of the next fit
             fit = fit_group(cfg, run, made, group, earlier, run.folder / group.torque)
             space, found = fit.found.saved
             earlier.append(Earlier(str(run.folder / group.torque), group.torque, space, found.x, found.samples))
@@ -181,7 +181,7 @@ def identify(cfg, overrides):
 
 
 def judge_recordings(cfg, run, made):
-    """Write verdict.json, of one recording or by recording; print the warnings, and refuse a fail."""
+    """Judge the training recordings: write verdict.json, print warnings, raise UserError if a verdict is fail."""
     from r2s.identification.verdict import judge
     from r2s.runs import write_json
 
@@ -201,7 +201,7 @@ def judge_recordings(cfg, run, made):
 
 @dataclass(frozen=True)
 class Fit:
-    """An identification from one kind of torque, with its errors and tables."""
+    """Result of an identification from one kind of torque, with prediction errors and tables."""
 
     found: Any
     nominal: Any
@@ -211,7 +211,7 @@ class Fit:
 
 
 def fit_group(cfg, run, made, group, earlier, folder):
-    """Identify from the recordings of one kind of torque, and write parameters.yaml and model/ to `folder`."""
+    """Identify the arm from one kind of torque; write parameters.yaml and model/ to `folder`; return the `Fit`."""
     from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.identify import identify as run_identify
     from r2s.identification.parameter_file import save_parameters
@@ -251,7 +251,7 @@ def fit_group(cfg, run, made, group, earlier, folder):
     save_parameters(folder / "parameters.yaml", *found.saved, source, found.note)
     for line in write_description(folder / "model", robot, found.dynamics):
         print(line)
-    if train.torque != "measured":  # a link-side sensor does not see the friction that a command must overcome
+    if train.torque != "measured":  # a link-side sensor does not measure the friction that a command has to overcome
         write_crisp(folder / "model" / "crisp_friction.yaml", robot, found.dynamics)
     tables, entries = compared(made, group, found, settings, " and ".join(str(e) for e in earlier))
     arm = Arm(found.space, found.x, found.found.samples)
@@ -262,9 +262,9 @@ def fit_group(cfg, run, made, group, earlier, folder):
 
 
 def compared(made, group, found, settings, known_from):
-    """Return tables and entries of summary.json: what each recording adds, and the drift since identify.from.
+    """Return tables and summary.json entries on what each recording contributes, and on drift since identify.from.
 
-    known_from: words for where `settings.known` comes from.
+    known_from: text that names the source of `settings.known`.
     """
     from r2s.identification.contributions import contradictions, contributions, validated
     from r2s.identification.known import FAR, block_of, disagreement, drift_table

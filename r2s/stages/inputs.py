@@ -1,4 +1,4 @@
-"""Files that a job reads and run folders that it starts from; meta.json keeps the files' SHA-256."""
+"""Find the files that a job reads and the run folders that it uses; meta.json records the files' SHA-256."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,8 +13,8 @@ PARENTS = (
     "estimate.surface",
     "dr.surface",
 )  # config keys that name a run folder
-FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; those of the package belong to its commit
-# of a run folder, what another job may read
+FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; the commit fixes files of the package
+# files of a run folder that another job may read
 READ = (
     *("config.yaml", "overrides.yaml", "policy.yaml", "summary.json", "measures.json", "evaluations.csv"),
     *("parameters.yaml", "posterior.npz", "contact.yaml", "contact_posterior.npz", "policy.pt", "timing.csv"),
@@ -23,16 +23,16 @@ READ = (
 
 
 def parents_of(cfg) -> list[str]:
-    """Return the run folders (or parameter files) that a config names."""
+    """Return the run folders, or parameter files, that a config names."""
     from omegaconf import OmegaConf
 
-    copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # that a resumed training reads
+    copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # a resumed run reads these
     keys = [k for k in PARENTS if not (cfg.resume and k in copies and (Path(cfg.resume) / copies[k]).is_file())]
     return [str(Path(str(value))) for key in keys if (value := OmegaConf.select(cfg, key))]
 
 
 def files_of(cfg, parents: Iterable[str]) -> list[Path]:
-    """Return the files of a config's robot and of `parents`, run folders or parameter files."""
+    """Return the files of a config's robot, and those of READ in `parents`: run folders or parameter files."""
     from omegaconf import OmegaConf
 
     named = [str(value) for key in FILES if (value := OmegaConf.select(cfg, key))]

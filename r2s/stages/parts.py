@@ -1,4 +1,4 @@
-"""Make parts by the `_target_` of a config node, with errors that name the settings as the user types them."""
+"""Make parts by the `_target_` of config nodes. Error messages name the settings as the user types them."""
 
 import inspect
 import logging
@@ -9,18 +9,18 @@ from r2s.errors import UserError, nearest
 
 
 def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
-    """Return what a config node's `_target_` makes.
+    """Call the class or function of a config node's `_target_` and return the result, a part.
 
     Args:
-        node: node of the config; its keys are arguments of the target.
-        group: path of the node in the config, for errors.
-        given: positional arguments from code.
-        beside: keys of the node that are no arguments.
+        node: config node; its keys are arguments of the target.
+        group: path of the node in the config, for error messages.
+        given: positional arguments, which the config does not have.
+        beside: keys of the node that are no arguments of the target.
 
     Raises:
         UserError: the target does not exist or refuses these arguments.
     """
-    make = target(node, group)  # refuses a node that is no mapping
+    make = target(node, group)  # raises if the node is no mapping
     settings = {k: v for k, v in plain(node).items() if k not in ("_target_", "name", *beside)}
     return called(make, group, settings, *given)
 
@@ -32,7 +32,7 @@ def target(node: Any, group: str) -> Callable[..., Any]:
     path = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(path, str) or not path:
         raise UserError(f"{group}: expected a yaml with _target_ (dotted path of a class or function), got none")
-    logging.getLogger("hydra.utils").disabled = True  # it would log the error as well
+    logging.getLogger("hydra.utils").disabled = True  # it would print the error a second time
     try:
         return get_object(path)
     except Exception as error:  # the import of a user's module may raise anything
@@ -44,7 +44,7 @@ def target(node: Any, group: str) -> Callable[..., Any]:
 
 
 def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *given: Any) -> Any:
-    """Return make(*given, **settings); errors name the settings as the user types them.
+    """Return make(*given, **settings); error messages name the settings as the user types them.
 
     Raises:
         UserError: an unknown or missing argument, a string for a number, or an error of `make` itself.
@@ -62,7 +62,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
         return make(*given, **settings)
     except UserError as error:
         first = str(error).split(":")[0].split(".")[0]
-        if first in settings and first != group:  # the target does not know the name of its group
+        if first in settings and first != group:  # add the group, which the target does not know
             raise UserError(f"{group}.{error}") from None
         raise
 
@@ -70,7 +70,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
 def arguments(make: Callable[..., Any]) -> dict[str, Any]:
     """Return {argument: type hint} of a function or class.
 
-    **kwargs of an __init__ stand for the arguments of the next class in the MRO; a function's are the key "**".
+    **kwargs of an __init__ stand for the arguments of the next class in the MRO. **kwargs of a function become "**".
     """
     found: dict[str, Any] = {}
     for owner in make.__mro__[:-1] if inspect.isclass(make) else (make,):
@@ -79,7 +79,7 @@ def arguments(make: Callable[..., Any]) -> dict[str, Any]:
             continue
         try:
             hints = get_type_hints(function)
-        except (NameError, TypeError):  # annotations that only a type checker can resolve; no plain function
+        except (NameError, TypeError):  # annotations only for type checkers, or no plain function
             hints = {}
         parameters = inspect.signature(function).parameters.values()
         found = {p.name: hints.get(p.name) for p in parameters if not p.kind.name.startswith("VAR")} | found
@@ -91,7 +91,7 @@ def arguments(make: Callable[..., Any]) -> dict[str, Any]:
 
 
 def check_types(make: Callable[..., Any], group: str, settings: Mapping[str, Any]) -> None:
-    """Raise UserError if a setting is a string and its annotation is a number or a list of numbers."""
+    """Raise UserError if a setting is a string, but its annotation is a number or a list of numbers."""
     hints = arguments(make)
     for key, value in settings.items():
         kinds = set(_kinds(hints.get(key)))
@@ -109,7 +109,7 @@ def _kinds(hint: Any) -> Iterator[Any]:
 
 
 def plain(node):
-    """Return a config node as dicts, lists and numbers."""
+    """Return a config node as plain dicts, lists and values; other objects are returned unchanged."""
     from omegaconf import OmegaConf
 
     if not OmegaConf.is_config(node):

@@ -1,4 +1,4 @@
-"""stage=identify data.loaded=FILE: a recording with a payload -> payload.yaml, its tables and figure."""
+"""stage=identify data.loaded=FILE: identify a payload from a recording of the loaded arm; write payload.yaml."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from r2s.stages.data import check_cutoff, read_file
 
 @dataclass(frozen=True)
 class LoadedData:
-    """The recording of the loaded arm, the payload that gravity compensation assumed or None, and their files."""
+    """The recording of the loaded arm, the payload declared to gravity compensation or None, and the files read."""
 
     recording: Any
     declared: Any
@@ -20,13 +20,13 @@ class LoadedData:
 
 
 def loaded_data(cfg, robot, file, torque=None):
-    """Return the `LoadedData` of data.loaded; None without it.
+    """Return the `LoadedData` of data.loaded, or None without data.loaded.
 
     Args:
-        file: `FileData` of the config, for the columns. torque: kind of the torque; None: data.torque.
+        file: `FileData` of the config; its columns are read. torque: kind of the torque; None: data.torque.
 
     Raises:
-        UserError: no arm without payload to compare with, another kind of torque than its, or a wrong file.
+        UserError: data.declared_payload or data.contact does not fit, or the file is wrong.
     """
     from r2s.identification.checks import check_motion
     from r2s.physics.payload import payload_of
@@ -51,12 +51,12 @@ def loaded_data(cfg, robot, file, torque=None):
 
 
 def torque_of_calibration(cfg, given):
-    """Return the kind of torque of a loaded recording: that from which `calibration=` was identified.
+    """Return the kind of torque from which `calibration=` was identified; a loaded recording must have the same.
 
-    given: data.torque.
+    given: value of data.torque, or None.
 
     Raises:
-        UserError: data.torque= is another one.
+        UserError: `given` is another kind.
     """
     from r2s.stages.adapter_factory import PARAMETERS, TORQUE
     from r2s.stages.run_config import loaded
@@ -71,9 +71,9 @@ def torque_of_calibration(cfg, given):
 
 
 def identify_load(cfg, run, arm, data, label=""):
-    """Write payload.yaml and figure; return the entry of summary.json and print the tables.
+    """Identify a payload; write payload.yaml and figure, print the tables, return the entry of summary.json.
 
-    label: of one of several loaded recordings; its payload.yaml is in the folder payload_LABEL.
+    label: of the recording, if there are several loaded ones; payload.yaml is then in the folder payload_LABEL.
     """
     from r2s.identification.payload.estimate import identify_payload
     from r2s.identification.payload.payload_file import save_payload

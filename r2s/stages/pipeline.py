@@ -1,6 +1,6 @@
-"""stage=pipeline: identify, train and transfer on one machine; each step is a command with its own run folder.
+"""stage=pipeline: identify, train and transfer on one computer; each command of a step has its own run folder.
 
-With a task on a surface, the arm presses on it before the trainings, and the surface is identified on top of the arm.
+For a task on a surface, the arm presses on the surface before the trainings, and the surface is identified as well.
 """
 
 import os
@@ -19,24 +19,24 @@ from r2s.stages.build import GROUP, console, is_simulated, make_robot, open_run,
 from r2s.stages.parts import target
 from r2s.stages.run_config import CONF, PACKAGE, PROGRAM, replayed
 
-STEPS = {  # by the first label of their commands
+STEPS = {  # {first label of the step's commands: description}
     "identify": "record the arm and identify it",
     "surface": "press on the surface and identify it",
     "identified": "train on both models, in parallel",
     "transfer": "run the policies on the arm",
 }
-STOPPED = 3  # exit status of a step that a stopped arm ended, see r2s/cli.py
+STOPPED = 3  # exit status of a command that ended because the arm stopped, see r2s/cli.py
 MODELS = ("identified", "nominal")
-# with adapt=: also computed torque with the identified model, and the identified policy with the adapter
+# with adapt=, also: computed torque with the identified model, and the policy trained on it with the adapter
 COMPUTED, ADAPTED, SURFACE = "computed", "adapted", "surface"
-REFERENCE = "reference"  # with a task on a surface: hybrid control with the identified model, without learning
+REFERENCE = "reference"  # for a task on a surface: hybrid control with the identified model, without learning
 ROWS = {
     COMPUTED: "computed torque",
     ADAPTED: "identified model + adapter",
     REFERENCE: "hybrid control, identified model",
 }
-PATHS = 6  # presses, 8 s each; the last one validates
-CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # of the arm at work
+PATHS = 6  # number of paths on the surface, 8 s each; the last one is for validation
+CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # for transfers only
 WHY = {
     "calibration": "it identifies the arm itself",
     "policy": "it trains its policies itself",
@@ -46,23 +46,23 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the config keys of the steps, except those that the pipeline sets itself."""
+    """Return the config keys that the steps read, except those that the pipeline itself sets."""
     keys = {"pipeline", *identify.reads(cfg), *train.reads(cfg), *transfer.reads(cfg)} - {"calibration", "policy"}
     return keys if cfg.pipeline.train_minutes is None else keys - {"budget"}
 
 
 def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
-    """Return the typed overrides that a step reads, given its config."""
+    """Return those of the typed overrides that a step reads; `step` is its config."""
     own = ("stage=", "name=", "root=", "threads=", "pipeline.")
     return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
 
 
 def run_step(words: dict[str, list[str]]) -> None:
-    """Run the commands {label: words} in parallel: print their progress line by line, their tables when they end.
+    """Run the commands {label: words} in parallel; print progress line by line, and tables when a command ends.
 
     Raises:
         UserError: a command failed; the others are terminated.
-        Stopped: an arm stopped in one of them; the others are terminated.
+        Stopped: the arm of a command stopped; the others are terminated.
     """
     running: dict[str, subprocess.Popen] = {}
     last: dict[str, str] = {}
@@ -107,12 +107,12 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Return the commands of a step in groups that run in parallel; commands that move one arm run alone."""
+    """Return groups of a step's commands; those of a group run in parallel. With `moves`, each runs alone."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
 def command_prefix() -> list[str]:
-    """Return the command of this process, from a checkout or as installed, with the user's --config-dir."""
+    """Return the command that starts r2s as in this process, from a checkout or installed, with --config-dir."""
     from hydra.core.hydra_config import HydraConfig
 
     program = [str(PACKAGE.parent / "run.py")] if CONF.parent != PACKAGE else ["-m", "r2s"]
@@ -121,17 +121,17 @@ def command_prefix() -> list[str]:
 
 
 def compose_step(words: Sequence[str], option: str) -> Any:
-    """Return the config of the command command_prefix() with these words; `option` names them in errors.
+    """Return the config of a command with the overrides `words`; errors begin with `option`.
 
     Raises:
-        UserError: Hydra refuses the words.
+        UserError: Hydra refuses the overrides.
     """
     from hydra import compose
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     try:
-        return replayed(compose("config", list(words)))  # the Hydra of this job includes --config-dir
+        return replayed(compose("config", list(words)))  # Hydra of this job knows --config-dir
     except (HydraException, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split()).removeprefix("In 'config': ")
         reason = reason.split(" Config search path")[0].split(" To append")[0]
@@ -139,17 +139,17 @@ def compose_step(words: Sequence[str], option: str) -> Any:
 
 
 def touches(cfg: Any) -> bool:
-    """Return whether the task presses a tool on a surface, which is identified."""
+    """Return whether the task presses a tool on a surface, so that the surface has to be identified."""
     return bool(getattr(target(cfg.task, "task"), "touches", False)) and not moves_box(cfg)
 
 
 def moves_box(cfg: Any) -> bool:
-    """Return whether the task pushes a box, whose mass and friction are not identified."""
+    """Return whether the task pushes a box; its mass and friction are not identified."""
     return bool(getattr(target(cfg.task, "task"), "moves_box", False))
 
 
 def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the labels of the trainings and of the transfers."""
+    """Return the labels of the trainings, and those of the transfers."""
     adapts = cfg.adapt.name != "none"
     unlearned = [REFERENCE] if touches(cfg) or moves_box(cfg) else [COMPUTED] if adapts else []
     trained = *MODELS, *unlearned
@@ -157,7 +157,7 @@ def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def check_free(root: Path, name: str, cfg: Any) -> None:
-    """Raise UserError if the run folder of a step of the pipeline `name` exists."""
+    """Raise UserError if a run folder that the pipeline `name` would make exists already."""
     steps = [root / "identify" / name, *([root / "identify" / f"{name}_{SURFACE}"] if touches(cfg) else [])]
     for stage, each in zip(("train", "transfer"), labels(cfg), strict=True):
         steps += [root / stage / f"{name}_{m}" for m in each]
@@ -166,14 +166,14 @@ def check_free(root: Path, name: str, cfg: Any) -> None:
 
 
 def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
-    """Return {label: words of a command} for each step: identify, with a surface press on it, train, transfer.
+    """Return {label: words of a command} per step: identify, press on the surface if there is one, train, transfer.
 
-    Both trainings have the same settings, time and machine, so that on the arm only the model differs. With an
-    adapter, identification runs on the unchanged arm; payload, friction and delay change in the transfer only.
+    Both trainings have the same settings, time and computer, so their policies differ by the model only. With an
+    adapter, identification uses the unchanged arm: payload, friction and delay change for transfers only.
 
     Args:
-        cfg: config of the pipeline. name: of the pipeline; the names of its steps begin with it.
-        overrides: typed by the user; each step gets those that it reads.
+        cfg: config of the pipeline. name: of its run folder; the names of other run folders begin with it.
+        overrides: typed by the user; each command gets those that it reads.
     """
     root, choice = Path(cfg.root), chosen(overrides, cfg)
     both, adapts = cfg.threads or os.cpu_count() or 2, cfg.adapt.name != "none"
@@ -186,7 +186,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     ) -> list[str]:
         config = cfg.copy()
         config.stage, config.calibration = stage, calibration
-        if typed is not overrides:  # without an adapter
+        if typed is not overrides:  # a command without adapter
             config.adapt = {"name": "none"}
         full = f"{name}_{label}" if label != "identify" else name
         threads = cfg.threads if stage == "identify" else max(1, both // 2)
@@ -225,7 +225,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
 
 
 def surface_words(cfg: Any) -> list[str]:
-    """Return the words that give a simulated arm a surface at the plane of the task, or its box, if it has none."""
+    """Return overrides that add the task's plane or box to a simulated arm without a surface."""
     if not is_simulated(cfg) or cfg.arm.get("surface"):
         return []
     plane = {k: cfg.task[k] for k in ("point", "normal")}
@@ -237,14 +237,14 @@ def surface_words(cfg: Any) -> list[str]:
 
 
 def tool_words(cfg: Any) -> list[str]:
-    """Return the words that give the presses the tool and the plane of the task."""
+    """Return overrides that set the tool and the plane of the presses to those of the task."""
     tool = [f"robot.tool={cfg.task.tool}"] if cfg.robot.get("tool") is None else []
     given = {k: cfg.task[k] for k in ("point", "normal") if cfg.task[k] is not None}
     return tool + [f"data.press_{k}={list(v)}" for k, v in given.items()]
 
 
 def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrides: Sequence[str]) -> None:
-    """Add the surface's identified friction to the trainings with the identified model, if the task expects one."""
+    """Set task.friction to the identified one in trainings with the identified model, if the task has that key."""
     from r2s.identification.contact.contact_file import load_contact
 
     if "friction" not in cfg.task or any(o.startswith("task.friction=") for o in overrides):
@@ -254,14 +254,14 @@ def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrid
 
 
 def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
-    """Raise UserError if a step would refuse an override, before the arm is identified."""
+    """Raise UserError if identification or training would refuse an override, before anything moves."""
     first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
     identify.make_parts(compose_step(first["identify"], "stage=identify"))
-    train.make_parts(compose_step(trained["nominal"], "stage=train"))  # the other training needs the identified model
+    train.make_parts(compose_step(trained["nominal"], "stage=train"))  # the others need the identified model
 
 
 def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
-    """Return the words that give a training the nominal model, from which identification starts."""
+    """Return overrides that give a training the nominal model from which the identification starts."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices
@@ -270,7 +270,7 @@ def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
 
 
 def pipeline(cfg, overrides):
-    """Run every stage in its own process; write one table, one recording and one report."""
+    """Run every command in its own process; write one table, one recording and one report on all of them."""
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures
     from r2s.runs import read_summary
@@ -288,7 +288,7 @@ def pipeline(cfg, overrides):
     with open_run(cfg, overrides) as run:
         name = run.folder.name
         check_free(root, name, cfg)
-        os.environ.setdefault(GROUP, name)  # one group of its steps in trackers
+        os.environ.setdefault(GROUP, name)  # group of the steps in trackers
         identified, surface = root / "identify" / name, root / "identify" / f"{name}_{SURFACE}"
         steps = commands(cfg, name, overrides)
         for k, step in enumerate(steps, 1):

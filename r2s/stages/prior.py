@@ -1,4 +1,4 @@
-"""The prior of stage=identify: identify.prior.PARAMETER.mean=, and an earlier run, identify.from=RUN."""
+"""The prior of stage=identify: stated values identify.prior.PARAMETER.mean=, and an earlier run identify.from=RUN."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,9 +12,9 @@ from r2s.stages.run_config import loaded
 
 @dataclass(frozen=True)
 class Earlier:
-    """An identification before this one: folder, kind of torque, space, values (P,) and draws (S, P).
+    """An earlier identification: folder, kind of torque, parameter space, values x (P,) and posterior draws (S, P).
 
-    drift: of identify.drift since then. given: by identify.from=; otherwise it is of the same session.
+    drift: value of identify.drift. given: whether it comes from identify.from= or from this run.
     """
 
     run: str
@@ -26,12 +26,12 @@ class Earlier:
     given: bool = False
 
     def __str__(self):
-        """Return words for a message."""
+        """Return a text that names the source in messages."""
         return self.run if self.given else f"{self.torque} torque"
 
     @property
     def arm(self):
-        """The identified dynamics without a payload that was estimated with them, which is estimated again."""
+        """The identified dynamics; an estimated payload is removed, because it will be estimated again."""
         x = self.x.copy()
         if "payload_mass" in self.space.blocks:
             x[self.space.where("payload_mass")] = 0.0
@@ -42,11 +42,11 @@ def earlier_run(cfg, robot):
     """Return the `Earlier` of identify.from=, or None.
 
     Raises:
-        UserError: no identification of this robot is there, or calibration= names an arm, too.
+        UserError: RUN has no identification of this robot, or calibration= is given as well.
     """
     from r2s.identification.parameter_file import load_parameters, load_posterior
 
-    run, option = cfg.identify.get("from"), "identify.from"  # configs of older runs lack the key
+    run, option = cfg.identify.get("from"), "identify.from"  # older configs lack it
     if run is None:
         return None
     run = str(run)
@@ -59,12 +59,12 @@ def earlier_run(cfg, robot):
 
 
 def make_settings(cfg, torque, earlier=(), last=True):
-    """Return the `Settings` of an identification with this kind of torque.
+    """Return the `Settings` of an identification from this kind of torque.
 
     Args:
-        earlier: each an `Earlier`. If its kind of torque is another, it gives the links. If it is the same, it gives
-            all values, the friction family and the terms, so that then and now are values of one model.
-        last: whether it is the last of several kinds of torque; stated friction and sensors belong to the last.
+        earlier: list of `Earlier`. One with another kind of torque provides links and payload. One with the same kind
+            provides all values, friction family and terms, so that both identifications have the same model.
+        last: whether this is the last kind of torque; stated values of friction and sensors apply to the last only.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings
@@ -104,7 +104,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
 
 
 def check_known(robot, nominal, recording, settings):
-    """Raise UserError if a stated value does not fit the arm, or no recording shows it."""
+    """Raise UserError if a stated value does not fit the arm, or the recording cannot show the parameter."""
     from r2s.identification.stated import check_stated, stated_prior
     from r2s.identification.terms import scaled_prior, search_space
     from r2s.physics.dynamics import with_family
@@ -117,7 +117,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the dynamics from which an identification starts: all of an earlier run's, or only its links."""
+    """Return the initial dynamics of an identification: those of `earlier`, or for other torque only its links."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

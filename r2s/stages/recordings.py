@@ -1,7 +1,7 @@
 """The recordings of stage=identify and `r2s check`: one file or several, each with its own kind of torque.
 
-`data.path` and `data.validation` are a file, a pattern such as "logs/*.csv", {path: FILE, torque: motor, ...} with
-what differs from data., or a list of these.
+`data.path` and `data.validation` are a file, a pattern such as "logs/*.csv", a dict {path: FILE, torque: motor, ...}
+with the keys that differ from those of `data`, or a list of these.
 """
 
 import glob
@@ -17,15 +17,15 @@ from r2s.stages.data import check_other_motion, file_data, read_file
 from r2s.stages.parts import plain
 
 OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints", "payload")
-FIND = "find"  # payload of a recording that is to be found
-ORDER = ("measured", "motor", "commanded")  # of the fits: the last one gives the friction that a command overcomes
+FIND = "find"  # value of `payload` for a recording whose payload is to be identified
+ORDER = ("measured", "motor", "commanded")  # of the fits; the last gives the friction that a command has to overcome
 
 
 @dataclass(frozen=True)
 class Group:
     """Recordings of one kind of torque: {label: recording} of training and of validation motion.
 
-    loaded: with a payload that is to be found.
+    loaded: recordings with a payload that is to be identified.
     """
 
     torque: str
@@ -38,7 +38,7 @@ def recording_files(cfg, key="path"):
     """Return a `FileData` for each recording of data.path or data.validation.
 
     Raises:
-        UserError: a pattern without a file, an unknown key of an entry, or a file twice.
+        UserError: a pattern matches no file, an entry has an unknown key, or a file is named twice.
     """
     from omegaconf import OmegaConf
 
@@ -62,7 +62,7 @@ def recording_files(cfg, key="path"):
 
 
 def _matching(where: str, path: str) -> Iterator[str]:
-    """Yield a path, or the files of a pattern in the order of their names."""
+    """Yield the path, or, if it is a pattern, the matching files in the order of their names."""
     if not glob.has_magic(path) or located(path).exists():
         yield path
         return
@@ -72,7 +72,7 @@ def _matching(where: str, path: str) -> Iterator[str]:
 
 
 def of_one_reader(files):
-    """Return the `FileData`; topic and joints of a bag, the first file, do not count for other formats."""
+    """Return the `FileData`; if the first is a bag, remove its topic and joints from files of other formats."""
     from r2s.recordings.readers import is_bag
 
     if not is_bag(Path(files[0].path)):
@@ -81,17 +81,17 @@ def of_one_reader(files):
 
 
 def labels_of(files):
-    """Return a short label of each file: its stem, or its path where stems repeat."""
+    """Return a label for each file: the stem of its name, or its path if several files have that stem."""
     stems = [Path(f.path).stem for f in files]
     return [stem if stems.count(stem) == 1 else f.path for f, stem in zip(files, stems, strict=True)]
 
 
 def read_groups(robot, files, validation, share, cutoff_hz):
-    """Return the recordings as `Group`s in the order of their fits.
+    """Read the recordings; return one `Group` per kind of torque, in the order of the fits.
 
     Args:
-        files, validation: `FileData` of each; without `validation`, each recording holds out the `share` at its end,
-            or of every period. cutoff_hz: see `without_payload`.
+        files, validation: `FileData` of each file. Without `validation`, the share `share` at the end of each
+            recording, or of every period, is held out. cutoff_hz: see `without_payload`.
     """
     made: dict[str, Group] = {}
 
@@ -132,7 +132,7 @@ def read_groups(robot, files, validation, share, cutoff_hz):
 
 
 def _read(robot, file, several, cutoff_hz):
-    """Return the checked recording of a file, without its declared payload; with `several`, errors name it."""
+    """Return the checked recording of a file, less the torque of a known payload; `several`: errors name the file."""
     from r2s.identification.checks import check_recording
     from r2s.identification.payload.unloaded import without_payload
     from r2s.physics.payload import payload_of
@@ -158,7 +158,7 @@ def _split(recording, share, label):
 
 
 def whole(recordings, label=""):
-    """Return {label: recording} as one recording."""
+    """Return the recordings {label: recording} joined to one recording."""
     from r2s.recordings.joined import joined
 
     own = [replace(r, name=r.name or label) for label, r in recordings.items()]

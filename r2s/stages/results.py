@@ -1,4 +1,4 @@
-"""stage=results: a page of benchmarks/results made again in a clean clone of this commit, beside the committed page.
+"""stage=results: make a page of benchmarks/results again in a clean clone of this commit, and compare it.
 
 `python run.py -m +experiment=results` makes all pages that docs/results.md cites.
 """
@@ -17,21 +17,21 @@ from r2s.stages.parts import plain
 WHY: dict[str, str] = {}
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = Path("benchmarks/results")
-CLONE = "checkout"  # in the run folder
+CLONE = "checkout"  # name of the clone in the run folder
 
 
 def reads(cfg):
-    """Return the keys of the config that this stage reads; commands of other pages may change meanwhile."""
+    """Return the config keys that this stage reads, without the commands of other pages, which may change."""
     return {"results.page", "results.data", f"results.pages.{cfg.results.page}"}
 
 
 def commands_of(settings):
-    """Return the commands (lists of words) of `results.page`, with `results.data` put in.
+    """Return the commands (lists of words) of `results.page`, with the folder `results.data` inserted.
 
-    A command is `make ...` or the arguments of python.
+    A command is `make ...`, or the arguments of python.
 
     Raises:
-        UserError: no such page; a page that needs data and none given; no checkout of r2s.
+        UserError: there is no such page, no checkout of r2s, or no data for a page that needs it.
     """
     page, pages, data = (settings[k] for k in ("page", "pages", "data"))
     if page not in pages:
@@ -49,7 +49,7 @@ def commands_of(settings):
 
 
 def results(cfg, overrides):
-    """Page -> the same page of this commit, differences.csv, report.md."""
+    """Make a page again; write the new page, differences.csv and report.md."""
     from r2s.progress import Progress
     from r2s.provenance import git
     from r2s.reporting.page_comparison import compare_all
@@ -76,10 +76,10 @@ def results(cfg, overrides):
 
 
 def cloned(clone, paths):
-    """Clone this commit unless an earlier part of the run did; return {page: committed text ("": none)} and its hash.
+    """Clone this commit unless the clone exists; return {page: committed text, or ""} and the hash of the commit.
 
-    The tables of the clone's pages lose their rows, so that one that is not made again shows it. The clone appears
-    under its name when it is complete.
+    The rows of tables in the clone's pages are removed, so that a table that is not made again stays empty. The clone
+    appears under its name when it is complete.
     """
     from r2s.reporting.page_comparison import without_rows
 
@@ -100,10 +100,10 @@ def cloned(clone, paths):
 
 
 def execute(words, clone, log):
-    """Run `python WORDS`, or `make WORDS`, in the clone, whose r2s it imports; output goes to log.
+    """Run `python WORDS`, or WORDS if they begin with make, with the r2s of the clone; append the output to `log`.
 
     Raises:
-        UserError: the command fails; its last line is in the message.
+        UserError: the command fails; the message has the last line of its output.
     """
     command = words if words[0] == "make" else [sys.executable, *words]
     with open(log, "a+") as file:

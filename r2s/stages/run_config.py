@@ -1,4 +1,4 @@
-"""config.yaml of a run folder. It may be anybody's, so r2s calls only its own parts and the parts of `trust=`."""
+"""Read config.yaml of a run folder. Anybody may have written it, so only parts of r2s or of `trust=` are called."""
 
 import os
 import re
@@ -10,17 +10,17 @@ from r2s.errors import UserError
 from r2s.stages.parts import target
 
 PACKAGE = Path(__file__).parent.parent
-CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
-PROGRAM = "python run.py" if CONF.parent != PACKAGE else "r2s"  # what the user types
+CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # of a wheel, or of a checkout
+PROGRAM = "python run.py" if CONF.parent != PACKAGE else "r2s"  # how the user starts r2s
 TRUST = (
-    "R2S_TRUST"  # environment variable: `trust=` of a resumed search, whose trainings replay overrides of its folder
+    "R2S_TRUST"  # environment variable: `trust=` of a resumed search, whose trainings use the overrides in its folder
 )
-# ${oc.env:HOME}, what may become one, ${a${b}}, and a $ that is escaped
+# matches resolvers such as ${oc.env:HOME}, nested ${a${b}} that may become one, and an escaped $
 RESOLVER = re.compile(r"\$\{\s*(\w*)[^}]*(?::|\$\{)|\\\$")
 
 
 def loaded(path):
-    """Return a YAML file of a run folder as a config.
+    """Return the content of a YAML file of a run folder as a config.
 
     Raises:
         UserError: the file cannot be read or is no YAML.
@@ -36,10 +36,10 @@ def loaded(path):
 
 
 def modules(trust) -> list[str]:
-    """Return the modules of an option `trust=`: a name, names with commas, a list, or nothing.
+    """Return the module names in the option `trust=`: a name, names with commas, a list, or None.
 
     Raises:
-        UserError: it is anything else.
+        UserError: the option is anything else.
     """
     names = trust.strip("[]").split(",") if isinstance(trust, str) else trust
     if names is None:
@@ -50,30 +50,30 @@ def modules(trust) -> list[str]:
 
 
 def run_config(folder, trust=None):
-    """Return the config.yaml of a run folder, as `checked` does; the folder may be anybody's.
+    """Return the config.yaml of a run folder after `checked`; anybody may have written it.
 
     Raises:
-        UserError: the file cannot be read, or names what `trust` does not.
+        UserError: the file cannot be read, or names parts outside r2s and `trust`.
     """
     return checked(loaded(Path(folder) / "config.yaml"), Path(folder) / "config.yaml", trust)
 
 
 def replayed(cfg):
-    """Return a composed config; `checked` if its overrides come from a run folder."""
+    """Return a composed config, after `checked` if its overrides come from a run folder."""
     return checked(cfg, "resume", os.environ[TRUST]) if TRUST in os.environ else cfg
 
 
 def checked(cfg, where, trust=None):
-    """Return a config of a run folder with its interpolations resolved, if no part of it can run foreign code.
+    """Return a run folder's config with resolved interpolations; raise UserError if it could run untrusted code.
 
-    A part is called, and its module imported, so it has to be one that conf/ names in the same group, or be defined
-    in a module of `trust`. Resolvers can read the environment, so they count as parts of the module `oc`.
+    r2s imports the module of a part and calls the part. So conf/ has to name the part in the same group, or a module
+    of `trust` has to define it. Resolvers can read the environment, so they count as parts of the module `oc`.
 
     Args:
-        where: the file, for errors. trust: modules that the user trusts, see `modules`; it replaces the config's own.
+        where: file, for errors. trust: modules that the user trusts, see `modules`; replaces the config's `trust`.
 
     Raises:
-        UserError: another part, which was neither imported nor called.
+        UserError: the config names another part, which has been neither imported nor called.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -102,7 +102,7 @@ def checked(cfg, where, trust=None):
 
 
 def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield (keys, value) of nested settings."""
+    """Yield (keys, value) for each leaf of nested settings."""
     if not isinstance(node, dict | list):
         yield path, node
         return
@@ -111,7 +111,7 @@ def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...],
 
 
 def _is_own(key, value) -> bool:
-    """Return whether a setting is no dotted path, or one of conf/."""
+    """Return whether a setting names no part (dotted path), or one that conf/ names in the same group."""
     if key == ("friction", "family"):
         return "." not in str(value)
     if key[-1:] != ("_target_",):
@@ -121,7 +121,7 @@ def _is_own(key, value) -> bool:
 
 
 def _is_defined_in(key, value, trusted) -> bool:
-    """Return whether a dotted path is of a trusted module, and a part not only reached through it."""
+    """Return whether a trusted module defines the part at a dotted path; merely importing the part is not enough."""
     head = str(value).split(".")[0]
     if head not in trusted or key[-1] != "_target_":
         return head in trusted

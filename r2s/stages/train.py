@@ -1,4 +1,4 @@
-"""stage=train: train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
+"""stage=train: train one policy in simulation, evaluate it, and save it as policy.pt and policy.onnx."""
 
 import copy
 import math
@@ -36,12 +36,12 @@ WHY = {
     "search": "only stage=identify searches; calibration= loads its result",
 }
 CALIBRATION = ("parameters.yaml", "posterior.npz")  # files of an identification that a training copies
-SURFACE = ("contact.yaml", "contact_posterior.npz")  # likewise, of dr.surface=
-UPDATE_THREADS = 4  # at most; networks of 128 units have no work for more
+SURFACE = ("contact.yaml", "contact_posterior.npz")  # files of dr.surface= that a training copies
+UPDATE_THREADS = 4  # most threads for updates; networks of 128 units cannot use more
 
 
 def reads(cfg):
-    """Return the config keys of this stage."""
+    """Return the config keys that this stage reads."""
     keys = {"robot", "dr", "algo", "task", "control", "safety", "evaluation.episodes", "calibration"}
     if not cfg.calibration:
         keys |= {"friction", "inertia"}
@@ -52,9 +52,9 @@ def reads(cfg):
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a training, made before its run folder, so that a config error leaves no folder.
+    """The parts of a training. They are made before its run folder, so that a config error leaves no folder.
 
-    An algo without training has only the first five; `algo` is then the controller.
+    Without training, only the first five are set, and `algo` is the controller.
     """
 
     robot: Any
@@ -70,7 +70,7 @@ class Parts:
 
 
 def make_parts(cfg):
-    """Return the parts of the training of a config.
+    """Return the parts of the training that a config describes.
 
     Raises:
         UserError: a setting is wrong.
@@ -111,7 +111,7 @@ def make_parts(cfg):
 
 
 def check_length(budget, loop, n_envs, key):
-    """Raise UserError if the budget ends before the first update, for which algo.`key` is the reason."""
+    """Raise UserError if the budget ends before the first update; the message names algo.`key` as the reason."""
     before = n_envs * max(1, math.ceil(loop.learning_starts / n_envs))
     if budget.env_steps is not None and budget.env_steps <= before:
         raise UserError(
@@ -121,7 +121,7 @@ def check_length(budget, loop, n_envs, key):
 
 
 class Selection:
-    """The best and the last of a training's evaluations; of two equal scores the later counts as better."""
+    """The best and the last evaluation of a training. If scores are equal, the later evaluation is the better one."""
 
     def __init__(self, task):
         self._task, self.best, self.last = task, {}, {}
@@ -135,7 +135,7 @@ class Selection:
 
 
 def train(cfg, overrides):
-    """Train one policy in simulation, evaluate it, and save it."""
+    """Train one policy in simulation, evaluate it, and save it; a controller without learning is only evaluated."""
     from r2s.learning.checkpoint import Checkpoint
     from r2s.learning.policy import save_policy
     from r2s.learning.train import Callbacks
@@ -175,7 +175,7 @@ def train(cfg, overrides):
 
 
 def conclude(cfg, run, parts, selection):
-    """Evaluate the best and the last policy on the goals of reports; write policy.onnx, summary.json and the page."""
+    """Evaluate the best and last policy on goals without selection; write policy.onnx, summary.json and the page."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.learning.policy import export_onnx, load_policy
     from r2s.reporting import pages
@@ -193,13 +193,13 @@ def conclude(cfg, run, parts, selection):
 
 
 def share_threads(cfg):
-    """Return the threads of updates and those of the arms' physics, which run at the same time."""
+    """Return the number of threads for updates, and that for the physics, which runs at the same time."""
     learning = max(1, min(UPDATE_THREADS, all_threads(cfg) // 2))
     return learning, max(1, all_threads(cfg) - learning)
 
 
 def split_algo(cfg):
-    """Return number of arms, env steps of demonstrations, `Loop` and the learner's settings of conf/algo."""
+    """Return number of arms, env steps of demonstrations, `Loop`, and the other settings of conf/algo."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
@@ -214,12 +214,12 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config of a training; if resumed, its models are its own copies, as the originals may be gone."""
+    """Return the config; a resumed training reads its own copies of models, because the originals may be gone."""
     if not cfg.resume:
         return cfg
     model = cfg.copy()
     if cfg.calibration and (Path(cfg.resume) / CALIBRATION[0]).is_file():
-        if cfg.dr.get("calibration") == cfg.calibration:  # dr=identified draws from the same one
+        if cfg.dr.get("calibration") == cfg.calibration:  # dr=identified draws from the same calibration
             model.dr.calibration = cfg.resume
         model.calibration = cfg.resume
     if cfg.dr.get("surface") and (Path(cfg.resume) / SURFACE[0]).is_file():
@@ -228,7 +228,7 @@ def with_own_calibration(cfg):
 
 
 def keep_calibration(cfg, folder):
-    """Copy the identified parameters and surface into the run folder, so that it transfers without its parents."""
+    """Copy identified parameters and surface into the run folder, so that a transfer needs no other run folder."""
     import shutil
 
     from r2s.files import atomic_write
@@ -237,7 +237,7 @@ def keep_calibration(cfg, folder):
         if not given or (folder / names[0]).is_file():
             continue
         source = Path(given)
-        for name in reversed(names):  # `with_own_calibration` looks for the first, so that is written last
+        for name in reversed(names):  # write the first name last, because `with_own_calibration` looks for it
             path = source / name if source.is_dir() else source.with_name(name)
             path = source if name == names[0] and not source.is_dir() else path
             if path.is_file():
@@ -252,7 +252,7 @@ def title(cfg):
 
 
 def evaluate_reference(cfg, overrides, parts):
-    """Evaluate an algo without training in the same way as a trained policy."""
+    """Evaluate a controller, which needs no training, in the same way as a trained policy."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures

@@ -1,4 +1,4 @@
-"""stage=transfer: the same policy on the same goals in simulators and on an arm."""
+"""stage=transfer: run one policy on the same goals in simulators and on an arm."""
 
 import shutil
 from contextlib import contextmanager, nullcontext
@@ -29,24 +29,24 @@ from r2s.stages.build import (
 from r2s.stages.parts import part
 from r2s.stages.run_config import run_config
 
-REST_GAP = 0.05  # share of the episodes; a larger gap in `rest` between prediction and arm raises a warning
+REST_GAP = 0.05  # share of episodes; if `rest` on the arm is lower than predicted by more, print a warning
 FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward", "costs")
 WHY = {k: "it comes from the policy's run" for k in FROM_POLICY}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
 
 
 def reads(cfg):
-    """Return the config keys of this stage."""
+    """Return the config keys that this stage reads."""
     return {"policy", "simulator", "arm", "adapt", "safety", "evaluation.episodes"}
 
 
 def trained_config(cfg, option="policy"):
-    """Return the run folder of `policy=` and its config; `option` names it in errors.
+    """Return the run folder of `policy=` and its config; errors begin with `option`.
 
-    The folder also holds the calibration of the training, so it needs no other folder.
+    The config's calibration and surface become the copies in this folder, so no other folder is needed.
 
     Raises:
-        UserError: it is no finished training.
+        UserError: the folder is no finished training.
     """
     if not cfg.policy:
         raise UserError(f"{option} must be given: {option}=RUN_FOLDER, of a finished stage=train")
@@ -66,12 +66,12 @@ def trained_config(cfg, option="policy"):
 
 @dataclass(frozen=True)
 class Request:
-    """A policy and the episodes that it runs everywhere.
+    """A policy and the episodes to run in every simulator and on the arm.
 
     Attributes:
-        robot, task, center: of the training; center of its randomization.
-        source: run folder of the policy. policy: trained, or a controller. starts, goals: of all episodes.
-        draw: randomization of the training; None with simulator=none. soft_start_s: s, of the arm.
+        robot, task, center: of the training; `center` is the center of its randomization.
+        source: run folder of the policy. policy: a trained one, or a controller. starts, goals: of all episodes.
+        draw: randomization of the training; None with simulator=none. soft_start_s: of the arm, s.
     """
 
     robot: Any
@@ -86,10 +86,10 @@ class Request:
 
 
 def make_request(cfg):
-    """Return the request, after a check that a safe path leads to every start.
+    """Return the request; if there is an arm, check that a safe path leads to every start posture.
 
     Raises:
-        UserError: no finished training, neither simulator nor arm, or a start without a safe path.
+        UserError: no finished training, neither simulator nor arm, an unsuitable arm, or no safe path to a start.
     """
     from r2s.excitation.motion_checks import Space
     from r2s.excitation.paths import approach
@@ -128,20 +128,20 @@ def make_request(cfg):
 
 
 def has_box(surface):
-    """Return whether this setting of arm.surface is a box."""
+    """Return whether a value of arm.surface is a box."""
     return surface == "box" or (hasattr(surface, "get") and surface.get("box") is not None)
 
 
 @contextmanager
 def goal_progress(label):
-    """Yield a callback (goals done, total) that shows progress."""
+    """Yield a callback with the arguments (goals done, total) that shows progress."""
     progress = Progress(label)
     yield lambda k, n: progress(k / n, f"{k} goals")
     progress.close()
 
 
 def run_in_simulators(cfg, request, engine):
-    """Return {name: measures} and {name: Episodes} of MuJoCo and of the second engine, if any."""
+    """Run the episodes in MuJoCo and in `engine`, if not None; return {name: measures} and {name: Episodes}."""
     from r2s.engines.episodes import EngineArms
     from r2s.learning.evaluate import make_evaluation
     from r2s.tasks.rollout import gap, rollout
@@ -163,10 +163,10 @@ class ArmResult:
     """Result of the episodes on an arm.
 
     Attributes:
-        tried: (k,) numbers of the goals that began. episodes: (k) of them, None without any.
-        stops: reasons why episodes ended early. timing: of the 1 kHz cycles, None if unknown.
+        tried: (k,) indices of the goals whose episodes began. episodes: these k episodes; None if k = 0.
+        stops: stops that ended episodes early. timing: of the 1 kHz cycles; None if unknown.
         halted: reason why the remaining goals did not run; None: all ran.
-        blocked: stop that ended the last episode of an arm with an operator; None: it did not stop.
+        blocked: reason of a stop that ended the last episode of an arm with an operator; None: no such stop.
     """
 
     tried: Any = ()
@@ -178,7 +178,7 @@ class ArmResult:
 
 
 def run_on_arm(cfg, request, runner, predicted):
-    """Return the result of the goals for which the prediction has no contact, and nothing that the driver stops."""
+    """Run the goals whose predicted episodes have no collision and stay far enough from one; return the result."""
     import numpy as np
 
     from r2s.physics.collision import CollisionCheck
@@ -200,13 +200,13 @@ def run_on_arm(cfg, request, runner, predicted):
     with goal_progress(f"on {cfg.arm.name}") as progress:
         done = rollout(request.policy, runner, request.task, request.starts[tried], request.goals[tried], progress)
     stops = [replace(stop, episode=int(tried[stop.episode])) for stop in runner.stops]
-    tried = tried[: runner.done]  # goals that did not begin are no failures
+    tried = tried[: runner.done]  # goals that did not begin do not count as failures
     episodes = select_episodes(done, slice(len(tried)))
     return ArmResult(tried, episodes, stops, runner.timing, runner.halted, runner.blocked)
 
 
 def run_on_twins(cfg, request, open_runner):
-    """Return the result of copies of one twin in parallel processes."""
+    """Run the episodes on copies of one twin in parallel processes; return the `ArmResult`."""
     import numpy as np
 
     from r2s.arm.parallel_episodes import run_parallel_episodes
@@ -220,7 +220,7 @@ def run_on_twins(cfg, request, open_runner):
 
 
 def predict(cfg, request, robot):
-    """Return the episodes that the model of the training predicts for the arm."""
+    """Return the episodes that the model at the center of the training's randomization predicts for the arm."""
     from r2s.learning.vector_arms import VectorArms
     from r2s.tasks.rollout import rollout
 
@@ -232,9 +232,9 @@ def predict(cfg, request, robot):
 
 
 def save_arm_result(run, request, name, result, predicted):
-    """Write stops.txt, timing.csv and a row per episode to episodes_<arm>.csv; return the measures of the arm.
+    """Write stops.txt, timing.csv and episodes_<arm>.csv with a row per episode; return the measures on the arm.
 
-    predicted: episodes to compare with, or None.
+    predicted: predicted episodes for the comparison, or None.
     """
     import pandas as pd
 
@@ -254,9 +254,9 @@ def save_arm_result(run, request, name, result, predicted):
 
 
 def rest_warning(rows, name):
-    """Return a warning if a policy rests less on an arm than predicted, else None.
+    """Return a warning if fewer episodes end at rest on the arm than predicted, else None.
 
-    Success and path gap do not show a shaking policy, because its end effector hardly moves
+    Success and path gap do not reveal a shaking policy, because its end effector hardly moves
     (benchmarks/results/transfer.md).
     """
     seen, expected = (rows.get(k, {}).get("rest") for k in (name, "predicted"))
@@ -269,7 +269,7 @@ def rest_warning(rows, name):
 
 
 def transfer(cfg, overrides):
-    """Evaluate a trained policy in simulators and on an arm, on the same goals; adapters act on the arm only."""
+    """Run a policy on the same goals in simulators and on an arm; an adapter acts on the arm only."""
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures
     from r2s.tasks.measures import write_measures
@@ -280,14 +280,14 @@ def transfer(cfg, overrides):
     engine = part(cfg.simulator, "simulator", robot) if "_target_" in cfg.simulator else None
     if twin := is_twin(cfg):
         with opened_arm(cfg, robot):
-            pass  # a wrong setting of the twin raises before there is a run folder
+            pass  # raise for a wrong setting of the twin before a run folder exists
     open_runner = partial(opened_runner, cfg, robot, task, request.center, adapter=adapter)
     opened = nullcontext() if name == "none" or twin else open_runner()
     rows, episodes, predicted, result = {}, {}, None, ArmResult()
     with opened as runner, open_run(cfg, overrides, parents=[str(request.source)]) as run:
         shutil.copyfile(request.source / "config.yaml", run.folder / "policy.yaml")
         write_measures(run.folder, task.measure_table)
-        if twin:  # first, because it forks: there are no threads yet
+        if twin:  # first, because it forks, which must precede any thread
             result = run_on_twins(cfg, request, open_runner)
         if request.draw is not None:
             rows, episodes = run_in_simulators(cfg, request, engine)
@@ -296,7 +296,7 @@ def transfer(cfg, overrides):
         if runner:
             result = run_on_arm(cfg, request, runner, predicted)
         if request.draw is None:
-            predicted = None  # it served the check for contacts only
+            predicted = None  # it was needed only to skip goals on the arm
         if predicted is not None:
             rows["predicted"], episodes["predicted"] = task.measures(predicted) | {"stops": 0}, predicted
         if name != "none":
@@ -309,7 +309,7 @@ def transfer(cfg, overrides):
         print_measures(console(), task.measure_table, rows, f"{request.source.name} on {len(goals)} goals")
         if warning := rest_warning(rows, name):
             print(warning)
-        if (why := result.halted or result.blocked) is not None:  # no later job moves a blocked arm
+        if (why := result.halted or result.blocked) is not None:  # a later job must not move a blocked arm
             count = len(result.tried)
             raise Stopped(f"{count} of {len(goals)} goals done on arm={name}: {why}; see {run.folder}")
     print(f"written: {run.folder}")

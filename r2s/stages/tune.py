@@ -1,4 +1,4 @@
-"""stage=tune: search the settings of a training with Optuna; each trial is a run folder of stage=train."""
+"""stage=tune: search settings of trainings with Optuna; each trial has a run folder of stage=train."""
 
 import csv
 import math
@@ -20,31 +20,31 @@ from r2s.stages.build import all_threads, console, open_run, unread
 from r2s.stages.parts import called, plain
 from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 
-MOST_STARTS = 3  # of a training that the system ends, for example because memory is short
+MOST_STARTS = 3  # of a training that the system keeps ending, for example because memory is short
 POLL_S = 0.2
-STOP_S = 20.0  # for a training to end after Ctrl-C, and again after SIGTERM; a step or an evaluation takes less
+STOP_S = 20.0  # s, to wait for the end of a training after each signal; a step or an evaluation takes less
 EDGE = 0.05  # share of a range at each end that counts as its edge
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 
 def reads(cfg):
-    """Return the config keys of this stage and its trainings."""
+    """Return the config keys that this stage and its trainings read."""
     return {"tune", *train.reads(cfg)}
 
 
 @dataclass(frozen=True)
 class Tune:
-    """`tune` of the config.
+    """Settings of the config group `tune`.
 
     Attributes:
-        trials: total number. workers: parallel trainings of one thread each; None: as threads=.
-        startup: random trials before TPE and the pruner start.
-        measure: key of a measure of the task; the last evaluation counts.
-        space: {option: [values], or a range that `parse_range` reads}.
-        against: glob of trainings to compare with, for example of a grid.
+        trials: total number. workers: number of parallel trainings, with one thread each; None: as threads=.
+        startup: number of random trials before TPE and the pruner start.
+        measure: key of the measure to optimize, a measure of the task; its value in the last evaluation counts.
+        space: {option: list of values, or a range for `parse_range`}.
+        against: pattern of run folders of trainings to compare with, for example of a grid; None: no comparison.
 
     Raises:
-        UserError: a number out of its range, an invalid space, or a glob without a match.
+        UserError: a number is outside its range, the space is invalid, or the pattern matches nothing.
     """
 
     trials: int
@@ -71,7 +71,7 @@ class Tune:
 
 
 def parse_range(key: str, axis: Any) -> tuple[float, float, bool]:
-    """Return (low, high, logarithmic) of an axis "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
+    """Return (low, high, whether logarithmic) of a range such as "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
 
     Raises:
         UserError: the text has neither form.
@@ -90,7 +90,7 @@ def parse_range(key: str, axis: Any) -> tuple[float, float, bool]:
 
 
 def suggest(trial: Any, space: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings {option: value} of an Optuna trial."""
+    """Return the settings {option: value} that Optuna suggests for a trial."""
     out = {}
     for key, axis in space.items():
         if isinstance(axis, list):
@@ -102,14 +102,14 @@ def suggest(trial: Any, space: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return settings that contain every listed value and both ends of every range at least once."""
+    """Return a list of settings in which every listed value and both ends of every range occur at least once."""
     values = {key: axis if isinstance(axis, list) else [*parse_range(key, axis)[:2]] for key, axis in space.items()}
     first = {key: own[0] for key, own in values.items()}
     return [first, *({**first, key: value} for key, own in values.items() for value in own[1:])]
 
 
 def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
-    """Return a line per number of the best trial at an edge: the last `EDGE` of a range, or an end of a list."""
+    """Return a line for each setting of the best trial at an edge: within EDGE of a range's end, or a list's end."""
     from r2s.reporting.comparison.scores import edge, is_number
 
     lines = []
@@ -125,7 +125,7 @@ def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
 
 
 def training_words(cfg, overrides, settings):
-    """Return the words of a training: the typed overrides that it reads, and the settings {option: value}."""
+    """Return the overrides of a training: the typed ones that it reads, and the settings {option: value}."""
     step = cfg.copy()
     step.stage = "train"
     typed = [o for o in overrides_for(overrides, step) if not o.startswith(("resume=", "skip_completed="))]
@@ -133,7 +133,7 @@ def training_words(cfg, overrides, settings):
 
 
 def check_trainings(cfg, overrides, space):
-    """Return the parts of one of the trainings; raise UserError if any would refuse an override or a value."""
+    """Return the parts of one training; raise UserError if any training would refuse an override or a value."""
     typed = {o.lstrip("+~").split("=")[0] for o in overrides}
     if both := sorted(typed & set(space)):
         raise UserError(f"{both[0]}: tune.space searches it; leave it out, or give tune.space={{{both[0]}: [VALUE]}}")
@@ -147,7 +147,7 @@ def check_trainings(cfg, overrides, space):
 
 
 def logged_measures(parts):
-    """Return {key: Measure} of what a training logs; of COMMON some need an arm. A short evaluation shows which."""
+    """Return {key: Measure} of the measures that a training logs, found by a short evaluation; others need an arm."""
     import torch
 
     from r2s.learning.evaluate import make_evaluation
@@ -159,12 +159,12 @@ def logged_measures(parts):
 
 
 class TrialRun:
-    """The training of an Optuna trial: a run folder of stage=train, and the process that writes it.
+    """The training of an Optuna trial: a run folder of stage=train, and the process that writes in it.
 
-    A training that a killed tune left running may still write its folder; then there is no process to start.
+    If a killed stage=tune left a training running, that process may still write in the folder; then none is started.
 
     Args:
-        trial: Optuna's trial. folder: run folder. words: command of the training. log: file for its stderr.
+        trial: of Optuna. folder: run folder. words: command of the training. log: file for its stderr.
     """
 
     def __init__(self, trial: Any, folder: Path, words: Sequence[str], log: Path):
@@ -174,16 +174,16 @@ class TrialRun:
         self._reported = len(trial.study.trials[trial.number].intermediate_values)
 
     def start(self) -> None:
-        """Start the training, or resume it."""
+        """Start the training, or resume it if its run folder exists."""
         self.starts += 1
         self.log.parent.mkdir(exist_ok=True)
         with open(self.log, "a") as log:
             self._process = subprocess.Popen(self._words, stdout=subprocess.DEVNULL, stderr=log)
 
     def stop(self) -> None:
-        """End the training as Ctrl-C does, so that its folder has the status stopped.
+        """End the training as Ctrl-C does, so that its run folder gets the status stopped.
 
-        A process that a shell started in the background ignores Ctrl-C, as do its children; harder signals end those.
+        A process started in the background of a shell ignores Ctrl-C, as do its children, so other signals follow.
         """
         if self._process is None:
             return
@@ -196,7 +196,7 @@ class TrialRun:
                 continue
 
     def status(self) -> str:
-        """Return started (by this tune, running), left (by another, running), or the status of the run folder."""
+        """Return started (this process runs it), left (another process runs it), or the status of the run folder."""
         from r2s.runs import is_locked, read_meta
 
         if self._process is not None and self._process.poll() is None:
@@ -206,10 +206,10 @@ class TrialRun:
         return "left" if is_locked(self.folder) else read_meta(self.folder)["status"]
 
     def report(self, measure: str) -> list[float]:
-        """Report new evaluations to Optuna; return the measure of every evaluation."""
+        """Report new evaluations to Optuna; return the values of the measure in all evaluations so far."""
         path = self.folder / "evaluations.csv"
         text = path.read_text() if path.is_file() else ""
-        complete = text[: text.rfind("\n") + 1]  # the training may be writing the last row
+        complete = text[: text.rfind("\n") + 1]  # the training may still be writing the last row
         values = [float(row[measure]) for row in csv.DictReader(complete.splitlines())]
         for k in range(self._reported, len(values)):
             self.trial.report(values[k], k)
@@ -218,7 +218,7 @@ class TrialRun:
 
 
 def follow(study: Any, one: TrialRun, measure: str) -> bool:
-    """Report evaluations, start the training if necessary, and prune it; return whether the trial is finished.
+    """Report evaluations, start the training if necessary, prune it if bad; return whether the trial is finished.
 
     Raises:
         UserError: the training failed before its first evaluation, or ended MOST_STARTS times.
@@ -249,7 +249,7 @@ def follow(study: Any, one: TrialRun, measure: str) -> bool:
 
 
 def search(study: Any, how: Tune, make: Callable[[Any], TrialRun], workers: int) -> None:
-    """Run trials in parallel until there are `how.trials`; unfinished trials of a stopped search come first."""
+    """Run trials in parallel until `how.trials` exist; begin with unfinished trials of a stopped search."""
     import optuna
 
     from r2s.progress import Progress
@@ -278,13 +278,13 @@ def search(study: Any, how: Tune, make: Callable[[Any], TrialRun], workers: int)
 
 
 def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize", "maximize"]) -> Any:
-    """Return the Optuna study of a run folder, study.db; a resumed search draws from another seed."""
+    """Return the Optuna study in study.db of a run folder; a resumed search draws with another seed."""
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     storage = f"sqlite:///{run.folder / 'study.db'}"
     study = optuna.create_study(study_name="tune", storage=storage, direction=direction, load_if_exists=True)
-    # the storage keeps the drawn settings, not the state of the generator
+    # study.db has the drawn settings, but not the state of the generator
     study.sampler = optuna.samplers.TPESampler(
         seed=(seed + 1000 * len(study.trials)) % 2**32, n_startup_trials=startup
     )
@@ -293,7 +293,7 @@ def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize",
 
 
 def tune(cfg, overrides):
-    """Search settings: ask for a trial, train, report its evaluations, prune; write trials.csv and the page."""
+    """Search settings with Optuna trials, each of which is a training; write trials.csv and the page."""
     optional_import("optuna", "stage=tune", "sweeps")
     from r2s.reporting.tuning import against_table, read_grid, trials_table, tuning_page
     from r2s.runs import read_summary
@@ -317,7 +317,7 @@ def tune(cfg, overrides):
         if done.empty:
             raise UserError(f"tune: no trial of {len(trials)} is complete")
         best = done.sort_values("value", key=lambda values: measure.sign * values).iloc[-1]
-        # the value is the best of many on goals that chose it; these goals chose nothing
+        # the best value is biased, as its goals selected it; `last` is from goals that selected nothing
         last = read_summary(Path(cfg.root) / "train" / f"{run.folder.name}_{int(best['trial'])}", "tune")["last"]
         counts = trials["state"].value_counts().to_dict()
         run.summary({"best": best.to_dict() | {"unseen": last[how.measure]}, "trials": counts})
@@ -337,7 +337,7 @@ def tune(cfg, overrides):
 
 
 def make_trial(cfg, overrides, run, space, trial):
-    """Return the training of an Optuna trial."""
+    """Return the `TrialRun` of an Optuna trial, with the settings that Optuna suggests for it."""
     name = f"{run.folder.name}_{trial.number}"
     words = training_words(cfg, overrides, suggest(trial, space))
     words += [f"root={cfg.root}", f"name={name}", "skip_completed=true"]

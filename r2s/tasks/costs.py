@@ -1,10 +1,10 @@
-"""Costs beside a reward, each with a limit of its mean, and a Lagrange multiplier per cost that a training adapts.
+"""Costs in addition to the reward: a training limits the mean of each by a Lagrange multiplier that it adapts.
 
 Maximize the mean reward r subject to mean costs c_k <= d_k (a constrained Markov decision process, Altman 1999):
 the policy maximizes r - sum_k lambda_k c_k / d_k, while lambda_k grows with c_k / d_k - 1 and stays at or above 0
 (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization, ICLR 2019). The replay buffer stores the costs
-in their units, and an update weights them with the present multipliers, so one critic serves all four algorithms and
-no stored transition becomes stale. Means are over the steps of the training, exploration included.
+in their units, and an update weights them with the current multipliers. So one critic serves all four algorithms
+and no stored transition becomes stale. Means are over the steps of the training, exploration included.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,8 +19,8 @@ from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State
 
 MARGIN_RAD = 0.1  # rad, from a position limit: where the safety filter starts to fade the torque
-PATIENCE = 50_000  # env steps in which a multiplier grows by 1 at twice its limit, as in rewards.py
-MOST = 50.0  # largest multiplier: a cost that no policy holds may not silence the reward for the rest of the training
+PATIENCE = 50_000  # env steps in which a multiplier grows by 1 while its cost is twice the limit, as in rewards.py
+MOST = 50.0  # largest multiplier: a limit that no policy can meet must not drown the reward for the whole training
 
 
 def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
@@ -49,10 +49,10 @@ COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {
 
 
 class ConstrainedReward(Reward):
-    """A reward with costs: terms of the reward, then the costs in their units, with weights -lambda / limit.
+    """A reward with costs. Its terms are the reward's, then the costs in their units, with weights -lambda / limit.
 
     Args:
-        reward: what is maximized. robot: the arm. limits: {cost: mean that it may reach, in its unit}, of COSTS.
+        reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost, in its unit}.
 
     Raises:
         UserError: an unknown cost, or a limit that is not positive.
@@ -68,11 +68,11 @@ class ConstrainedReward(Reward):
 
     @property
     def factor(self) -> np.ndarray:
-        """(1 + k,), at the start: the factor of the reward, and the multipliers."""
+        """(1 + k,), initial values of the reward's factor and of the multipliers of the costs."""
         return np.array([self._reward.factor, *np.zeros(len(self._names))])
 
     def terms(self, task: Any) -> tuple[str, ...]:
-        """Return the reward's terms and the costs; raise UserError for a cost that the task does not have."""
+        """Return the names of reward terms and costs; raise UserError for a cost that does not fit the task."""
         for name in self._names:
             if name != "limit_margin" and not task.touches:
                 raise UserError(f"costs.{name}: {type(task).__name__} touches nothing; limit_margin is allowed")
@@ -85,7 +85,7 @@ class ConstrainedReward(Reward):
     def judge(
         self, task: Any, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (m,) m, and terms and costs (m, k)."""
+        """Return the distance (m,) m, and the terms and costs (m, k)."""
         distance, terms = self._reward.judge(task, state, ddq, goals, reference)
         costs = [COSTS[name](self._robot, task, state, goals) for name in self._names]
         return distance, np.column_stack([terms, *costs])
@@ -98,6 +98,6 @@ class ConstrainedReward(Reward):
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> np.ndarray:
         """Return the reward's factor and the multipliers after `env_steps` steps with mean terms `seen` (k,)."""
         own = len(seen) - len(self._names)
-        beyond = seen[own:] / self._limits - 1.0  # not clipped: rare large costs would count less than their mean
+        beyond = seen[own:] / self._limits - 1.0  # not clipped, or rare large costs would count too little
         multipliers = (factor[1:] + beyond * env_steps / PATIENCE).clip(0.0, MOST)
         return np.array([self._reward.adapt(factor[0], progress, seen[:own], env_steps), *multipliers])

@@ -25,7 +25,7 @@ class Measure:
         key: column of evaluations.csv. short: column heading of a table. title: name in figures and sentences.
         unit: unit of the shown value, "" if dimensionless. scale: shown value / stored value.
         digits: decimals shown. lower_is_better: direction.
-        root_mean_square: several values are averaged as the root of their mean square.
+        root_mean_square: whether several values are averaged as the root of their mean square.
     """
 
     key: str
@@ -59,7 +59,7 @@ class Measure:
         return f"{self.scale * value:.{self.digits if digits is None else digits}f}"
 
     def in_words(self, value: float | None) -> str:
-        """Return "success at 1 cm 98 %"."""
+        """Return title, value and unit, such as "success at 1 cm 98 %"."""
         return f"{self.title} {self.cell(value)} {self.unit}".strip()
 
 
@@ -77,11 +77,11 @@ GAP = COMMON[0]
 
 @dataclass(frozen=True)
 class MeasureTable:
-    """The measures of a task, and which of them each table and figure shows. Entries of the lists are keys.
+    """The measures of a task, and the keys of those that each table and figure shows.
 
     Attributes:
-        measures: the task's own; COMMON are known besides.
-        selection: measures that compare trainings. The first must exist in a row, the last ranks groups.
+        measures: those of the task; COMMON are always added.
+        selection: measures that compare trainings. A row must contain the first; the last ranks groups of trainings.
         rows: columns of the table with a row per simulator and arm.
         comparison: columns of the table of trainings. curves: panels of the learning figure.
         scores: panels of the figure of scores.
@@ -91,7 +91,7 @@ class MeasureTable:
         error: name, unit and scale of `Episodes.distance`. error_levels: lines in its figure, in that unit.
         reward: name of `Episodes.reward`.
 
-    Empty lists take `selection`; `rows` and `diagnostics` take all measures and COMMON.
+    Defaults of empty lists: `measures` for `rows`, COMMON for `diagnostics`, else `selection`.
     """
 
     measures: tuple[Measure, ...]
@@ -129,7 +129,7 @@ class MeasureTable:
         return self.known[key]
 
     def in_words(self, row: Mapping[str, Any]) -> list[str]:
-        """Return the measures of selection that a row has: ["success at 1 cm 98 %", ...]."""
+        """Return those measures of `selection` that the row contains: ["success at 1 cm 98 %", ...]."""
         return [self[key].in_words(float(row[key])) for key in self.selection if row.get(key) not in (None, "")]
 
 

@@ -1,4 +1,4 @@
-"""Task press: touch a surface whose place is roughly known, hold a force against it, and follow its step."""
+"""Task press: touch a surface of roughly known position, hold a force against it, and follow a step of the force."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,19 +16,19 @@ from r2s.tasks.press_measures import PRESS, WINDOW_S, press_measures
 from r2s.tasks.surface_task import FAR_N, FINE_N, HARD_N, NORMAL, SurfaceTask, near, rough
 from r2s.tasks.task import Episodes, State
 
-LEAST_STEP = 0.2  # of the range of forces, the smallest step
-REVERSAL_S = 0.2  # s, in which the direction of friction changes after a step
+LEAST_STEP = 0.2  # smallest step, share of the range of forces
+REVERSAL_S = 0.2  # s, in which the friction feedforward reverses after a step down
 
 
 @dataclass(frozen=True)
 class PressTask(SurfaceTask):
     """Press on a surface; a `Task` (r2s/tasks/task.py) from conf/task/press.yaml.
 
-    A goal is the row of `SurfaceTask`, with the forces before and after the step.
+    A goal is the row of `SurfaceTask`; its two forces are those before and after the step.
 
     Attributes:
-        step_s: s, when the force steps. The others: see `SurfaceTask`.
-        creep: m/s, along the normal, at which the fastest joint has the first speed of the controller's friction.
+        step_s: s, time of the force step. The others: see `SurfaceTask`.
+        creep: m/s, speed along the normal at which the fastest joint moves at FIRST_DQ (r2s/physics/impedance.py).
     """
 
     step_s: float = 3.5
@@ -53,7 +53,7 @@ class PressTask(SurfaceTask):
         return replace(task, creep=FIRST_DQ / float(np.abs(moves).max()))
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
-        """Return (1, 3) m ~ U(disc of `spread` on the plane)."""
+        """Return one point (1, 3) m ~ U(disc of radius `spread` on the plane)."""
         about, away = rng.uniform(0, 2 * np.pi), self.spread * np.sqrt(rng.uniform())
         return away * np.array([[np.cos(about), np.sin(about)]]) @ axes
 
@@ -71,26 +71,26 @@ class PressTask(SurfaceTask):
         return self.at(np.zeros(len(goals)), goals)
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force N of hybrid control at t (m,) s; it steps at `force_rate`."""
+        """Return (m, 4), normal and force, N, of hybrid control at t (m,) s; the force steps at `force_rate`."""
         first, second = goals[:, 6], goals[:, 7]
         moved = (self.force_rate * (t - self.step_s)).clip(0.0)
         force = first + np.sign(second - first) * np.minimum(moved, np.abs(second - first))
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of an impedance, m and m/s: place, and direction of friction.
+        """Return the target (m, 6) of an impedance, m and m/s: position, and direction of friction.
 
-        The place moves from the start along the normal through the nominal plane, until the spring to a surface at
-        the farthest allowed place has the larger force. Its velocity only gives the direction in which joints are
-        about to move, for the feedforward of friction: against the normal while the force rises, along it after a
-        step down.
+        The position moves from the start along the normal through the nominal plane, until the spring exerts the
+        larger of the two forces even on a surface at the farthest allowed position. The velocity only tells the
+        friction feedforward in which direction the joints are about to move: against the normal while the force
+        rises, along it after a step down.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = self.at(t, goals) - self.depth(t, goals)[:, None] * goals[:, NORMAL]
         return np.concatenate([place, (self.creep * (2.0 * share - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the requested one (a step)."""
+        """Return (m, 2) N, the force against the nominal normal, and the requested one, an ideal step."""
         before = state.t < self.step_s + 0.5 / self.ctrl_hz
         return self.pressed(state, goals, np.where(before, goals[:, 6], goals[:, 7]))
 
@@ -100,7 +100,7 @@ class PressTask(SurfaceTask):
         """Return the force error (m,) N, and the reward terms (m, 5).
 
         force -tanh(error / 5 N); precision 1 - tanh(error / 5 N) / 2 - tanh(error / 0.5 N) / 2; excess: -tanh of the
-        force beyond the requested one / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        force above the requested one / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
         """
         beyond = -np.diff(self.forces(state, goals))[:, 0]
         error, excess = np.abs(beyond), np.tanh(beyond.clip(0.0) / HARD_N)
@@ -112,6 +112,6 @@ class PressTask(SurfaceTask):
         return press_measures(episodes, round(self.step_s * self.ctrl_hz), self.ctrl_hz)
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return 10 per unit of success minus the RMSE in N, minus 1 for every percent of stopped episodes."""
+        """Return 10 times the success, minus the RMSE in N, minus 1 for every percent of stopped episodes."""
         rmse = row["force_rmse_N"] if np.isfinite(row["force_rmse_N"]) else 1e3
         return 10 * row["success"] - rmse - 100 * row["stopped"]

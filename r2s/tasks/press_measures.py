@@ -5,10 +5,10 @@ import numpy as np
 from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.task import Episodes
 
-WINDOW_S = 1.0  # s before the step, and before the end, in which the force error counts
+WINDOW_S = 1.0  # s before the step, and before the end, over which the force error is averaged
 IMPACT_S = 0.1  # s after the first touch that count as its impact
 TOUCH_N = 0.5  # N, above which the tip counts as touching
-GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # success: RMSE in both windows; overshoot, or its share of the step
+GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # limits of success: RMSE N in each window; overshoot N, or its share
 
 PRESS = MeasureTable(
     measures=(
@@ -41,11 +41,11 @@ PRESS = MeasureTable(
 def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
-    force_rmse_x_N: RMS over episodes of the force error in the second before the step, and in the last one.
-    overshoot_N: largest force beyond the new one, in the direction of the step, mean over episodes;
-    overshoot_share: the same over the step. impact_N: mean of the largest force within IMPACT_S of the first
-    touch. contact: share of the time after it. success: see GOOD_N. Stopped episodes count only in success, as
-    failures.
+    force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the step, and in the
+    last second. overshoot_N: largest excess over the new force in the direction of the step, mean over episodes;
+    overshoot_share: the same relative to the step. impact_N: mean of the largest force within IMPACT_S of the first
+    touch. contact: share of the time in contact after the first touch. success: share of episodes within the limits
+    of GOOD_N. Stopped episodes count as failures in `success` and not at all in these other measures.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]

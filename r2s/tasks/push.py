@@ -1,7 +1,7 @@
 """Task push: push a box of unknown mass and friction to a pose on its table.
 
-The arm knows the table, the size of the box and, from a camera, its pose with `pose_noise`. The box's mass and its
-frictions are part of the dynamics (`dr=box`, `arm.surface`), and no observation contains them.
+The task knows the table and the size of the box. It observes the box's pose with the noise `pose_noise`, as from a
+camera. Mass and friction of the box belong to the dynamics (`dr=box`, `arm.surface`); no observation contains them.
 """
 
 from collections.abc import Mapping
@@ -46,8 +46,8 @@ WEIGHTS = {
     "smoothness": 1.0,
     "filter_penalty": 1.0,
 }
-# columns of an observation behind q, dq, effort and `limited`, in the frame of the table: tip m, its velocity m/s,
-# box and error (x m, y m, yaw rad each)
+# columns of an observation after q, dq, effort and `limited`, in the frame of the table: tip m, its velocity m/s, box
+# and error (x m, y m, yaw rad each)
 TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 
 
@@ -55,20 +55,20 @@ TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 class PushTask(TipTask):
     """Push a box to a pose; a `Task` (r2s/tasks/task.py) from conf/task/push.yaml.
 
-    A goal is the row (6 + n,): pose of the box there (`State.box`), and the start posture rad, with the tip behind
-    the box, at PUSHED_AT of its height.
+    A goal is the row (6 + n,): goal pose of the box, in the form of `State.box`, and start posture of the arm, rad.
+    The tip then is behind the box, at PUSHED_AT of the box's height.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        size: (3,) m, edges of the box. away: (low, high) m, distance of a goal from the box's nominal place.
-        bearing, goal_yaw: degrees, goals lie within +- this of straight ahead, with a yaw of up to this.
-        spread, first_yaw: m, degrees, of the box's first pose about the nominal one; read by `dr=box`.
+        size: (3,) m, edges of the box. away: (low, high) m, distance of a goal from the box's nominal position.
+        bearing: degrees, goals lie within +- this angle of straight ahead. goal_yaw: degrees, their largest yaw.
+        spread: m, first_yaw: degrees, largest deviation of the box's first pose from nominal; read by `dr=box`.
         pose_noise: m and degrees, standard deviation of the perceived pose in simulation.
-        point, normal: nominal place of the box on the table, m in the base frame; None: see `table_frame`.
-        displacement: m, of the tip's target by an action of 1 under the task's own cartesian impedance.
+        point, normal: nominal position of the box on its table, m, and normal of the table; None: see `table_frame`.
+        displacement: m, by which an action of 1 shifts the tip's target under the default controller.
         tool, pool: see `SurfaceTask`. torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
-        tip_radius, frame, own, parameters: m, of the tool; of the table; own controller and its parameters; see
-            `with_model`.
+        tip_radius: m. frame: of the table. own, parameters: default controller and its parameters. `with_model` sets
+            these four.
     """
 
     ctrl_hz: int = 25
@@ -121,14 +121,14 @@ class PushTask(TipTask):
 
     @property
     def height(self) -> float:
-        """Height of the tip's centre above the table, m, at which it pushes."""
+        """Height above the table, m, at which the tip's centre pushes."""
         return PUSHED_AT * self.size[2]
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task with the model of one arm, for its controller, and with the frame of the table.
+        """Return the task with a default controller for the model of one arm, and with the frame of the table.
 
         Raises:
-            UserError: no tool, one too short for the box, or one that would touch the table.
+            UserError: there is no tool, it is too short for the box, or its tip would touch the table.
         """
         Tip(robot)
         length, radius = float(np.linalg.norm(robot.tool.tip)), robot.tool.radius  # type: ignore[union-attr]
@@ -150,7 +150,7 @@ class PushTask(TipTask):
 
     @property
     def spring(self) -> float:
-        """The stiffness, N/m, of the spring of the task's own controller."""
+        """The stiffness, N/m, of the default controller's spring."""
         return float(self.of_model("parameters")[K_DEFAULT])
 
     @property
@@ -160,7 +160,7 @@ class PushTask(TipTask):
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) m, the tip's target for an action of zero: the middle between nominal place and goals."""
+        """(3,) m, the tip's target for zero action: ahead of the box's nominal position by the middle of `away`."""
         return self.table.outside(np.array([0.5 * sum(self.away), 0.0, self.height]))
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -168,18 +168,18 @@ class PushTask(TipTask):
         return np.tile(self.centre, (len(goals), 1))
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
-        """Return the dynamics with a box of middling mass and friction at its nominal place."""
+        """Return the dynamics with a box of medium mass and friction at its nominal position."""
         return replace(dynamics, surface=standing_box(self.table, np.zeros(3), self.size, **EXPECTED))
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, n) rad, postures with the tip behind the box."""
+        """Return (m, n) rad, start postures with the tip behind the box."""
         return goals[:, START : START + starts.shape[1]]
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
         """Return goals (count, 6 + n), see the class.
 
-        distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw); the tip starts BEHIND the
-        farthest corner of a box, ~ U(-half edge, half edge) to its side.
+        distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts with a gap of
+        BEHIND to the farthest corner that a box can have, and ~ U(-half edge, half edge) to the side.
 
         Raises:
             UserError: the tip does not reach a start or the far side of a goal.
@@ -208,7 +208,7 @@ class PushTask(TipTask):
         return goals[:, :3]
 
     def planar(self, state: State, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return box and goal (m, 3), x m, y m, yaw rad in the table's frame, and goal minus box (yaw: +-pi)."""
+        """Return box, goal and goal minus box, (m, 3) each: x m, y m, yaw rad in the table's frame (error: +-pi)."""
         seen = self.table.pose(np.zeros((len(goals), 3)), 0.5 * self.size[2]) if state.box is None else state.box
         box, goal = self.table.planar(seen), self.table.planar(goals[:, POSE])
         error = goal - box
@@ -216,7 +216,7 @@ class PushTask(TipTask):
         return box, goal, error
 
     def tip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return place (m, 3) m and Jacobian (m, 3, n) m/rad of the tip at q (m, n) rad, in the table's frame."""
+        """Return position (m, 3) m and Jacobian (m, 3, n) m/rad of the tip at q (m, n) rad, in the table's frame."""
         place, jacobian = arm_tips(np.ascontiguousarray(q), self.of_model("parameters"))
         return self.table.inside(place), np.einsum("ij,mjn->min", self.table.axes, jacobian)
 
@@ -250,12 +250,12 @@ class PushTask(TipTask):
         return np.concatenate(rows, axis=1, dtype=np.float32)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force on the box, and the requested one, 0."""
+        """Return (m, 2) N, the magnitude of the force on the box, and 0: the task requests no force."""
         none = np.zeros(len(goals))
         return np.stack([none if state.force is None else np.linalg.norm(state.force, axis=1), none], 1)
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 11), pose of the box, its yaw error rad, height of the tip's lowest point m, edges m."""
+        """Return (m, 11), pose of the box, its yaw error rad, the lowest point of the tip m, edges of the box m."""
         box, _, error = self.planar(state, goals)
         pose, height = self.table.pose(box, 0.5 * self.size[2]), self.tip(state.q)[0][:, 2]
         edges = np.tile(self.size, (len(goals), 1))
@@ -264,10 +264,10 @@ class PushTask(TipTask):
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance of the box from its goal (m,) m, and the reward terms (m, 7).
+        """Return the distance d of the box from its goal (m,) m, and the reward terms (m, 7).
 
         distance -tanh(d / 10 cm); yaw -tanh(|error| / 0.5 rad); precision: product of 1 - tanh(d / 10 cm) / 2 -
-        tanh(d / 3 cm) / 2 and the same of the yaw with 0.5 rad and 10 degrees; gap -tanh(distance of the tip from the
+        tanh(d / 3 cm) / 2 and the same for yaw with 0.5 rad and 10 degrees; gap -tanh(distance of the tip from the
         box / 5 cm); height -tanh(error of the tip's height / 2 cm); smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2);
         filter_penalty -limited.
         """
@@ -291,6 +291,6 @@ class PushTask(TipTask):
 
 
 def _turned(vectors: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    """Return vectors (m, 2) in axes that are turned by yaw (m,) rad."""
+    """Return vectors (m, 2) in axes that are rotated by yaw (m,) rad."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1)

@@ -39,10 +39,10 @@ PUSH = MeasureTable(
 def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
-    within_3cm, within_10deg: share of episodes with the box so near its goal for the whole last 0.5 s; success: both,
-    in an episode that was not stopped and in which the tip stayed above the table, which does not resist it in
-    simulation. distance_median_m, yaw_median_deg: medians of the means in that time. force_peak_N: mean over
-    episodes of the largest force at a control step. on_table: share of episodes with the tip in the table.
+    within_3cm, within_10deg: share of episodes with the box this close to its goal for the whole last 0.5 s.
+    success: both, without a stop, and with the tip always above the table, which it could penetrate freely in
+    simulation. distance_median_m, yaw_median_deg: median over episodes of the mean in the last 0.5 s. force_peak_N:
+    mean over episodes of the largest force at a control step. on_table: share of episodes with the tip in the table.
     """
     hold, box = round(HOLD_S * ctrl_hz), episodes.box
     assert box is not None

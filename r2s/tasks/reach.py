@@ -16,15 +16,15 @@ from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.rollout import measures
 from r2s.tasks.task import BaseTask, Episodes, ObservationTerm, State
 
-FINE_M = 0.02  # m, tanh scale of the observed error: the last centimetres span a network's input range
+FINE_M = 0.02  # m, tanh scale of the observed error: the last centimetres span the range of a network's input
 FINE_RAD = 0.015  # m^2/rad, tanh scale of the observed J^T error
 FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds: makes creeping joints visible
 OBSERVED = (  # terms of `observe`, for metadata
     f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
 )
-SPEED_NOISE = 0.05  # rad/s, of trainings for an identified arm: the speed that counts as rest
+SPEED_NOISE = 0.05  # rad/s, speed noise of trainings for an identified arm; equals the speed that counts as rest
 CLOSE_M = 1e-3  # m, smallest initial distance that the reward divides by
-MIDDLE = 0.05, 0.95  # quantiles of the distances of random postures that bound the default goal region
+MIDDLE = 0.05, 0.95  # quantiles of the shoulder distance over random postures: default goal region
 POSTURES = 500  # random postures for these quantiles
 
 REACH = MeasureTable(
@@ -62,15 +62,15 @@ class ReachTask(BaseTask):
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        torque_fraction: share of tau_max that an action of 1 commands; one for all joints, or one per joint.
+        torque_fraction: share of tau_max that an action of 1 commands; one number for all joints, or one each.
         cutoff_hz: low-pass on the torque.
         start_spread: rad, episodes start at q_home + U(-spread, spread).
         reach: (low, high) m, distance of goals from the shoulder (the second joint, or the only one); None: the
             quantiles MIDDLE of random postures.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
         speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise does not react to it, so it does not excite oscillations of elastic
-            gears, which no rigid model has (benchmarks/results/transfer.md).
+            else 0. A policy trained with noise learns not to react to it. So it does not excite oscillations of
+            elastic gears, which rigid models do not have (benchmarks/results/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -156,14 +156,14 @@ class ReachTask(BaseTask):
         )
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 3) m of an impedance: the goals."""
+        """Return the target (m, 3) m of an impedance: the goals themselves."""
         return goals
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (6 n + 12,) to normalise `observe` by: the task's own scales.
 
-        Statistics of random torques are unsuitable: they spin the wrist at 10 rad/s, whereas 0.1 rad/s matter for
-        stopping at a goal.
+        Statistics of random motion are unsuitable: random torques spin the wrist at 10 rad/s, whereas 0.1 rad/s
+        matters for stopping at a goal.
         """
         n, far = robot.n, self.region(robot)[1]
         centre = np.zeros(6 * n + 12)

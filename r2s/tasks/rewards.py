@@ -1,10 +1,9 @@
 """The paper's reward, eq. (2), and the curriculum that leads to it.
 
-A reward is a weighted sum of named terms. The replay buffer stores the terms, and each update weights them with the
-present weights. So a curriculum can change its weights without making stored transitions stale. Three terms are not
-in
-the paper: a bonus for precision, a penalty for motion close to the goal, and a penalty for commands that the safety
-filter changes.
+A reward is a weighted sum of named terms. The replay buffer stores the terms, and each update applies the current
+weights to them. So a curriculum can change its weights without making stored transitions stale. Three terms are not
+in the paper: a bonus for precision, a penalty for motion close to the goal, and a penalty for commands that the
+safety filter changes.
 """
 
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # m, tanh scales of the bonus
-STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint: the end effector can lie on a rotating axis
+STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint: the end effector can rest on the axis of a moving one
 TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 
 
@@ -38,7 +37,7 @@ def terms(
         distance, distance0: (m,) m, now and at the start of the episode.
         dq: (m, n) rad/s.
         ddq: (m, n) rad/s^2, mean over the last control period.
-        limited: (m,), share of its cycles in which the safety filter changed the command.
+        limited: (m,), share of that period's cycles in which the safety filter changed the command.
     """
     out = np.empty((len(distance), 5))
     for i in range(len(distance)):
@@ -61,16 +60,16 @@ PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms that make eq
 
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
-PATIENCE = 50_000  # env steps in which the penalty factor grows e-fold at twice max_filter_rate
-MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2, at 4 ddpg and td3 stop moving
+PATIENCE = 50_000  # env steps in which the penalty factor grows e-fold while the filter rate is twice the maximum
+MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2; at 4, ddpg and td3 learn not to move
 
 
 class Reward:
-    """A weighted sum of named terms; `reward._target_` names a subclass, made with the other keys of its yaml. This
-    base class has the task's own terms and weights: `reward=task`.
+    """A weighted sum of named terms. `reward._target_` names a subclass; other keys of its yaml are its arguments.
+    This base class uses the terms and weights of the task: `reward=task`.
 
     Attributes:
-        factor: what `weights` and `adapt` get at the start of a training, a number or an array.
+        factor: initial argument `factor` of `weights` and `adapt`, a number or an array.
     """
 
     factor: Any = 1.0
@@ -89,12 +88,12 @@ class Reward:
         """Return the (k,) weights.
 
         Args:
-            task: the trained one. progress: fraction of the budget that is spent. factor: result of `adapt`.
+            task: of the training. progress: fraction of the budget that is spent. factor: result of `adapt`.
         """
         return task.paper_weights
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> Any:
-        """Return the factor after env_steps further steps with mean terms `seen` (k,)."""
+        """Return the new factor after `env_steps` further steps, in which the terms had the means `seen` (k,)."""
         return factor
 
 
@@ -107,16 +106,16 @@ class Curriculum(Reward):
     `anneal` fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
 
     Attributes:
-        smoothness, precision, stillness, filter_penalty: weights before and after.
+        smoothness, precision, stillness, filter_penalty: weights before and after the change.
         anneal: fractions of the budget where the change starts and ends.
         max_filter_rate: largest share of the cycles, exploration included, in which the safety filter may change the
-            command; None: any. From the first of `anneal` on, a higher share raises the filter penalty, and a lower
-            one reduces it, down to the curriculum's weight. No fixed weight holds a share: with it, the filter acts
-            in 1 to 6 % of the cycles, depending on the seed (benchmarks/results/minutes.md). This is integral control
+            command; None: any. From the first fraction of `anneal` on, a higher share raises the filter penalty, and
+            a lower one reduces it, down to the curriculum's weight. A fixed weight does not fix the share: it
+            varies from 1 to 6 % of the cycles with the seed (benchmarks/results/minutes.md). This is integral control
             of a Lagrange multiplier's logarithm (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
-        UserError: no pair of numbers, or a number outside its range.
+        UserError: a value is not a pair of numbers, or a number is outside its range.
     """
 
     smoothness: Sequence[float]

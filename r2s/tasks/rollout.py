@@ -11,7 +11,7 @@ from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import Robot
 from r2s.tasks.task import Episodes, State, Task, observe
 
-HOLD_S = 0.5  # s at the end of an episode in which the end effector has to stay within a distance (design: success)
+HOLD_S = 0.5  # s at the end of an episode in which the end effector has to stay within a distance to succeed
 REST = 0.05  # rad/s, below which a joint is at rest
 
 
@@ -40,7 +40,7 @@ class Arms(Protocol):
     def speeds(self) -> np.ndarray | None: ...  # noqa: D102
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Begin the episodes first, first + 1, ... at rest at starts (width, n) rad."""
+        """Begin episodes number first, first + 1, ... at rest at starts (width, n) rad; return their state."""
         ...
 
     def step(self, command: np.ndarray) -> State:
@@ -48,7 +48,7 @@ class Arms(Protocol):
         ...
 
     def end(self) -> np.ndarray:
-        """End the episodes; return (width,) bool: whether each arm had stopped before."""
+        """End the episodes; return (width,) bool: whether each arm had stopped early."""
         ...
 
 
@@ -63,9 +63,9 @@ def rollout(
 ) -> Episodes:
     """Run one episode per goal.
 
-    A stop ends an episode, and so does a contact of the arm with itself or the table (r2s/physics/collision.py),
-    except `task.may_touch`. Contacts are checked after every control step. The episode keeps its last state,
-    and its last distance is infinite.
+    A stop ends an episode, and so does a contact of the arm with itself or the table (r2s/physics/collision.py)
+    that `task.may_touch` does not allow. Contacts are checked after every control step. An ended episode repeats
+    its last state, and its last distance is infinite.
 
     Args:
         policy: observation -> action. arms: simulated or real. task: with its controller.
@@ -112,7 +112,7 @@ def _run(
     contacts: CollisionCheck,
     out: Episodes,
 ) -> None:
-    """Run the episodes `now` from their first state, and write them into `out`."""
+    """Run the episodes with the indices `now` from their first state, and write them into `out`."""
     weights, scale, before = task.paper_weights, task.distance_scale(state, goals), state.dq.copy()
     over = np.zeros(arms.width, dtype=bool)  # ended by a contact
     for k in range(task.steps):
@@ -149,7 +149,7 @@ def _run(
 
 
 def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
-    """Return the state with the last q, dq, ee and tau of those arms whose episode is `over` (m,)."""
+    """Return the state, with the `last` q, dq, ee and tau for the arms whose episode is `over` (m,)."""
     names, here = ("q", "dq", "ee", "tau"), over[:, None]
     kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
     return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
@@ -159,13 +159,13 @@ def measures(episodes: Episodes) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
     success_x: share of episodes within x of the goal for the whole last 0.5 s. distance_median_m: median over goals
-    of the mean distance in that time. return_paper: mean sum of eq. (2); return_smooth: without the noise of measured
-    speeds, which eq. (2) takes for accelerations. time_to_reach_s: median time until the end effector stays within 2
-    cm, over the episodes that succeed. overshoot_m: largest distance outside the 2 cm after the first entry, mean
-    over episodes. rest: share of episodes with every joint slower than REST for the whole last 0.5 s (the end
-    effector alone can lie on a joint's axis). q_left_rad: distance to the position limits, 5 % quantile over
-    episodes. limited: share of the cycles in which the safety filter changed the torque. collision: share of episodes
-    ended by a contact.
+    of the mean distance in that time. return_paper: mean sum of eq. (2); return_smooth: the same without the noise of
+    measured speeds, which eq. (2) mistakes for acceleration. time_to_reach_s: median time until the end effector
+    stays within 2 cm, over the episodes in which it does. overshoot_m: largest distance beyond 2 cm after it first
+    came within 2 cm, mean over episodes. rest: share of episodes with every joint slower than REST for the whole last
+    0.5 s (the end effector may rest on the axis of a moving joint). q_left_rad: distance to the position limits, 5 %
+    quantile over episodes. limited: share of the cycles in which the safety filter changed the torque. collision:
+    share of episodes that a contact ended.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)
@@ -198,7 +198,7 @@ def measures(episodes: Episodes) -> dict[str, float]:
 
 
 def gap(one: Episodes, other: Episodes) -> dict[str, float]:
-    """Return the gap of two sets of episodes with equal goals: RMSE of end-effector path, mm, and of torques, Nm."""
+    """Return the gap between episodes with equal goals: RMSE of the end-effector path, mm, and of torques, Nm."""
     path = np.linalg.norm(one.ee - other.ee, axis=-1)
     return {
         "ee_path_rmse_mm": float(1e3 * np.sqrt((path**2).mean())),

@@ -1,8 +1,8 @@
-"""What tasks on a surface share: a nominal plane, a way down to it, an estimate of the force, its reward terms.
+"""Base class of tasks on a surface: nominal plane, approach, force estimate, and parts of their reward terms.
 
-The arm knows a nominal plane. The true one, its stiffness and its friction are part of the dynamics (`dr=contact`,
-`arm.surface`). Neither observation nor controller contains the true force. The policy observes an estimate from q, dq
-and the commanded torque.
+The task knows a nominal plane only. The true plane, its stiffness and its friction are part of the dynamics
+(`dr=contact`, `arm.surface`). Neither observation nor controller contains the true force: the policy observes an
+estimate from q, dq and the commanded torque.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,36 +24,36 @@ from r2s.tasks.task import ObservationTerm, State
 from r2s.tasks.tip_task import TipTask
 
 POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8, 9  # columns of a goal
-LAG_M = 0.01  # m, by which the tip may follow its target: damping at approach_speed, and 2 N of wrong friction
-RESIDUAL_M = 5e-3  # m, displacement of an action of 1 under the task's own controller: a quarter of 20 N on the Panda
+LAG_M = 0.01  # m, lag of the tip behind its target, from damping at approach_speed and a friction error of 2 N
+RESIDUAL_M = 5e-3  # m, shift of the target by an action of 1 (default controller): a quarter of 20 N on the Panda
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
-# 1/rad, see `cartesian_impedance`: where joints stick, a torque of the null space reaches the tip. From 0.02 to 0.05
-# the forces of press.py on twins 0 and 1 are alike, at 0.2 a fifth worse
+# 1/rad, see `cartesian_impedance`; low, because a null-space torque reaches the tip where joints stick. On models of
+# twins 0 and 1 the reference's force errors are alike from 0.02 to 0.05, and up to twice as large at 0.2
 NULL_STIFFNESS = 0.05
-REGULAR = 1e-3  # m^2/rad^2, of the least squares of the force: blind directions of the Jacobian count as force-free
+REGULAR = 1e-3  # m^2/rad^2, regularizes the force estimate: no force along directions that no joint moves
 EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: middle of conf/dr/contact.yaml
-POSTURES = 12  # of a path, which the arm must reach
+POSTURES = 12  # about this many points of a path must be within reach
 
 
 @dataclass(frozen=True)
 class SurfaceTask(TipTask):
-    """A task that presses a tool's tip on a surface of roughly known place.
+    """A task that presses a tool's tip on a surface whose position is known roughly.
 
-    A goal begins with the row (9 + n,): the first touched point of the nominal plane m, its normal, two forces N,
-    height of the tip above the point at the start m, and the start posture rad.
+    A goal begins with (9 + n,) numbers: first touched point of the nominal plane, m; normal of the plane; two forces,
+    N; start height of the tip's centre above the point, m; start posture, rad.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        force: (low, high) N, drawn forces. force_rate: N/s, at which the asked force moves.
-        approach_speed: m/s, of the target along the nominal normal, so the largest speed of a touch.
-        clearance: m, height of the tip above the nominal plane at the start. spread: m, of the touched points about
-            `point`. place: m and tilt: degrees, by which the true plane may differ from the nominal one.
-        point, normal: of the nominal plane in the base frame, m; None: a table below the tip at home.
+        force: (low, high) N, range of the requested forces. force_rate: N/s, at which a requested force changes.
+        approach_speed: m/s, speed of the target along the nominal normal, so the highest closing speed at contact.
+        clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
+            from `point`. place: m, tilt: degrees, largest deviation of the true plane from the nominal one.
+        point, normal: the nominal plane in the base frame, m; None: a table below the tip at home.
         tool: tool file of the robot if robot.tool is null; the stages read it.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of goals that a training draws from.
-        stop: what a stop does with a force, of `r2s.physics.push_limit.STOPS`; None: release.
-        model, own, parameters: the identified arm, the task's own controller and its parameters; see `with_model`.
+        stop: what a stop of the arm does to a contact, one of `r2s.physics.push_limit.STOPS`; None: release.
+        model, own, parameters: identified arm, default controller and its parameters; `with_model` sets them.
     """
 
     ctrl_hz: int = 100
@@ -96,7 +96,7 @@ class SurfaceTask(TipTask):
             )
 
     def _check_range(self, name: str, unit: str, equal: bool = False) -> None:
-        """Raise UserError unless an attribute is (low, high), above 0; `equal`: both may be the same."""
+        """Raise UserError unless an attribute is (low, high) with 0 < low < high; `equal` allows low = high."""
         pair = getattr(self, name)
         numbers = isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(x, int | float) for x in pair)
         if not numbers or not 0 < pair[0] <= pair[1] or (pair[0] == pair[1] and not equal):
@@ -108,10 +108,10 @@ class SurfaceTask(TipTask):
         return self.place + self.spread * float(np.tan(np.radians(self.tilt)))
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task with the model of one arm, for its controller and for the estimate of the force.
+        """Return the task with the model of one arm, for its default controller and its force estimate.
 
         Raises:
-            UserError: the robot has no tool, or cannot exert the forces.
+            UserError: the robot has no tool, or cannot exert the largest force.
         """
         Tip(robot)
         task = replace(self, model=InverseDynamics(robot, dynamics), speed_noise=self.noise_for(dynamics))
@@ -125,18 +125,18 @@ class SurfaceTask(TipTask):
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """Settings of the task's own controller that differ from the defaults of `cartesian_impedance`."""
+        """Settings of the default controller that replace defaults of `cartesian_impedance`."""
         return {}
 
     def controlled_by(self, controller: Controller) -> Self:
-        """Return the task with this controller; raise UserError if it cannot exert the forces."""
+        """Return the task with this controller; raise UserError if it cannot exert the largest force."""
         self._check_force(controller)
         return super().controlled_by(controller)
 
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with a limit of force and speed at the nominal plane, which admits its forces."""
+        """Return the task with a limit of force and speed at the nominal plane that admits the requested forces."""
         limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1], self.stop)
         if limit is not None:
             limit = replace(limit, place=self.place, tilt=float(np.radians(self.tilt)))
@@ -161,20 +161,20 @@ class SurfaceTask(TipTask):
         return nominal_plane(robot, self.point, self.normal)
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
-        """Return the dynamics with a surface of middling stiffness in the nominal plane."""
+        """Return the dynamics with a surface of medium stiffness in the nominal plane."""
         point, normal = self.plane(robot)
         return replace(dynamics, surface=Surface(point, normal, *EXPECTED))
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, n) rad, postures above the first touched points."""
+        """Return (m, n) rad, start postures with the tip above the first touched points."""
         return goals[:, START : START + starts.shape[1]]
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
-        """Return (k, 3) m, drawn points about task.point that the tip touches; axes (2, 3) span the plane."""
+        """Return (k, 3) m, random points that the tip touches, relative to `point`; axes (2, 3) span the plane."""
         raise NotImplementedError
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force N of hybrid control at t (m,) s."""
+        """Return (m, 4), normal and requested force, N, of hybrid control at t (m,) s."""
         raise NotImplementedError
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
@@ -185,7 +185,7 @@ class SurfaceTask(TipTask):
         """Return goals (count, 9 + n), see the class.
 
         Raises:
-            UserError: the tip does not reach the plane.
+            UserError: the tip does not reach a drawn point.
         """
         point, normal = self.plane(robot)
         tip = Tip(robot)
@@ -222,7 +222,7 @@ class SurfaceTask(TipTask):
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, how far the target of the tip's centre is below the nominal plane at t (m,) s.
 
-        It moves at approach_speed until the tip has touched for sure, then so that the force rises at force_rate.
+        The target moves at approach_speed until the tip has certainly touched, then the force rises at force_rate.
         """
         height, K = goals[:, HEIGHT], self.spring
         touched = self.beyond + LAG_M - (height - self.clearance)  # the tip's centre is a radius above its surface
@@ -233,12 +233,12 @@ class SurfaceTask(TipTask):
 
     @property
     def down_s(self) -> float:
-        """When the tip has touched for sure, s."""
+        """Time after which the tip has certainly touched, s."""
         return (self.beyond + LAG_M + self.clearance) / self.approach_speed
 
     @property
     def spring(self) -> float:
-        """The stiffness, N/m, of the controller's spring; of the task's own one if it has none."""
+        """Stiffness, N/m, of the controller's spring, or of the default controller's if it has no spring."""
         for control in (self.controller, self.own):
             if isinstance(control, Impedance) and control.parameters[K_DEFAULT] > 0:
                 return float(control.parameters[K_DEFAULT])
@@ -285,10 +285,10 @@ class SurfaceTask(TipTask):
         ]
 
     def estimate(self, state: State, normal: np.ndarray, jacobian: np.ndarray | None = None) -> np.ndarray:
-        """Return (m,) N, the estimated force against the normal (m, 3), of q, dq and the last command.
+        """Return (m,) N, the force against the normal (m, 3), estimated from q, dq and the last command.
 
-        Quasi-static: least squares of J^T F = tau - model(q, dq). At rest friction hides up to its level over the
-        lever; errors of the model are its bias.
+        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest it may be wrong by
+        the friction level over the lever arm; errors of the model bias it.
         """
         jacobian = self.tip(state.q)[1] if jacobian is None else jacobian
         q, dq = np.ascontiguousarray(state.q), np.ascontiguousarray(state.dq)
@@ -298,7 +298,7 @@ class SurfaceTask(TipTask):
         return -(force * normal).sum(1)
 
     def tip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return place (m, 3) m and Jacobian (m, 3, n) m/rad of the tip's centre at q (m, n) rad."""
+        """Return position (m, 3) m and Jacobian (m, 3, n) m/rad of the tip's centre at q (m, n) rad."""
         return arm_tips(np.ascontiguousarray(q), self.of_model("parameters"))
 
     def tip_velocity(self, state: State) -> np.ndarray:
@@ -310,7 +310,7 @@ class SurfaceTask(TipTask):
         return goals[:, NORMAL]
 
     def pressed(self, state: State, goals: np.ndarray, asked: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the asked one (m,)."""
+        """Return (m, 2) N, the force against the nominal normal, and the requested force `asked` (m,)."""
         none = np.zeros(len(goals))
         return np.stack([none if state.force is None else -(state.force * goals[:, NORMAL]).sum(1), asked], 1)
 
@@ -321,5 +321,5 @@ def near(error: np.ndarray, coarse: float, fine: float) -> np.ndarray:
 
 
 def rough(ddq: np.ndarray) -> np.ndarray:
-    """Return (m,) 0.03 sum tanh(|ddq| / 10 rad/s^2) of ddq (m, n)."""
+    """Return (m,), 0.03 sum tanh(|ddq| / 10 rad/s^2) over the joints, for ddq (m, n)."""
     return 0.03 * np.tanh(np.abs(ddq) / 10.0).sum(1)

@@ -19,27 +19,27 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.rewards import TERMS
 
-# filter rate above which the score falls; lower rates do not make policies better
+# the score penalizes filter rates above this; lower rates do not make policies better
 MAX_FILTER_RATE = 0.04
-TORQUE_STD = 0.3  # of the torque limit, to normalise an observed controller torque by
+TORQUE_STD = 0.3  # share of the torque limit, normalises an observed controller torque
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """m arms of n joints at one moment. Its arrays may be views that the next step overwrites.
+    """The state of m arms with n joints. Its arrays may be views that the next step overwrites.
 
     Attributes:
         t: (m,) s since the episodes began. q, dq: (m, n) rad, rad/s.
         ee: (m, 3) m, the end effector. jacobian: (m, 3, n) m/rad, its translational Jacobian.
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target torque after the low-pass.
-        stopped: (m,), whether the arm has ended its motion.
+        stopped: (m,), whether the arm has stopped before the end of its episode.
         limited: (m,), share of the last control period in which the safety filter changed the command.
-        noise: (m, n) rad/s, sensor noise that `measured` adds where dq is the true speed; None: dq is the measured
-            speed, or sensors are exact.
-        force: (m, 3) N, what the tool exerts, in base axes: true in simulation and on twins, else what the arm
-            reports. It is for rewards and measures, not for observations. None: unknown.
-        box: (m, 6), centre m and first axis in the base frame of the box that the tool pushes, as perceived; None:
-            there is none.
+        noise: (m, n) rad/s, sensor noise that `measured` adds to dq, which then is the true speed; None: dq is the
+            measured speed, or the sensors are exact.
+        force: (m, 3) N, force that the tool exerts, in base axes: the true force in simulation and on twins, the
+            force that the arm reports otherwise. Rewards and measures use it, observations do not. None: unknown.
+        box: (m, 6), perceived pose of the box that the tool pushes, in the base frame: its centre, m, and its first
+            axis. None: there is no box.
     """
 
     t: np.ndarray
@@ -61,7 +61,7 @@ class State:
 
     @staticmethod
     def at_home(robot: Robot) -> "State":
-        """Return one arm at rest at home, without kinematics, to compile functions with."""
+        """Return one arm at rest at home, with zero kinematics: an input that makes functions compile."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
         none = np.zeros(1, dtype=bool), np.zeros(1)
         return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
@@ -69,18 +69,18 @@ class State:
 
 @dataclass(frozen=True)
 class Episodes:
-    """E finished episodes of T control steps; row k is the state after step k.
+    """E finished episodes of T control steps; index k along T is the state after step k.
 
     Attributes:
         t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) where it moves; see
             `Task.goal_positions`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m.
         reward: (E, T), under `Task.paper_weights`; for reaching, eq. (2).
-        reward_smooth: (E, T), the same without the noise of measured speeds.
+        reward_smooth: (E, T), the same from speeds without measurement noise.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
         collision: (E,) str, time and bodies of the contact that ended the episode; "" without contact.
-        force: (E, T, 2) N, exerted against a surface and asked for; None: the task asks for none.
-        box: (E, T, 11), see `Task.boxes`; None: the task moves none.
+        force: (E, T, 2) N, force on the surface and requested force; None: the task touches no surface.
+        box: (E, T, 11), see `Task.boxes`; None: the task moves no box.
     """
 
     t: np.ndarray
@@ -104,11 +104,11 @@ class ObservationTerm:
     """One term of an observation, described so that a program without r2s can compute it.
 
     Attributes:
-        name: of the term. unit: SI, "1" if dimensionless.
+        name: name of the term. unit: its SI unit, "1" if dimensionless.
         of: its source: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). With a plan, `goal` is the
-            current reference position. More sources of a plan: ahead (next positions - ee), velocity (of the path),
+            current reference position. A plan adds the sources ahead (next positions - ee), velocity (of the path),
             limited, q_off and dq_off (plan minus arm). control: the torque of a controller that observes it.
-        divided_by: one number, or one per element; None: nothing. tanh: whether tanh follows.
+        divided_by: divisor, one number or one per element; None: 1. tanh: whether tanh is applied afterwards.
     """
 
     name: str
@@ -127,13 +127,13 @@ class Task(Protocol):
         observation_summary: terms and units of an observation, for the metadata of policy.onnx.
         reward_terms: names of the reward terms. paper_weights: (k,), their weights in `Episodes.reward`.
         pool: number of goals that a training draws from.
-        speed_noise: rad/s; in training, measured speeds are at least as noisy as U(0, speed_noise), drawn per arm.
-            None or 0: the noise of the arm's own sensors.
+        speed_noise: rad/s; in training, each arm draws a lower bound of its speed noise (standard deviation) from
+            U(0, speed_noise). None or 0: the noise of the arm's own sensors.
         measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
-        may_touch: pairs of body names that may touch, or of one and "table"; other contacts end an episode.
+        may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
         touches: whether the tool touches a surface, so that simulated arms need one (`Dynamics.surface`).
-        moves_box: whether that surface is a box that it pushes, so that arms must perceive one (`State.box`).
-        push_limit: of force and speed of its contacts; None: they are not limited.
+        moves_box: whether that surface is a box that the tool pushes, so that arms must perceive it (`State.box`).
+        push_limit: limit of the force and the speed of contacts; None: no limit.
     """
 
     @property
@@ -170,7 +170,7 @@ class Task(Protocol):
         ...
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "Task":
-        """Return the task with the identified model of one arm, for what depends on it."""
+        """Return the task for the identified model of one arm, which sets model-dependent defaults."""
         ...
 
     def controlled_by(self, controller: Controller) -> "Task":
@@ -180,7 +180,7 @@ class Task(Protocol):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "Task":
-        """Return the task with limited force, N, and speed, m/s, of contacts; friction (n,) Nm may hide some."""
+        """Return the task with limits of contact force, N, and speed, m/s; joint friction (n,) Nm may add force."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -188,31 +188,31 @@ class Task(Protocol):
         ...
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, n) rad, where episodes start at rest."""
+        """Return (count, n) rad, the postures in which episodes start at rest."""
         ...
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, ...), the goals of that many episodes: points, or timed paths."""
+        """Return (count, ...), the goals of `count` episodes: points, or timed paths."""
         ...
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, n) rad, where the episodes with these goals start; `starts` is a proposal."""
+        """Return (m, n) rad, the start postures of episodes with these goals; `starts` are the proposed ones."""
         ...
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
-        """Return the goals as positions to plot: (m, 3) m, or (m, steps, 3) for a reference after each step."""
+        """Return the goals as positions to plot: (m, 3) m, or (m, steps, 3) m, the reference after each step."""
         ...
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (d,) to normalise observations by."""
+        """Return mean and standard deviation (d,) that normalise observations."""
         ...
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, d) float32; torque: `torque_limit`, to scale efforts by."""
+        """Return the observations (m, d) float32; torque: `torque_limit`, which divides the efforts."""
         ...
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, by which the reward divides the distances of the episodes that begin at `state`."""
+        """Return (m,) m, divisors of the distances in the reward; the episodes begin at `state`."""
         ...
 
     def judge(
@@ -221,7 +221,7 @@ class Task(Protocol):
         """Return the distance (m,) m from the goal, and the reward terms (m, k).
 
         Args:
-            state: after a step. ddq: (m, n) rad/s^2, mean over that control period.
+            state: after a control period. ddq: (m, n) rad/s^2, mean over this period.
             goals: (m, ...). scale: (m,) m, of `distance_scale`.
         """
         ...
@@ -235,7 +235,7 @@ class Task(Protocol):
         ...
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
-        """Return the dynamics with the nominal surroundings, for predictions."""
+        """Return the dynamics with the nominal surface or box around the arm, for predictions."""
         ...
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
@@ -243,7 +243,7 @@ class Task(Protocol):
         ...
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return the score that selects the best of several rows of `measures`."""
+        """Return the score of a row of `measures`; the highest score selects the best policy."""
         ...
 
 
@@ -251,7 +251,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, goals: see `Task.observe`. controller: of the task. state: the true state; this function adds its noise.
+        task, goals: see `Task.observe`. controller: of the task. state: without its sensor noise, which this adds.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()
@@ -305,7 +305,7 @@ class BaseTask:
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with the limit of `push_limit` (r2s/physics/push_limit.py) at a table below home."""
+        """Return the task with the `push_limit` (r2s/physics/push_limit.py) of a table below the tip at home."""
         return self._with("push_limit", push_limit(robot, friction, force_max, speed_near))
 
     def _with(self, name: str, value: Any) -> Self:
@@ -326,7 +326,7 @@ class BaseTask:
         return goals
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
-        """Return None: the task asks for no force."""
+        """Return None: the task requests no force."""
         return None
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
@@ -334,14 +334,14 @@ class BaseTask:
         raise TypeError(f"{type(self).__name__} moves no box")
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
-        """Return the dynamics: there is nothing around the arm."""
+        """Return the dynamics unchanged: there is nothing around the arm."""
         return dynamics
 
     def score(self, row: Mapping[str, float]) -> float:
         """Return the score of one evaluation.
 
-        One percentage point of success within 1 cm, or of episodes at rest, counts like 1 of the return. Each point
-        of the filter rate above MAX_FILTER_RATE costs 10.
+        One percentage point of success within 1 cm, or of episodes at rest, counts as much as 1 of the return. Each
+        percentage point of the filter rate above MAX_FILTER_RATE costs 10.
         """
         price = 1e3 * max(row["limited"] - MAX_FILTER_RATE, 0.0)
         return 100 * (row["success_1cm"] + row["rest"]) + row["return_paper"] - price

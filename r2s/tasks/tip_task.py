@@ -1,4 +1,4 @@
-"""What tasks of a robot's tool share: their own controller, its torque limit, and starts that goals replace."""
+"""Base class of tasks for a tool: default controller, its torque limit, and starts that the goals replace."""
 
 from typing import Any
 
@@ -14,12 +14,12 @@ from r2s.tasks.task import BaseTask, State
 
 
 class TipTask(BaseTask):
-    """A task of a tool's tip, whose own controller is a Cartesian impedance.
+    """A task for the tip of a tool, with a Cartesian impedance as its default controller.
 
     Attributes:
-        torque_fraction: share of tau_max, the largest torque of the task's own controller and of control=torque.
+        torque_fraction: share of tau_max, the largest torque of the default controller and of control=torque.
         cutoff_hz, speed_noise: see `ReachTask`.
-        own: the task's own controller, of `with_model`; None before.
+        own: the default controller, which `with_model` makes; None before.
     """
 
     torque_fraction: float | tuple[float, ...]
@@ -27,26 +27,26 @@ class TipTask(BaseTask):
     own: Impedance | None
 
     def as_reach(self) -> ReachTask:
-        """Return a reach task with the same rates and torques; raise UserError for wrong ones."""
+        """Return a reach task with the same rates and torques; raise UserError if one is not allowed."""
         return ReachTask(
             self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
         )
 
     def noise_for(self, dynamics: Dynamics) -> float:
-        """Return the speed noise of a training for an arm with these dynamics, rad/s."""
+        """Return `speed_noise`, rad/s, or its default in trainings for an arm with these dynamics."""
         if self.speed_noise is not None:
             return self.speed_noise
         return SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0
 
     def of_model(self, name: str) -> Any:
-        """Return an attribute that `with_model` sets; raise UserError before."""
+        """Return an attribute that `with_model` sets; raise UserError if it is not set yet."""
         value = getattr(self, name)
         if value is None:
             raise UserError(f"task: {type(self).__name__} needs a model of the arm; call with_model first")
         return value
 
     def control(self, robot: Robot) -> Controller:
-        """Return the controller: by default the task's own one."""
+        """Return the controller of `controlled_by`, else the default one."""
         return self.controller or self.own or super().control(robot)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
@@ -59,5 +59,5 @@ class TipTask(BaseTask):
         return np.tile(robot.q_home, (count, 1))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones: the reward takes forces in N and distances in m."""
+        """Return (m,) ones: the reward uses forces in N and distances in m, without a scale."""
         return np.ones(len(goals))

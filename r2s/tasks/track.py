@@ -23,10 +23,10 @@ from r2s.tasks.trajectory import KINDS, Curve, Paths, V, X, at_time, curve
 
 FAR_M, NEAR_M, FINE_M = 0.03, 0.01, 0.003  # m, tanh scales of the reward
 SPEED, ACCELERATION = 1.0, 10.0  # rad/s, rad/s^2, tanh scales of deviations from the plan
-NEAR_RAD = 0.02  # rad, scale of joint errors
-CHECKED = 12  # postures of a path that are checked for contacts
-TRIES = 60  # draws per path, on average
-JERK_S = 0.1  # s, window of the cubic that gives the jerk
+NEAR_RAD = 0.02  # rad, scale of observed joint errors
+CHECKED = 12  # about this many postures of a path are checked for contacts
+TRIES = 60  # most draws per path, on average
+JERK_S = 0.1  # s, window of the fitted cubic whose third derivative is the jerk
 
 TRACK = MeasureTable(
     measures=(
@@ -57,17 +57,17 @@ TRACK = MeasureTable(
 class TrackTask(BaseTask):
     """Follow a path on time; a `Task` (r2s/tasks/task.py) from conf/task/track.yaml.
 
-    A goal is a plan (steps + 1 + preview, 6 + 3 n) of r2s/tasks/trajectory.py, a row for each control step.
+    A goal is a plan (steps + 1 + preview, 6 + 3 n) of r2s/tasks/trajectory.py, with a row for each control step.
 
     Attributes:
         ctrl_hz: policy rate, 50 to 200. episode_s: length of a path, s. ramp_s: duration of its acceleration, and of
             its deceleration.
-        torque_fraction, boost: the largest target is boost x torque_fraction of tau_max.
+        torque_fraction, boost: the largest target torque is boost x torque_fraction x tau_max, at most tau_max.
         cutoff_hz: low-pass on the torque.
         preview: samples of the path ahead in an observation.
         speed: (low, high) m/s, drawn peak speed; lower where the arm's limits require it.
-        size: (low, high) m, of paths about their middle. kinds: subset of KINDS, drawn with equal probability.
-        reach, height, azimuth: region of paths, see `ReachTask`.
+        size: (low, high) m, drawn radius of a path about its centre. kinds: subset of KINDS, equally probable.
+        reach, height, azimuth: region that contains the paths, see `ReachTask`.
         pool: number of paths that a training draws from.
         model: the identified arm, for the default controller; see `with_model`.
     """
@@ -205,7 +205,7 @@ class TrackTask(BaseTask):
 
         Args:
             robot: the arm. start: (3,) m of the end effector. shape: offset from there, (T, 3) m, at arc length u
-                (T,) m. pace: m/s of u; lower where the arm's limits require it.
+                (T,) m. pace: peak du/dt, m/s; lower where the arm's limits require it.
 
         Raises:
             UserError: the arm cannot follow it.
@@ -272,7 +272,7 @@ class TrackTask(BaseTask):
         return np.concatenate([now[:, X], now[:, V]], axis=1)
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones: the reward takes distances in m."""
+        """Return (m,) ones: the reward uses distances in m, without a scale."""
         return np.ones(len(goals))
 
     def judge(
@@ -291,8 +291,8 @@ class TrackTask(BaseTask):
 
         path_rmse_mm: RMS distance of end effector and reference, over all steps of all paths that were not stopped.
         path_max_mm: mean over paths of their largest error. within_x: share of the steps; steps of stopped paths
-        count as outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: over joints
-        and time. jerk: m/s^3, RMS of the end effector, from a cubic over JERK_S. stopped: share of the paths.
+        count as outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: RMS over joints
+        and time. jerk: m/s^3, RMS at the end effector, cubic fit over JERK_S. stopped: share of the paths.
         q_left_rad, limited: as for reaching.
         """
         ended = ~np.isfinite(episodes.distance).all(1)

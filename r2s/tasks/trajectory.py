@@ -1,9 +1,9 @@
 """End-effector trajectories: curves, the postures that follow them, and the fastest feasible timing.
 
-A curve is x(u) m; where it is fastest, u is arc length. Inverse kinematics on a grid and a cubic spline give postures
-q(u). The clock u(t) starts and stops with minimum-jerk speed and runs at a pace of v m/s in between. So position,
-velocity and acceleration of end effector and joints are continuous. The pace is reduced until torque, speed and the
-acceleration bounds of the safety filter leave a margin.
+A curve is x(u), m, with |dx/du| <= 1. Inverse kinematics on a grid of u and a cubic spline yield the postures q(u).
+The clock u(t) accelerates along a minimum-jerk polynomial to the pace v, m/s, and slows down along one at the end. So
+position, velocity and acceleration of end effector and joints are continuous. The pace is reduced until torque, speed
+and acceleration keep a margin to the limits of the arm and of its safety filter.
 """
 
 from collections.abc import Callable
@@ -22,15 +22,15 @@ KINDS = ("fourier", "eight", "circle", "waypoints")
 SPACE = np.eye(3)
 GRID_M = 0.01  # m, step of u between two postures of the inverse kinematics
 HARMONICS = 3  # of a random Fourier curve
-LEADS = 60  # points from home to the start of a path, and as many for the posture to converge there
+LEADS = 60  # points from home to the start of a path; as many more at the start let the posture converge
 OFF_M = 1e-4  # m, largest position error of a posture
-INSIDE = 0.05  # rad, distance from the position limits of the safety filter
-# Shares of action torque, of the filter's speed limit and of its acceleration bound that a path may use; the rest is
-# for friction, feedback and errors of the nominal model.
+INSIDE = 0.05  # rad, least distance of a path from the position limits of the safety filter
+# Shares of the largest target torque, and of the filter's speed limit and acceleration bound, that a path may use;
+# the rest remains for friction, feedback and errors of the nominal model.
 TORQUE, SPEED, ACCELERATION = 0.5, 0.9, 0.8
 SLOWEST = 0.02  # share of the drawn pace; a path that must be slower is rejected
-CHECK_HZ = 50  # samples for limits
-TRIES = 20  # paces to try
+CHECK_HZ = 50  # Hz, rate at which a path is checked against limits
+TRIES = 20  # most paces tried for a path
 PEAK = 1.875  # peak over mean speed of a minimum-jerk motion
 X, V = slice(0, 3), slice(3, 6)  # columns of a plan, followed by q, dq, ddq
 
@@ -40,7 +40,7 @@ Curve = Callable[[np.ndarray], np.ndarray]
 def curve(kind: str, rng: np.random.Generator, size: float, axes: np.ndarray = SPACE) -> Curve:
     """Return the curve u (T,) m -> x(u) - x(0) (T, 3) m, within `size` m of its centre and with |dx/du| <= 1.
 
-    axes: (k, 3), perpendicular unit vectors of the plane, or of the space, in which it lies.
+    axes: (k, 3), orthonormal vectors that span the plane (k = 2) or the space (k = 3) of the curve.
     """
     k = len(axes)
     a, b = np.linalg.qr(rng.standard_normal((k, k)))[0].T[:2] @ axes
@@ -93,9 +93,9 @@ def smooth(s: np.ndarray) -> np.ndarray:
 
 
 def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return position, pace and acceleration of a clock with unit pace at t (T,) s; the pace is 0 outside.
+    """Return position, pace and acceleration at t (T,) s of a clock of unit pace, from 0 to `seconds`.
 
-    The pace rises by `smooth` over the first `ramp` s of `seconds` and falls over the last.
+    The pace rises along `smooth` in the first `ramp` s and falls along it in the last; outside it is 0.
     """
 
     def integral(s: np.ndarray) -> np.ndarray:
@@ -129,9 +129,9 @@ class Paths:
         object.__setattr__(self, "_limits", filter_limits(self.robot, self.torque))
 
     def postures(self, start: np.ndarray, shape: Curve, pace: float) -> tuple[CubicSpline, np.ndarray] | None:
-        """Return q(u) and the points (T, 3) m of the curve from `start` (3,) m.
+        """Return the spline q(u) and the points (T, 3) m of the curve from `start` (3,) m.
 
-        None if a point is out of reach or a posture too near to a position limit.
+        Return None if a point is out of reach, or a posture is too near to a position limit.
         """
         home, hand, limits = self.robot.q_home, self._hand, self._limits  # type: ignore[attr-defined]
         first = hand.place(home[None])[0]
@@ -153,10 +153,10 @@ class Paths:
         return q(u[:, 0]), along * rate, q(u[:, 0], 2) * rate**2 + along * slope
 
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
-        """Return the largest ratio of a path's torque or acceleration to its limit.
+        """Return the largest ratio of a path's torque, or of its speed and acceleration, to what is allowed.
 
-        The torque is the nominal model's. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq), where v is
-        the speed allowed at q.
+        The torque comes from the nominal model. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq), with
+        v, the speed allowed at q.
         """
         limits = self._limits  # type: ignore[attr-defined]
         shares = [np.abs(self._model.rigid(q, dq, ddq)) / (TORQUE * self.torque)]  # type: ignore[attr-defined]
@@ -172,7 +172,7 @@ class Paths:
     def plan(self, start: np.ndarray, shape: Curve, pace: float, t: np.ndarray) -> np.ndarray | None:
         """Return the plan (T, 6 + 3 n) at t (T,) s, slower than `pace` m/s if `strain` exceeds 1; None: not feasible.
 
-        Columns: position and velocity of the end effector, m, m/s; q, dq, ddq of the joints. t may be longer.
+        Columns: position and velocity of the end effector, m, m/s; q, dq, ddq of the joints. t may exceed `seconds`.
         """
         found = self.postures(start, shape, pace)
         if found is None:
@@ -196,7 +196,7 @@ class Paths:
 
 
 def at_time(plans: np.ndarray, k: np.ndarray, ahead_s: float, hz: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, dq, ddq (m, n) of plans `ahead_s` after rows k (m,); the acceleration is linear between rows."""
+    """Return q, dq, ddq (m, n) of plans `ahead_s` s after rows k (m,); acceleration is linear between rows."""
     n, whole = (plans.shape[2] - 6) // 3, int(ahead_s * hz)
     rows, last = np.arange(len(plans)), plans.shape[1] - 1
     a, b = plans[rows, np.minimum(k + whole, last)], plans[rows, np.minimum(k + whole + 1, last)]

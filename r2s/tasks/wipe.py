@@ -1,4 +1,4 @@
-"""Task wipe: follow a timed path on a surface whose place is roughly known, under a normal force."""
+"""Task wipe: follow a timed path on a surface whose position is roughly known, with a normal force."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -20,25 +20,25 @@ from r2s.tasks.task import Episodes, ObservationTerm, State
 from r2s.tasks.trajectory import KINDS, V, X, clock, curve
 from r2s.tasks.wipe_measures import GOOD_M, GOOD_N, WIPE, wipe_measures
 
-A = slice(6, 9)  # columns of a path, after those of place and velocity
+A = slice(6, 9)  # columns of the acceleration in a path, after position and velocity
 SLOW_V = 0.01  # m/s, at which the expected friction of the surface reaches its level
 FAR_M = 0.01  # m, tanh scale of the path error
-REST_S = 0.3  # s, between the whole force and the path, and at the path's end
-STEADY = 0.25  # of the rate of an integral at which the path oscillates without end: a gain margin of 12 dB
+REST_S = 0.3  # s, pause between the full force and the path, and after the path
+STEADY = 0.25  # share of the integral rate at the limit of stability: a gain margin of 12 dB
 
 
 @dataclass(frozen=True)
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal is the row of `SurfaceTask`, with equal forces at the path's start and end (`goals`), then the path:
-    position, velocity and acceleration (9,) before the first control step and after each.
+    A goal is the row of `SurfaceTask` with the forces at start and end of the path, which `goals` makes equal, and
+    then the path: position, velocity and acceleration (9,) before the first control step and after each step.
 
     Attributes:
-        speed: (low, high) m/s, drawn peak speed. size: (low, high) m, of paths about their middle. kinds: subset of
-            KINDS, drawn with equal probability. ramp_s: s, of the path's acceleration, and of its deceleration.
-        friction: of the surface, expected. The others: see `SurfaceTask`.
-        inertia: (3, 3) kg, of the tip at the nominal plane.
+        speed: (low, high) m/s, drawn peak speed. size: (low, high) m, drawn radius of a path. kinds: subset of
+            KINDS, equally probable. ramp_s: s, duration of the path's acceleration, and of its deceleration.
+        friction: expected friction coefficient of the surface. The others: see `SurfaceTask`.
+        inertia: (3, 3) kg, effective mass of the tip at the nominal plane.
     """
 
     episode_s: float = 8.0
@@ -66,14 +66,14 @@ class WipeTask(SurfaceTask):
                 raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
         check_number(
             "task.size", self.size[1], f"(0, {self.spread / np.sqrt(2):.3g}]"
-        )  # its middle is that of a square
+        )  # a path's middle is that of its bounding box
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
         check_number("task.friction", self.friction, "[0, inf)")
         check_number("task.episode_s", self.episode_s, f"[{self.begin_s + 2 * self.ramp_s + REST_S:g}, 60]")
 
     @property
     def begin_s(self) -> float:
-        """When the path begins, s: the tip has touched for sure, and the largest force has risen."""
+        """Start of the path, s: by then the tip has certainly touched, and the largest force has built up."""
         return self.down_s + self.force[1] / self.force_rate + REST_S
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
@@ -87,18 +87,18 @@ class WipeTask(SurfaceTask):
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """Stiffness N/m and rate of the integrals 1/s, from the tip's inertia at the plane.
+        """Stiffness N/m and rate r of the integrals 1/s, from the tip's effective mass at the plane.
 
-        A path wants the stiffest spring that the latency allows, K = m w^2 of the lightest direction m. Under the
-        critical damping of the law, M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0 of the heaviest direction M is stable
-        for r < 2 (K / M)^(1/2) (Routh and Hurwitz), of which r is STEADY.
+        A path needs the stiffest spring that the latency allows: K = m w^2 with the smallest effective mass m. With
+        the law's critical damping, the largest mass M has the characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s
+        + K r = 0. It is stable for r < 2 (K / M)^(1/2) (Routh and Hurwitz); STEADY is the used share of this limit.
         """
         masses = np.linalg.eigvalsh(self.inertia)
         K = float(masses[0] * fastest_spring(self) ** 2)
         return {"stiffness": K, "integral_rate": float(STEADY * 2.0 * np.sqrt(K / masses[-1]))}
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
-        """Return (steps + 1, 3) m, a curve of KINDS at a speed ~ U(speed), anywhere within `spread`."""
+        """Return (steps + 1, 3) m, a curve of random kind with speed ~ U(speed), anywhere within `spread`."""
         size, speed = rng.uniform(*self.size), rng.uniform(*self.speed)
         shape = curve(self.kinds[rng.integers(len(self.kinds))], rng, size, axes)
         t = np.arange(self.steps + 1) / self.ctrl_hz - self.begin_s
@@ -109,12 +109,12 @@ class WipeTask(SurfaceTask):
         return path - middle + away * np.array([np.cos(about), np.sin(about)]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return a force ~ U(force), twice."""
+        """Return the same force ~ U(force), N, twice."""
         force = rng.uniform(*self.force)
         return force, force
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return ((steps + 1) 9,), place m, velocity m/s and acceleration m/s^2 of the path's rows."""
+        """Return ((steps + 1) 9,), position m, velocity m/s and acceleration m/s^2 of the path's rows."""
         spline = CubicSpline(np.arange(len(path)) / self.ctrl_hz, path)
         return np.hstack([path, spline(spline.x, 1), spline(spline.x, 2)]).ravel()
 
@@ -123,7 +123,7 @@ class WipeTask(SurfaceTask):
         return goals[:, -9 * (self.steps + 1) :].reshape(len(goals), -1, 9)
 
     def now(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 9), place, velocity and acceleration of the paths at t (m,) s, linear between rows."""
+        """Return (m, 9), position, velocity and acceleration of the paths at t (m,) s, linear between rows."""
         rows, which = self.rows(goals), np.arange(len(t))
         k = (t * self.ctrl_hz).clip(0.0, self.steps)
         low = np.minimum(k.astype(np.int64), self.steps - 1)
@@ -139,19 +139,19 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force N of hybrid control; it changes along the path if both ends' differ."""
+        """Return (m, 4), normal and force, N, of hybrid control; unequal forces are interpolated along the path."""
         share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
         force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of an impedance, m and m/s, in the middle of the period that begins at t."""
+        """Return an impedance's target (m, 6), position and velocity, in the middle of the period from t on."""
         middle, normal = t + 0.5 / self.ctrl_hz, goals[:, NORMAL]
         now, down = self.now(middle, goals), self.depth(middle, goals)[:, None] * normal
         return np.concatenate([now[:, X] - down, now[:, V]], axis=1)
 
     def pull(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 3) N, what accelerates the tip along the path, and overcomes the expected friction."""
+        """Return the feedforward force (m, 3) N that accelerates the tip along the path against expected friction."""
         now, force = self.now(t + 0.5 / self.ctrl_hz, goals), self.contact(t, goals)[:, 3:]
         speed = np.linalg.norm(now[:, V], axis=1, keepdims=True)
         return now[:, A] @ self.inertia + self.friction * force * now[:, V] / np.maximum(speed, SLOW_V)
@@ -187,8 +187,8 @@ class WipeTask(SurfaceTask):
         """Return the distance from the path along the nominal plane (m,) m, and the reward terms (m, 6).
 
         force -tanh(error / 5 N); path -tanh(distance / 1 cm); precision: product of 1 - tanh(error / 5 N) / 2 -
-        tanh(error / 2 N) / 2 and the same of the distance with 1 cm and 3 mm; excess: -tanh of the force beyond the
-        requested one / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        tanh(error / 2 N) / 2 and the same for the distance with 1 cm and 3 mm; excess -tanh(e / 10 N) with the force
+        e above the requested one; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
         """
         beyond, normal = -np.diff(self.forces(state, goals))[:, 0], goals[:, NORMAL]
         offset = self.tip(state.q)[0] - self.at(state.t, goals)

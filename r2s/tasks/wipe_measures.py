@@ -1,4 +1,4 @@
-"""The measures of task wipe, from the path error and the force against the surface while the path runs."""
+"""The measures of task wipe, from path error and force against the surface while the path runs."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.press_measures import TOUCH_N, impact_of
 from r2s.tasks.task import Episodes
 
-GOOD_N, GOOD_M = 2.0, 0.003  # N, m: a step counts as wiped within both
-SUCCESS = 0.95  # share of a path that is wiped
+GOOD_N, GOOD_M = 2.0, 0.003  # N, m: a step counts as wiped if force and path error are within both
+SUCCESS = 0.95  # share of a path that must be wiped
 
 WIPE = MeasureTable(
     measures=(
@@ -38,12 +38,12 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv; only impact_N counts steps before `begin`, when the path starts.
+    """Return one row of evaluations.csv; the path starts at step `begin`, and forces and errors count from there.
 
-    wiped, within_2N, within_3mm: share of the steps with a force and a path error that small; contact: share with
-    more than TOUCH_N. Steps of stopped episodes count as misses. success: share of episodes wiped to SUCCESS.
-    force_rmse_N, path_rmse_mm: RMS over the steps of the episodes that were not stopped. impact_N: mean over them of
-    the largest force within IMPACT_S of the first touch.
+    within_2N, within_3mm: share of the steps with so small a force error, and path error; wiped: share with both;
+    contact: share with more than TOUCH_N. Steps of stopped episodes count as misses. success: share of episodes wiped
+    to SUCCESS. force_rmse_N, path_rmse_mm: RMS error over the steps of the episodes that were not stopped. impact_N:
+    mean over these episodes of the largest force within IMPACT_S of the first touch, also before `begin`.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = ~ended[:, None]

@@ -11,23 +11,23 @@ from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
 
 OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to it, so that no reflex acts
-# Share of the cautious thresholds that friction and errors of the model take: they reach 3.7 of 20 Nm in a Panda's
-# joints 1 to 4 and 2.2 of 12 Nm in its wrist.
+# Share of the cautious thresholds that friction and model errors use up: they cause an external torque of up to 3.7
+# of 20 Nm in a Panda's joints 1 to 4 and 2.2 of 12 Nm in its wrist.
 ERROR = 0.2
-FRICTION = 0.5  # of a surface, the largest of conf/dr/contact.yaml
+FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/contact.yaml
 
 
 @dataclass(frozen=True)
 class CollisionThresholds:
     """External torque and force at which the arm stops itself.
 
-    The contact thresholds get the same values. The defaults are the lowest in libfranka's motion examples.
+    libfranka's contact thresholds get the same values. The defaults are the lowest in libfranka's motion examples.
 
     Attributes:
         torque: (7,) Nm at the joints. force: (6,) N and Nm at the end effector.
 
     Raises:
-        UserError: a wrong count, or a value that is not above 0.
+        UserError: a count is wrong, or a value is not above 0.
     """
 
     torque: Sequence[float] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
@@ -45,10 +45,10 @@ CAUTIOUS = CollisionThresholds()
 
 
 def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
-    """Return the thresholds for a task: above every force that its limit of pushes allows, and at least CAUTIOUS.
+    """Return the thresholds for a task: above every force that its push limit allows, and at least CAUTIOUS.
 
-    The load case is a tip on the plane: the largest force that the limit allows on a rigid surface, and FRICTION
-    times this force across the normal. Errors of the arm's model add ERROR.
+    The load case is a tip on the plane with the largest normal force that the limit allows on a rigid surface, and
+    FRICTION times this force tangentially. For model errors, ERROR times CAUTIOUS is added.
 
     Raises:
         UserError: the thresholds would switch the reflexes off.

@@ -1,4 +1,4 @@
-"""Whether this computer and its cable keep up with an arm: kernel, rights, and the states of an arm at rest."""
+"""Check whether this computer and its cable keep up with an arm: kernel, permissions, states of an arm at rest."""
 
 import os
 import resource
@@ -9,14 +9,14 @@ import numpy as np
 from r2s.arm.clients.connection_check import Finding
 from r2s.physics.robot import SIM_DT
 
-LOST_SHARE = 0.01  # of the states: states and commands share the cable
+LOST_SHARE = 0.01  # of the states; the same limit as for lost commands, because both use the same cable
 GAP_S = 0.02  # 20 cycles without an answer stop the arm
 REALTIME = Path("/sys/kernel/realtime")  # where libfranka looks for a real-time kernel
 LIMITS = resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK
 
 
 def computer_findings(realtime: bool) -> list[Finding]:
-    """Check kernel and rights; `realtime`: whether libfranka will insist on them."""
+    """Check kernel and permissions; `realtime`: whether libfranka will require them."""
     kernel = REALTIME.is_file() and REALTIME.read_text().strip() == "1"
     fifo, (priority, _), (memory, _) = _may_use_fifo(), *map(resource.getrlimit, LIMITS)
     locked = "unlimited" if memory == resource.RLIM_INFINITY else f"{memory / 2**20:.0f} MiB"
@@ -30,7 +30,7 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check the states of an arm at rest by the arm's and this computer's time (k,) s of each."""
+    """Check the states of an arm at rest; arm, here: their times (k,) s on the arm's and this computer's clock."""
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)
@@ -44,7 +44,7 @@ def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
 
 
 def _may_use_fifo() -> bool:
-    """Try the priority that libfranka asks for, and return to the one before."""
+    """Return whether this process may use libfranka's priority: try it, then restore the previous one."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO)))

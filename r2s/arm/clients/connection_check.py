@@ -1,4 +1,4 @@
-"""The check at connection, before anything moves: is the arm behind the address the arm of the model?"""
+"""The check at connection, before anything moves: does the arm at the address match the model?"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +13,11 @@ from r2s.physics.payload import LoadTorque, Payload, ee_pose
 from r2s.physics.rigid_body import nominal_torque
 from r2s.physics.robot import Robot
 
-# Both kinematics are exact and read the same q: what is left is single precision (1e-7 m) and rounded robot files
+# Both kinematics are exact and use the same q: they differ only by single precision (1e-7 m) and rounded robot files
 PLACE_M, ANGLE_DEG = 1e-3, 0.2  # a tenth of the accuracy of a policy; 0.2 deg are 1 mm at 0.3 m
 LOAD_KG = 0.01  # 0.08 Nm at full reach: less than the friction of any joint, so gravity compensation still holds
 GRAVITY = 0.1  # m/s^2: 0.6 deg of tilt, 1 % of gravity compensation
-# Without O_ddP_O, the arm's gravity torque is compared. Models of its links differ; a tilt of 5 to 12 deg shows
+# Without O_ddP_O, the gravity torque is compared. Link models differ, so only tilts above 5 to 12 deg are detected
 GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # of the largest gravity torque at the posture, and Nm
 BEYOND = 0.1  # rad, how far a person may guide a joint beyond its limit
 
@@ -62,7 +62,7 @@ class Finding:
     """One compared quantity.
 
     Attributes:
-        name: what was compared. expected: by r2s. found: on the arm or computer. refused: whether they do not agree.
+        name: what was compared. expected: by r2s. found: on arm or computer. refused: whether `found` is not allowed.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Connection:
     """What a client expects of its arm.
 
     Attributes:
-        arm: its type. declared: payload that its gravity compensation should assume, end effector included.
+        arm: its type. declared: payload that its gravity compensation should assume, including the end effector.
         moves: False for `r2s check`: a mismatch is only reported, and no motion begins.
     """
 
@@ -128,7 +128,7 @@ def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
 
 
 def _load_of(robot: Robot, s: Any) -> np.ndarray:
-    """Return the `mass_and_moment` (4,) of what the arm declares, end effector and load."""
+    """Return the `mass_and_moment` (4,) of end effector and load as the arm's RobotState declares them."""
     place, axes = ee_pose(robot)
     tool = np.array(s.F_T_EE).reshape(4, 4).T
     flange = axes @ tool[:3, :3].T
@@ -136,7 +136,7 @@ def _load_of(robot: Robot, s: Any) -> np.ndarray:
 
 
 def refuse(findings: Sequence[Finding], what: str) -> None:
-    """Raise UserError with the findings that do not agree, in one line."""
+    """Raise UserError, in one line, with all findings that are refused; do nothing if there are none."""
     if wrong := [str(finding) for finding in findings if finding.refused]:
         raise UserError(f"{what}: {'; '.join(wrong)}")
 
@@ -149,7 +149,7 @@ def _posture(arm: ArmType, q: np.ndarray) -> Finding:
 
 
 def _limits(arm: ArmType, robot: Robot) -> list[Finding]:
-    """Torque must not exceed the arm's; positions were clipped to the arm's, which must leave the home posture."""
+    """Compare limits: torque must not exceed the arm's; home must be within the limits clipped to the arm's."""
     step, torque = robot.dtau_max / arm.dtau_max, robot.tau_max / arm.tau_max
     i, j, home = int(torque.argmax()), int(step.argmax()), robot.q_home
     k = int(np.maximum(robot.q_min - home, home - robot.q_max).argmax())
@@ -184,7 +184,7 @@ def _end_effector(robot: Robot, s: Any) -> Finding:
 
 
 def _external(s: Any) -> Finding:
-    """Not refused: an adapter may be meant to find an undeclared payload."""
+    """Report the external torque, but never refuse it: an adapter may be meant to find an undeclared payload."""
     return Finding("external torque at rest", "about 0 Nm", f"{_row(np.array(s.tau_ext_hat_filtered), 1)} Nm")
 
 

@@ -18,7 +18,7 @@ class Operator(Protocol):
 
 
 def find_operator(operator: Operator | str | None) -> Operator | None:
-    """Return the operator of a setting: 'terminal', a function, or None."""
+    """Return the operator for a setting, which is 'terminal', a function, or None."""
     if not isinstance(operator, str):
         return operator
     if operator != "terminal":

@@ -34,11 +34,11 @@ def emulated_arm(
     moves: bool = True,
     speed_share: float = 1.0,
 ) -> AbstractContextManager[Franka]:
-    """Open an emulated Panda or FR3. These are the keys of conf/arm/*_emulated.yaml.
+    """Open an emulated Panda or FR3. The arguments are the keys of conf/arm/*_emulated.yaml.
 
     Args:
         robot: nominal model. client: 'panda' or 'fr3'.
-        seed: of the rigid twin. noise, payload, declared_payload, surface: see `TwinBase`.
+        seed: of the rigid twin behind the emulator. noise, payload, declared_payload, surface: see `TwinBase`.
         realtime: 1 kHz instead of lock-step. operator, collision_torque, collision_force, speed_share, moves: see
             `Panda`.
     """
@@ -58,5 +58,5 @@ def emulated_arm(
 @contextmanager
 def _opened(make_arm: Callable[[str], Franka], emulator: Emulator, realtime: bool) -> Iterator[Franka]:
     with emulator as address, closing(make_arm(address)) as arm:
-        arm.realtime = realtime  # but without a real-time kernel, which the client would require
+        arm.realtime = realtime  # set here, because as an argument it would require a real-time kernel
         yield arm

@@ -14,11 +14,11 @@ from r2s.arm.clients.libfranka import Client
 from r2s.arm.clients.panda import Panda
 from r2s.physics.robot import Robot
 
-STOP_DISTANCE = 0.02  # rad, of a joint that brakes from 0.2 rad/s, the speed that an FR3 allows there
+STOP_DISTANCE = 0.02  # rad, braking distance of a joint from 0.2 rad/s, the speed that an FR3 allows there
 
 
 def within_fr3(robot: Robot) -> Robot:
-    """Return the robot with its limits clipped to an FR3's; it slows down before them as an FR3 does.
+    """Return the robot with its limits clipped to an FR3's and with an FR3's position-dependent velocity limit.
 
     An FR3 allows no speed in the last hundredths of a radian. The limits exclude that range and a stopping distance.
     """
@@ -95,8 +95,8 @@ class FR3(Panda):
     """A Franka Research 3; arguments as in `Panda`, limits restricted by `within_fr3`.
 
     Raises:
-        UserError: pylibfranka is missing, no server of its FCI version answers at the address, or the arm behind it
-            is not the one of the model.
+        UserError: pylibfranka is missing, no server of its FCI version answers at the address, or the arm there does
+            not match the model.
     """
 
     arm_type, client_type, within = connection_check.FR3, _FR3Client, staticmethod(within_fr3)

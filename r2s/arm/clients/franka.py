@@ -1,8 +1,8 @@
-"""What the Panda and the FR3 have in common: the `Arm` protocol on a libfranka client, hardware or emulated.
+"""Base of Panda and FR3: the `Arm` protocol on a libfranka client, hardware or emulated.
 
 libfranka has no point-to-point motion in torque control. `move_to` therefore follows a slow, checked joint path with
-the recorder's tracking controller, in the same 1 kHz torque loop as every other motion. It needs no model from the
-client package, and the emulator tests the code that moves the hardware.
+the recorder's tracking controller, in the same 1 kHz torque loop as every other motion. So `move_to` needs no model
+from the client package, and tests on the emulator exercise the same code that moves the hardware.
 """
 
 import weakref
@@ -37,8 +37,8 @@ SPEED = 0.2  # of dq_max
 ACCELERATION = 0.2  # of ddq_max
 TORQUE_SHARE = 0.2  # of tau_max, torque limit of the driver
 MAX_DEVIATION = 0.1  # rad off the path, less where an obstacle is near; beyond it `move_to` gives up
-SETTLE_S = 3.0  # longest time at the end of the path
-INTEGRAL_GAIN = 15.0  # of tau_max per rad s; overcomes breakaway at the end of the path
+SETTLE_S = 3.0  # s, longest time to settle at the end of the path
+INTEGRAL_GAIN = 15.0  # of tau_max per rad s; overcomes breakaway torque at the end of the path
 INTEGRAL_SHARE = 0.15  # of tau_max, limit of that integral
 ARRIVED = 2e-3  # rad from the target: the motion ends
 ACCEPTED = 1e-2  # rad from the target after SETTLE_S: accepted, because a real wrist's friction may hold it there
@@ -51,23 +51,23 @@ class Franka:
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked: see `Operated`. Every end of a motion except `stop` blocks the arm: a reflex, a stop button
-            (even if released since), a refused command, a failed `move_to`. hold: see `Holds`.
-        findings: of the check at connection.
-        realtime: whether motions run in a `realtime_section`; a recording or an episode with less than 99 % of its
-            commands in time then does not count.
+        operator, blocked: see `Operated`. Any end of a motion other than `stop` blocks the arm: a reflex, a stop
+            button (even if released since), a rejected command, a failed `move_to`. hold: see `Holds`.
+        findings: results of the check at connection.
+        realtime: whether motions run in a `realtime_section`; a recording or an episode in which less than 99 % of
+            the commands arrive in time is then rejected.
 
     Args:
         robot: limits and nominal model.
         client: the connection.
-        operator: called with the reason before the arm moves again after a stop. None: `move_to` refuses until a new
-            connection begins with an arm that is ready.
+        operator: called with the reason before the arm moves again after a stop. None: after a stop `move_to` refuses
+            to move until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
-        connection: what the arm must be; None: not checked.
-        speed_share: share of all allowed speeds, in every motion.
+        connection: what is expected of the arm; None: not checked.
+        speed_share: factor on all allowed speeds, in every motion.
 
     Raises:
-        UserError: the arm is not the one of the model; nothing has moved.
+        UserError: the arm does not match the model; nothing has moved.
     """
 
     def __init__(
@@ -103,15 +103,15 @@ class Franka:
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Move to q (7,) rad at a fifth of the speed limits, unless the arm is within 2 mrad of it, and hold there.
+        """Move to q (7,) rad at up to a fifth of the speed limits, unless the arm is within 2 mrad of q; hold there.
 
         The path is the first one of r2s/excitation/paths.py that keeps clear of limits, table and arm.
 
         Raises:
             NotCleared: the arm stopped before, and no operator agreed that it may move.
-            StopRequested: a signal, or the end of the process of the policy; the arm is at rest.
-            ArmStopped: q is outside the limits; the arm is not ready; no path exists (nothing moved); the arm stopped
-                on the path, deviated from it by 0.1 rad, or ended more than 10 mrad from q.
+            StopRequested: a signal, or the policy's process ended; the arm is at rest.
+            ArmStopped: q is outside the limits, the arm is not ready, or no path exists (in these cases nothing
+                moved); the arm stopped on the path, deviated from it by 0.1 rad, or ended more than 10 mrad from q.
 
         """
         q = np.array(q, dtype=float)
@@ -127,7 +127,7 @@ class Franka:
         return self._state
 
     def read(self) -> ArmState:
-        """Return the state of the current cycle; before a motion's first command, of the arm at rest."""
+        """Return the state of the current cycle; before a motion's first command, the state of the arm at rest."""
         return self._state
 
     def command(self, tau: np.ndarray) -> None:
@@ -151,8 +151,8 @@ class Franka:
         self._send(tau)
 
     def stop(self) -> None:
-        """Damp the remaining motion for at most 0.5 s, and end it; `blocked` keeps an earlier reason."""
-        if self._damping:  # the driver's own stop during damping
+        """Damp the remaining motion for at most 0.5 s, and end it; an earlier reason stays in `blocked`."""
+        if self._damping:  # the command loop calls `stop` while it damps
             return
         for part in (self._damp, self._end):  # `_end` also runs if damping failed
             try:
@@ -167,11 +167,11 @@ class Franka:
             self._stopped = "stop was called"
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read an arm at rest; return the arm's and this computer's time (k,) s of each state."""
+        """Read states of the arm at rest; return their times (k,) s on the arm's clock and on this computer's."""
         return self._client.watch(seconds)
 
     def close(self) -> None:
-        """Stop and drop the connection."""
+        """Stop the arm and close the connection."""
         self.stop()
         self._client.close()
         self._closed, self._stopped = True, "the connection was closed"
@@ -262,7 +262,7 @@ class Franka:
         self._read_idle()
 
     def _plan(self, q: np.ndarray) -> np.ndarray:
-        """Return the postures (k, 7) rad on the path to q (7,) rad; k is 0 if the arm is at q already."""
+        """Return the postures (k, 7) rad of the path to q (7,) rad; k is 0 if the arm is already at q."""
         here = self._state.q
         if np.abs(here - q).max() <= ARRIVED:
             return q[:0, None]
@@ -276,7 +276,7 @@ class Franka:
     def _follow(self, q: np.ndarray) -> None:
         """Follow the straight joint path to q (7,) rad."""
         path, moving = _slow_path(self.robot, self._state.q, q, self.speed_share)
-        assert self._space is not None  # of `_plan`
+        assert self._space is not None  # set by `_plan`
         allowed = DeviationLimits.along(self._space, path, MAX_DEVIATION)
         controller, loop = TrackingController(self.robot, path, allowed), self._loop
         limit = INTEGRAL_SHARE * self.robot.tau_max
@@ -291,8 +291,8 @@ class Franka:
                 if (reason := controller.deviation(k, s)) is not None:
                     loop.halt(reason)
                 if k >= moving:
-                    # Clegg integrator (1958): it resets when the error changes sign. Otherwise the torque that broke
-                    # a joint loose would carry it past its target
+                    # Clegg integrator (1958): it resets when the error changes sign. Otherwise the torque that
+                    # overcame a joint's breakaway torque would carry the joint past its target
                     integral = np.clip(integral + INTEGRAL_GAIN * SIM_DT * self.robot.tau_max * error, -limit, limit)
                     integral = np.where(error * last_error < 0, 0, integral)
                     last_error = error
@@ -303,7 +303,7 @@ class Franka:
             self.blocked = self.blocked or str(reason)
             raise
         finally:
-            if self._moving:  # interrupted, or given up
+            if self._moving:  # an exception ended the loop
                 self.stop()
         distance = np.abs(self._state.q - q)
         if distance.max() > ACCEPTED:
@@ -318,7 +318,7 @@ def _ms(state: Any) -> int:
 
 
 def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray, share: float) -> tuple[Excitation, int]:
-    """Return a minimum-jerk path followed by rest, and how many rows move."""
+    """Return a minimum-jerk path that is followed by rest, and the number of rows before this rest."""
     distance = np.abs(end - start)
     # peaks of minimum jerk: velocity 15/8 distance / T, acceleration 10/sqrt(3) distance / T^2
     duration = max(

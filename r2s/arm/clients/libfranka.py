@@ -42,7 +42,7 @@ class Client:
             self._robot = connect(lambda: self._package.Robot(address, config), self.name, address)
 
     def start(self) -> Any:
-        """Start a torque motion; return the RobotState that waits for the first command."""
+        """Start a torque motion; return the RobotState that the first command will answer."""
         raise NotImplementedError
 
     def exchange(self, tau: np.ndarray) -> Any:
@@ -58,7 +58,7 @@ class Client:
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of an arm at rest; return the arm's and this computer's time (k,) s of each."""
+        """Read states of an arm at rest; return their times (k,) s on the arm's clock and on this computer's."""
         times, begun = [], time.perf_counter()
         while time.perf_counter() < begun + seconds:
             times.append((self._call(self._robot.read_once).time.to_sec(), time.perf_counter()))
@@ -75,7 +75,7 @@ class Client:
         self._call(lambda: self._robot.set_collision_behavior(torque, torque, force, force))
 
     def close(self) -> None:
-        """Drop the connection."""
+        """Close the connection."""
         self._robot = None
 
     def _call(self, function: Callable[[], Any]) -> Any:
@@ -86,10 +86,10 @@ class Client:
 
 
 def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
-    """Return the client's robot.
+    """Return the connected robot object that `make` creates.
 
     Raises:
-        UserError: no connection, with libfranka's reason.
+        UserError: there is no connection; the message has libfranka's reason.
     """
     if not is_reachable(address):
         raise UserError(f"arm={extra}: no connection to {address}: no answer; is the cable plugged in?")

@@ -122,7 +122,7 @@ class Panda(Franka):
     """A Franka Emika Panda.
 
     Attributes:
-        arm_type, client_type, within: what an `FR3` has instead; `within` restricts a robot's limits to the arm's.
+        arm_type, client_type, within: overridden by `FR3`; `within` restricts a robot's limits to the arm's.
 
     Args:
         robot: limits and nominal model.
@@ -130,12 +130,12 @@ class Panda(Franka):
         operator: see `Franka`; 'terminal' asks a person at the terminal.
         realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
         collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
-        declared_payload: what the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
-            `payload_of`; the connection is refused if the arm has another mass. moves: see `Connection`.
+        declared_payload: payload that the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
+            `payload_of`; the connection is refused if the arm declares another mass. moves: see `Connection`.
 
     Raises:
-        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm behind it is
-            not the one of the model.
+        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm there does
+            not match the model.
     """
 
     arm_type: ArmType = PANDA

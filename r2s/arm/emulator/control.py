@@ -34,17 +34,17 @@ _ERRORS = (  # parts of the messages of `Reflexes`, and libfranka's index of the
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault at a fixed cycle of a motion.
+    """A fault that begins at a fixed cycle of a motion.
 
     Attributes:
-        kind: 'late': the answers of these cycles arrive too late, and the arm repeats its last torque. 'drop': the
+        kind: 'late': the answers in these cycles arrive too late, and the arm repeats its last torque. 'drop': the
             states of these cycles do not reach the client. 'discontinuity': the first joint's torque steps by twice
             the allowed size. 'joint_limit': the arm reports a position limit. 'estop': the stop button is pressed and
             stays pressed. 'press': it is pressed, and released after `cycles` ms. 'hold': an external force holds the
             first link; the arm needs the attribute `external` for it.
         cycle: the first control cycle, from 0.
-        motion: the server's motion, from 0; a client's `move_to` is one unless the arm is at the target already.
-        cycles: number of consecutive cycles; 20 late or dropped ones stop the arm.
+        motion: number of the server's motion, from 0; a client's `move_to` is one motion, or none if already there.
+        cycles: number of consecutive cycles of the fault; 20 late or dropped cycles stop the arm.
 
     """
 
@@ -72,7 +72,7 @@ class Control:
         stopped_by: why the last motion was aborted; None if it was not.
 
     Args:
-        arm: behind the box. Its state may carry the true external torque; otherwise it reports zero.
+        arm: the arm behind the box. If its state lacks the true external torque, the box reports zero.
         version: of the FCI. faults, max_missed: see `Emulator`.
         desk: settings of `DESK` by name, such as {"m_ee": 0.73}, right or wrong; the arm itself does not change.
     """
@@ -138,7 +138,7 @@ class Control:
         self._sense()
 
     def first_answer(self) -> None:
-        """Note that the client's loop runs: cycles count from now on."""
+        """Record that the client's loop runs; from now on cycles count."""
         self._answered.append(True)
         self._sense()
 
@@ -186,7 +186,7 @@ class Control:
             self._place(self._arm.read().q)
 
     def idle(self, ms: int) -> None:
-        """Advance time between motions: releasing the stop button makes the arm idle, as on a Franka."""
+        """Advance time between motions; when the stop button is released the arm becomes idle, as on a Franka."""
         if self._mode == fci.USER_STOPPED and self._pressed_ms > 0:
             self._pressed_ms -= ms
             if self._pressed_ms <= 0:
@@ -208,7 +208,7 @@ class Control:
     def recover(self) -> bool:
         """Clear a reflex; return whether the arm can move again. A pressed stop button stays pressed.
 
-        A person has to guide a real arm back inside its joint limits; here recovery does it.
+        A real arm beyond its joint limits has to be guided back by a person; here `recover` moves it back.
         """
         if self._mode == fci.USER_STOPPED:
             return False
@@ -237,7 +237,7 @@ class Control:
         self._sense()
 
     def _has(self, kind: str) -> bool:
-        """Whether a fault of this kind is active in the current cycle."""
+        """Return whether a fault of this kind is active in the current cycle."""
         return any(f.kind == kind and self._is_now(f) for f in self._faults)
 
     def _is_now(self, fault: Fault) -> bool:
@@ -260,10 +260,10 @@ class Control:
             self._arm.external = np.zeros(7)
 
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
-        """Filter the external torque, set wrench and flags, and return error and message of a collision.
+        """Filter the external torque, set wrench and flags, and return error and message of a collision, or None.
 
-        As in libfranka, it is tau_J minus the model's torque: what the joints exert on the surroundings, wrong
-        settings of the gravity compensation included. Being exact, it has no friction and no error of the model.
+        As in libfranka, external torque is tau_J minus the model's torque: what the joints exert on the surroundings,
+        plus the effect of wrong `DESK` settings. Here it is exact: free of friction and of other model errors.
 
         Args:
             gain: of the low-pass; 1 for an arm at rest.

@@ -4,8 +4,8 @@
         arm = Panda(robot, address, operator=lambda reason: True)
 
 Any `Arm` of r2s can be behind it. In lock-step, the default, the arm's clock advances only with a command: the same
-commands give the same motion, bit for bit, however slow either side is. In real time it runs at 1 kHz, and an answer
-that arrives after its millisecond counts as missed.
+commands cause the same motion, bit for bit, however slow either side is. In real time the clock runs at 1 kHz, and an
+answer that arrives after its millisecond counts as missed.
 
 It emulates no network jitter, no brakes, and nothing that makes a motion safe beside a person.
 """
@@ -82,7 +82,7 @@ def _child(pipe, settings: tuple) -> None:
         socket = open_port()
         arm = make_arm()
         arm.move_to(arm.robot.q_home)
-        arm.command(np.zeros(arm.robot.n))  # compiles; a client would time out during it
+        arm.command(np.zeros(arm.robot.n))  # compile now; a client would time out meanwhile
         arm.stop()
         arm = make_arm()
         control = Control(arm, version, faults, max_missed, desk)

@@ -12,7 +12,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import LoadTorque, ee_pose
 from r2s.physics.robot import Robot
 
-SINGULAR = 0.03  # smallest singular value of the Jacobian, m and 1; our choice. It is 0.22 at Franka's ready pose
+SINGULAR = 0.03  # least singular value of the Jacobian (rows in m and 1); our choice. 0.22 at Franka's ready pose
 
 
 def urdf(robot: Robot) -> str:
@@ -25,7 +25,7 @@ def urdf(robot: Robot) -> str:
 
 
 class BoxModel:
-    """What the control box computes from the posture: poses, and the torques of gravity and declared load."""
+    """The box's model of its arm: computes poses, wrenches, and the torques of gravity and declared load."""
 
     def __init__(self, robot: Robot):
         self._model = robot.model(gravity=True)
@@ -34,7 +34,7 @@ class BoxModel:
         self._place, self._axes = ee_pose(robot)
 
     def pose(self, q: np.ndarray, tool: np.ndarray) -> np.ndarray:
-        """Return the pose (4, 4) at q (n,) rad of a frame that is given in the flange's, tool (4, 4)."""
+        """Return the pose (4, 4), in the base frame at q (n,) rad, of a frame `tool` (4, 4) in the flange's frame."""
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         flange = np.eye(4)
@@ -45,7 +45,7 @@ class BoxModel:
     def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the wrench (6,) N, Nm in the base frame at the frame `tool` that explains torque (n,) Nm best.
 
-        It is zero near a singularity, as libfranka's.
+        Near a singularity it is zero, as in libfranka.
         """
         place, j = self.pose(q, tool)[:3, 3], self._jacobian
         mujoco.mj_comPos(self._model, self._data)

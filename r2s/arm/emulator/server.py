@@ -16,7 +16,7 @@ from r2s.physics.robot import SIM_DT
 
 LOOPBACK = "127.0.0"
 IDLE_MS = 20  # between states of an idle arm in lock-step; the clients do not need 1 kHz there
-ANSWER_S = 0.9 * SIM_DT  # least time from a state to the next one, in real time; our choice, a box keeps 1 ms
+ANSWER_S = 0.9 * SIM_DT  # s, least time between two states in real time; our choice, a real box allows 1 ms
 BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's first answer; clients time out at 1 s
 
 
@@ -120,7 +120,7 @@ class Server:
         elif name == "GetRobotModel":
             self._reply(name, number, fci.DONE, self._urdf)
         elif name in ("LoadModelLibrary", "GetCartesianLimit") or self._control.running:
-            self._reply(name, number, fci.NOT_POSSIBLE)  # that library is machine code
+            self._reply(name, number, fci.NOT_POSSIBLE)  # the model library is machine code
         else:
             if name in fci.SETTINGS:  # impedances have no effect here
                 self._control.set(name, np.frombuffer(payload, fci.SETTINGS[name], 1)[0].copy())

@@ -1,4 +1,4 @@
-"""Random parameters that both variants of hidden twin have: links, torque offset, cable drag, sensor noise."""
+"""Random parameters of both variants of hidden twin: links, torque offset, cable drag, sensor noise."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
 
 
 def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return friction at speed (n,), range of |offset| (n, 2), largest cable drag (n,) and torque noise (n,), Nm.
+    """Return friction in motion (n,), range of |offset| (n, 2), largest cable drag (n,) and torque noise (n,), Nm.
 
     A Panda has the magnitudes of the paper's Tables I and IV; other arms scale them with their torque limits.
     """
@@ -36,11 +36,11 @@ def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Return (8, n): torque offset, Nm; cable drag, the arguments of `drag`; noise of q, dq and tau_J.
+    """Draw (8, n): torque offset, Nm; four cable parameters of `drag`; standard deviations of q, dq, tau_J noise.
 
     Args:
         robot, rng: the arm, and the random stream.
-        hold: (n,) Nm, lower bound of static friction. unbalanced: (n,) Nm, what gravity compensation leaves at home.
+        hold: (n,) Nm, lower bound of static friction. unbalanced: (n,) Nm, compensation minus gravity at home.
     """
     _, offset_range, drag_max, noise_max = magnitudes(robot)
     n = robot.n

@@ -4,7 +4,7 @@ Per joint, theta and w = dtheta/dt of the motor (at the joint's side of the gear
     rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v + J'F
     s = K (theta - q) + D (w - v)
     f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c one value per direction
-F is the contact with a surface (r2s/physics/contact.py).
+F is the contact force of a surface (r2s/physics/contact.py).
 L (w - v) is the damping of the gear by the drive's torque loop. A motor at rest stays exactly at rest while the net
 torque on it is within f at w = 0; friction then balances that torque.
 warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus a sine of theta each per revolution of the joint, of the
@@ -29,7 +29,7 @@ from r2s.physics.robot import SIM_DT
 # Rows of the parameters (ROWS, n) ...
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, SHAPE, VISCOUS, POWER, RATIO = range(9)
 RIPPLE, PHASE = 9, 12  # three rows each: joint, motor and half motor revolution
-FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: W of friction at which heat settles at 1
+FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: friction power, W, at which heat settles at 1
 HELP, HELP_VISCOUS, HELP_WIDTH = range(18, 21)  # the arm's own friction compensation: Nm, Nm s/rad, rad/s
 ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
 OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
@@ -44,7 +44,7 @@ HALF_WARM = 0.6  # heat scale of warming; heat is 1 at a quarter of the speed li
 
 @njit(cache=True)
 def warmth(p, heat, i):
-    """Return the factor of all friction, from 1 when cold to 1 - FALL."""
+    """Return the temperature-dependent factor of all friction: 1 when cold, down to 1 - FALL when warm."""
     return 1.0 - p[FALL, i] * (1.0 - np.exp(-heat / HALF_WARM))
 
 
@@ -58,7 +58,7 @@ def ripple(p, theta, i):
 
 @njit(cache=True)
 def level(p, w, load, side, i):
-    """Return the friction, Nm, cold and without ripple, against motion to `side` at w rad/s; at 0: breakaway."""
+    """Return cold friction without ripple, Nm, for motion in direction `side` at w rad/s; for w = 0: breakaway."""
     coulomb = p[C_POS, i] if side > 0 else p[C_NEG, i]
     speed = abs(w)
     rise = (p[BREAK, i] - 1.0) / (1.0 + (speed / p[V_STRIBECK, i]) ** p[SHAPE, i])
@@ -67,11 +67,11 @@ def level(p, w, load, side, i):
 
 @njit(cache=True)
 def _next_velocity(p, w, middle, push, load, factor, h, i):
-    """Return the motor's velocity after h seconds under a net torque `push` without friction.
+    """Return the motor's velocity, rad/s, after h s; `push` is the net torque on it except friction, Nm.
 
     Args:
-        p, i: parameters and joint. w: velocity now, rad/s. middle: velocity for the friction of a motor that keeps
-            its direction. load: Nm, of the gear. factor: of friction.
+        p, i: parameters and joint. w: velocity now, rad/s. middle: velocity, rad/s, at which friction is evaluated if
+            the motor keeps its direction. load: gear torque, Nm. factor: on friction.
     """
     side = np.sign(w)
     if w != 0.0:
@@ -79,7 +79,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
         after = w + h / p[ROTOR, i] * (push - side * f)
         if after * side >= 0.0:
             return after
-        h *= 1.0 - w / (w - after)  # the time that is left after it has come to rest
+        h *= 1.0 - w / (w - after)  # the time left after the motor has come to rest
     side = np.sign(push)
     edge = factor * level(p, 0.0, load, side, i)
     if abs(push) <= edge:
@@ -90,7 +90,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
 
 @njit(cache=True)
 def _active(line, cycle, t, delay):
-    """Return the row of the line that a joint executes at t cycles, the last whose delay is over; -1 for none yet."""
+    """Return the row of `line` that a joint executes at t cycles: the newest one after its delay; -1: none yet."""
     slots, arrival = len(line), line.shape[1] - 1
     for k in range(cycle, max(cycle - slots, -1), -1):
         if line[k % slots, arrival] + delay <= t:
@@ -100,7 +100,7 @@ def _active(line, cycle, t, delay):
 
 @njit(cache=True)
 def _commanded(line, cycle, begin, end, delay, i):
-    """Return the mean command, Nm, that a joint executes between two times, cycles."""
+    """Return the mean command, Nm, that joint i executes from `begin` to `end`, cycles."""
     older, newer = _active(line, cycle, begin, delay), _active(line, cycle, end, delay)
     after = line[newer, i] if newer >= 0 else 0.0
     if older == newer:
@@ -119,13 +119,13 @@ def compensate(p, s, gravity):
 
 @njit(cache=True)
 def advance(p, s, arm, line, cycle, steps, age):
-    """Advance the arm by one cycle in `steps` steps; keep its motion at `age` cycles before the end for the sensors.
+    """Advance the arm by one cycle in `steps` steps; the sensors read the state `age` cycles before its end.
 
     Args:
-        p, s: parameters, and the state, which changes.
-        arm: links and gravity of the true arm, and contact, Jacobian, frames and axes of its `Touch` with whether
-            there is a surface.
-        line: (slots, n + 1), the last commands, Nm, and when each arrived, cycles. cycle: its number.
+        p, s: parameters, and the state, which is updated.
+        arm: links and gravity of the true arm, and of its `Touch`: contact, Jacobian, frames, axes, and whether there
+            is a surface.
+        line: (slots, n + 1), the last commands, Nm, and the time when each arrived, cycles. cycle: current number.
     """
     links, gravity, touch = arm
     n, h = s.shape[1], SIM_DT / steps
@@ -146,7 +146,7 @@ def advance(p, s, arm, line, cycle, steps, age):
                 factor(mass, root)
             _accelerate(p, s, f, bias, root, h, correction == 1)
         _move(s, 0.5 * h)
-        share = steps * (1.0 - age) - step  # of this step, at which the sensors read
+        share = steps * (1.0 - age) - step  # part of this step that is over when the sensors read
         if 0.0 <= share <= 1.0:
             for i in range(n):
                 s[THETA_AT, i] = (1.0 - share) * before[0, i] + share * s[THETA, i]
@@ -170,7 +170,7 @@ def _move(s, h):
 
 @njit(cache=True)
 def _touch(s, links, touch, h, out):
-    """Write the torque (n,) Nm of the contact at the middle of a step of h s."""
+    """Write the joint torque (n,) Nm of the contact at the middle of a step of h s to `out`."""
     contact, jacobian, frames, axes, _ = touch
     link_frames(links, s[LINK_Q], frames, axes)
     place = frames[-1, :3], frames[-1, 3:]
@@ -182,7 +182,7 @@ def _touch(s, links, touch, h, out):
 
 @njit(cache=True)
 def _external_forces(p, s, f, line, cycle, begin, end, h):
-    """Write the motors' torque, friction factors and spring torques of a step from `begin` to `end`, cycles."""
+    """Write motor torques, friction factors, spring torques and velocities of a step from `begin` to `end` to `f`."""
     for i in range(s.shape[1]):
         target = s[ADDED, i] + _commanded(line, cycle, begin, end, p[DELAY, i], i)
         change = (target - s[MOTOR, i]) * -np.expm1(-h / p[LAG, i])
@@ -195,7 +195,7 @@ def _external_forces(p, s, f, line, cycle, begin, end, h):
 
 @njit(cache=True)
 def _accelerate(p, s, f, bias, root, h, last):
-    """Predict the velocities at the middle of the step, or take the step with them if `last`."""
+    """Predict the velocities at the middle of the step; if `last`, use those predicted before to take the step."""
     n, q = s.shape[1], s[LINK_Q]
     for i in range(n):
         gear = f[F_SPRING, i] + p[GEAR, i] * (f[F_W, i] - f[F_LINK_V, i])

@@ -1,10 +1,10 @@
 """The elastic variant of the hidden twin, with effects that the identification's models lack.
 
-Elastic gears that oscillate; friction with exact rest, a Stribeck curve of its own shape, warming, and ripple with
-the gears (elastic_joints.py); a control box that compensates a part of the friction from the measured speed; a clock
-that jitters and occasionally loses a packet; another delay and lag for each joint. Wrong masses, centres and tensors,
-offsets, cable drag, noise and quantisation are as in the rigid variant. `seed` draws a robot. Only this file reads
-its parameters. Seeds 0-9 are for development; seeds of 200 and above are for judging.
+Elastic gears that oscillate; friction with exact rest, another Stribeck curve than the models', warming, and ripple
+with the gears' rotation (elastic_joints.py); a control box that compensates a part of the friction from the measured
+speed; a clock that jitters and occasionally loses a packet; a different delay and lag for each joint. Wrong masses,
+centres and tensors, offsets, cable drag, noise and quantisation are as in the rigid variant. `seed` draws a robot.
+Only this file reads its parameters. Seeds 0-9 are for development; seeds of 200 and above are for judging.
 
 One cycle of 1 ms: the control box adds its compensations to the command; elastic_joints.py integrates rotors and
 links in steps of at most 0.05 ms; the sensors read the motors up to half a millisecond before the end.
@@ -24,20 +24,20 @@ from r2s.physics.robot import SIM_DT, Robot
 
 MIN_STEPS = 20  # per cycle: 1 s of open loop is then within 1e-5 rad of the result with finer steps
 MAX_STEPS = 200
-PHASE_STEP = 0.1  # rad per step of the fastest oscillation at home, at most
+PHASE_STEP = 0.1  # rad, largest phase of the fastest oscillation at home that one step covers
 SLOTS = 8  # cycles of stored commands
 WARM_SPEED = 0.25  # of dq_max, at which heat settles at 1
-STATIC_ROUNDS = 50  # fixed-point iterations of the posture in which gears balance gravity
+STATIC_ROUNDS = 50  # fixed-point iterations that find the posture in which the gears balance gravity
 
 
 class ElasticTwin(TwinBase):
     """The elastic variant; arguments as in `TwinBase`.
 
-    Time, noise and oscillation restart at every `move_to`. Heat remains, because the arm is the same: the k-th motion
-    of a twin depends on those before it. A new twin is cold, and `move_to` takes no time.
+    Time, noise and oscillation restart at every `move_to`. The joints' heat remains, so the k-th motion of a twin
+    depends on its earlier motions. A new twin is cold, and `move_to` takes no time.
 
     Args:
-        stiffness: None: drawn with the robot.
+        stiffness: None: drawn at random, like the other parameters.
 
     Raises:
         UserError: gears so stiff, or rotors and links so light, that their oscillation needs more than MAX_STEPS.
@@ -77,7 +77,7 @@ class ElasticTwin(TwinBase):
         self._links = links_of(self.robot, *with_payload(self.robot, payload, self._unloaded))
 
     def _gravity(self, links: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm that holds these links at q (n,) rad."""
+        """Return the torque (n,) Nm that holds these links at rest at q (n,) rad."""
         equations(links, self.robot.gravity, q, np.zeros(self.robot.n), self._mass, self._bias, self._work)
         return self._bias.copy()
 
@@ -128,19 +128,19 @@ class ElasticTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Return the parameters (ROWS, n) but the gears' damping.
+    """Draw the parameters (ROWS, n), all except the gears' damping.
 
     Args:
         robot, rng: the arm, and the random stream.
-        inertia: (n, n) kg m^2, of the true links at home.
-        unbalanced: (n,) Nm, what gravity compensation leaves at home.
+        inertia: (n, n) kg m^2, mass matrix of the true links at home.
+        unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
 
     """
     n, model = robot.n, robot.model(gravity=False)
     own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, with the other joints free
     p = np.zeros((ej.ROWS, n))
     size = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
-    coulomb = 0.75 * size  # the control box compensates a quarter of it; the rest of the size comes with speed
+    coulomb = 0.75 * size  # the control box compensates about a quarter of it; viscous friction adds to it
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[ej.C_NEG] = coulomb - asymmetry + model.dof_frictionloss
     p[ej.C_POS] = coulomb + asymmetry + model.dof_frictionloss
@@ -167,7 +167,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
 
 def _critical_damping(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return (n,) Nm s/rad of each gear's critical damping, with the other joints free."""
+    """Return the critical damping (n,) Nm s/rad of each gear, with the other joints free."""
     reduced = 1 / (1 / p[ej.ROTOR] + np.diag(np.linalg.inv(inertia)))
     return 2 * np.sqrt(p[ej.STIFF] * reduced)
 

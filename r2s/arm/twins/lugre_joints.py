@@ -17,7 +17,7 @@ from r2s.physics.robot import SIM_DT
 # Rows of the parameters (ROWS, n) ...
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, S0, S1, S2, OFFSET = range(9)
 DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE, COMPLIANCE = range(9, 18)
-DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; gains per cycle of torque lag and speed filter
+DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; LAG, DQ_FILTER: gains per cycle of torque lag and speed filter
 # ... and of the state (STATES, n)
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED, TAU_MEASURED, BENT = range(12)
 Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, of the contact with a surface
@@ -43,7 +43,7 @@ def cable_drag(p, q, i):
 
 @njit(cache=True)
 def rest(p, s, q, compensation, gravity):
-    """Set the state at rest at q (n,) rad: bristles hold the difference of gravity compensation and gravity, Nm."""
+    """Set the state at rest at q (n,) rad; bristles hold compensation, offset and cable drag minus gravity, Nm."""
     s[:] = 0
     for i in range(len(q)):
         s[Q, i] = q[i]
@@ -62,11 +62,11 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
     """Apply a command; return passive torque and implicit damping (n,) for the engine's step.
 
     The coupled implicit equation of the step, mass (w - v) / h + bias + f(w) = drive, is solved for the next velocity
-    w joint by joint (Gauss-Seidel), each exactly: with the bristle's backward Euler step
+    w by Gauss-Seidel. The equation of one joint is solved exactly: with the bristle's backward Euler step
     z' = (z + h w) / (1 + k |w|), k = h s0 / g, it is a quadratic with one root of the right sign.
 
     Args:
-        p, s: parameters and state. line: (slots, n) Nm, the last commands. cycle: its number.
+        p, s: parameters and state. line: (slots, n) Nm, the last commands. cycle: number of this cycle.
         tau, compensation: (n,) Nm, command and gravity compensation. mass: (n, n) kg m^2.
         touch: contact and Jacobian of r2s/physics/contact.py, and whether the tip may touch.
     """
@@ -114,7 +114,7 @@ def _solve(p, s, damping, mass):
 
 @njit(cache=True)
 def _solve_touch(p, s, damping, mass, contact, jacobian):
-    """Solve the step together with the contact, which adds to mass and drive; leave its torque in TOUCH."""
+    """Solve the step together with the contact, which adds to mass and drive; store its joint torque in TOUCH."""
     n, h = len(damping), SIM_DT
     added, soft, guess = np.empty(n * (n + 1) // 2), np.empty((n, n)), np.empty(GUESS)
     start_guess(contact, jacobian, s[V], h, guess)
@@ -154,7 +154,7 @@ def _sweep(p, s, damping, mass):
 
 @njit(cache=True)
 def sense(p, s, mass, noise):
-    """Finish the step: bristles, link torque, remaining bias, sensors.
+    """Finish the step after the engine: update bristles, friction, bias and sensors.
 
     Args:
         p, s: parameters, and the state with Q, V after the step and V_BEFORE.

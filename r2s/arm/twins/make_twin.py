@@ -24,7 +24,7 @@ def make_twin(
     extra_delay_s: float = 0.0,
     surface: Any = False,
 ) -> TwinBase:
-    """Return a hidden twin. These are the keys of conf/arm/twin.yaml; see `TwinBase`.
+    """Return a hidden twin. The arguments are the keys of conf/arm/twin.yaml; see `TwinBase`.
 
     Args:
         variant: 'rigid': rigid or quasi-statically elastic gears, LuGre friction, in DART. 'elastic': effects that no

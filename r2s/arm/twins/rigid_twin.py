@@ -1,9 +1,9 @@
-"""The rigid variant of hidden twin: a stand-in for a real arm, with effects missing in a rigid simulator.
+"""The rigid variant of hidden twin: a stand-in for a real arm, with effects that a rigid simulator lacks.
 
 It runs in another engine (DART), with another friction family (LuGre: bristles, Stribeck, load and direction
-dependence, breakaway), torque offsets, wrong masses, centres and tensors under a gravity compensation with the
-nominal ones, torque delay and lag, cable drag, sensor noise and quantisation. `seed` draws a robot; only this file
-reads the drawn parameters. Seeds 0-9 are for development; seeds of 100 and above are for judging.
+dependence, breakaway), torque offsets, torque delay and lag, cable drag, sensor noise and quantisation. Its masses,
+centres and tensors are wrong: they differ from the nominal ones that gravity compensation uses. `seed` draws a robot;
+only this file reads its parameters. Seeds 0-9 are for development; seeds of 100 and above are for judging.
 
 One cycle: the command passes delay and lag; lugre_joints.py solves the friction of the next step implicitly, together
 with the coupled joint velocities and the contact with a surface; DART takes the step with that friction linearised
@@ -22,7 +22,7 @@ from r2s.physics.payload import Payload, with_payload
 from r2s.physics.robot import SIM_DT, Robot
 
 MASS_EVERY = 4  # cycles between mass matrices for the implicit solution; DART itself always uses the current one
-STOP_MARGIN = 0.1  # rad from the position limits, where the reflexes stop the arm, to the mechanical stops
+STOP_MARGIN = 0.1  # rad by which the mechanical stops lie beyond the position limits, where the reflexes stop the arm
 
 
 class RigidTwin(TwinBase):
@@ -31,8 +31,8 @@ class RigidTwin(TwinBase):
     Each `move_to` also resets clock and bristles, so an evaluation on a fresh twin is reproducible.
 
     Args:
-        stiffness: None: rigid gears. Otherwise the gears bend without oscillation, and the encoders on the motors'
-            side do not see it.
+        stiffness: None: rigid gears. Otherwise the gears bend without oscillation, and the encoders, which are on the
+            motors' side, do not measure the bending.
     """
 
     def __init__(self, robot: Robot, seed: int, **settings: Any):
@@ -67,7 +67,7 @@ class RigidTwin(TwinBase):
         n = self.robot.n
         self._rng = np.random.default_rng([self._seed, 1, self._episode, self._stream])
         self._cycle = 0
-        q = q - self._hidden[lj.COMPLIANCE] * self._engine.gravity_torque(q)  # the motors are at q, the links below
+        q = q - self._hidden[lj.COMPLIANCE] * self._engine.gravity_torque(q)  # the motors are at q, the links sag
         self._q, self._dq, self._tau_J_d = q, np.zeros(n), np.zeros(n)
         self._engine.reset(q, self._dq)
         self._mass = self._engine.mass_matrix(q)
@@ -105,18 +105,18 @@ class RigidTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Return the parameters (ROWS, n) but delay, lag and speed filter.
+    """Draw the parameters (ROWS, n), all except delay, lag and speed filter.
 
     Args:
         robot, rng: the arm, and the random stream.
         inertia: (n,) kg m^2, of each joint at home with the others free.
-        unbalanced: (n,) Nm, what gravity compensation leaves at home.
+        unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
 
     """
     n = robot.n
     p = np.empty((lj.ROWS, n))
     level = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
-    coulomb = 0.6 * level  # the rest of the level comes with speed
+    coulomb = 0.6 * level  # viscous friction adds the rest of the level
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[lj.C_NEG], p[lj.C_POS] = coulomb - asymmetry, coulomb + asymmetry
     p[lj.BREAK] = rng.uniform(1.1, 1.5, n)  # of the Coulomb level

@@ -1,6 +1,6 @@
-"""The surface of a twin: drawn from its seed around its nominal place, and touched in every cycle.
+"""The surface of a twin, drawn from the twin's seed near its nominal place, and the tool's contact with it.
 
-A box is drawn from the seed as well, and stands elsewhere in each episode.
+A box is drawn from the seed as well; each episode places it anew.
 """
 
 from collections.abc import Mapping
@@ -34,25 +34,25 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import Tip, default_plane, tilted
 
-PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than its nominal place
+PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, largest distance and tilt of the surface from its nominal place
 STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
 CAMERA = 33, 1e-3, np.radians(0.5)  # cycles between two images, and noise of a box's pose, m and rad
 
 
 @dataclass(frozen=True)
 class BoxSurface:
-    """A box: where its table is, and a drawn box at its nominal place."""
+    """A box as surface: the frame of its table, and the drawn box at its nominal place."""
 
     frame: TableFrame
     surface: Surface
 
 
 class Touch:
-    """A tool's tip and a surface, as a twin's compiled cycle takes them; without a surface nothing ever touches.
+    """The contact of a tool's tip with a surface, in arrays for a twin's compiled cycle; without a surface: none.
 
     Attributes:
         contact: (COLUMNS,) of r2s/physics/contact.py; jacobian: (ROWS, n); frames: (n, POSE); axes: (n, 3).
-        links: of `links_of`. there: whether there is a surface.
+        links: from `links_of`. there: whether there is a surface.
 
     Args:
         robot: the arm. surface: None: no surface.
@@ -71,9 +71,9 @@ class Touch:
         self._first = self.contact.copy()
 
     def start(self, q: np.ndarray, seed: list[int]) -> float:
-        """Return the depth, m, of the tip at rest at q (n,) rad; it has not slid there. A box is placed anew.
+        """Reset the contact, place a box anew, and return the penetration depth, m, of the tip at q (n,) rad.
 
-        seed: of the episode.
+        seed: of the episode. The depth is -inf far from the surface; the bristle is not deflected.
         """
         self.contact[DEFLECTION:] = self._first[DEFLECTION:]
         if self._table is not None:
@@ -107,7 +107,7 @@ class Touch:
         return self._seen
 
     def wrench(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the arm exerts on the surface: joint torque (n,) Nm, wrench (6,) N, Nm at the end effector."""
+        """Return what the arm exerts on the surface: joint torque (n,) Nm; wrench (6,) N, Nm, at the end effector."""
         link_frames(self.links, q, self.frames, self.axes)
         last, force = self.frames[-1], -self.contact[FORCE : FORCE + 3]
         R, normal = last[3:].reshape(3, 3), self.contact[NORMAL : NORMAL + 3]
@@ -118,14 +118,14 @@ class Touch:
 
 
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
-    """Return a twin's surface near its nominal place; U: uniform.
+    """Draw a twin's surface near its nominal place; U: uniform distribution.
 
-    surface: False: none. True: a table below the tip at home. {point: m, normal}: that place. box: a box of
-    `r2s.physics.box.SIZE` on a table before the tip at home; {box: [3 edges m]}, with or without point and normal:
-    another box or place.
+    surface: False: none. True: a table below the tip at home. {point: m, normal}: a plane at this place. box: a box
+    of `r2s.physics.box.SIZE` on a table in front of the tip at home; {box: [3 edges m]}: a box of this size, with
+    point and normal at another place.
 
     Raises:
-        UserError: another value, a robot without a tool, or a surface inside the arm.
+        UserError: the value is invalid, the robot has no tool, or its tip at home would be inside the surface.
     """
     if surface is False or surface is None:
         return None
@@ -155,7 +155,7 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
 
 
 def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) -> BoxSurface:
-    """Return a box with the ranges of r2s/physics/box.py."""
+    """Draw a box from the ranges of r2s/physics/box.py."""
     size = settings.pop("box")
     point, normal = _place(settings) if settings else (None, None)
     edges, frame = check_size("arm.surface.box", size, box.TABLE[1]), table_frame(robot, point, normal)
@@ -166,7 +166,7 @@ def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) 
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return point, m, and normal of the nominal place."""
+    """Return point, m, and unit normal of the nominal place from the setting `surface`."""
     if not isinstance(surface, Mapping):
         raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):

@@ -1,7 +1,7 @@
-"""What both variants of hidden twin have in common: settings, reflexes, payload, surface, extra delay, episodes.
+"""Base of both variants of hidden twin: settings, reflexes, payload, surface, extra delay, episodes.
 
-A variant (rigid_twin.py, elastic_twin.py) draws a robot around the nominal one from its seed, and has drives and
-friction of its own. Only the variant's own code reads the drawn parameters.
+A variant (rigid_twin.py, elastic_twin.py) draws a random robot near the nominal one from its seed, and has its own
+model of drives and friction. Only the variant's own code reads the drawn parameters.
 """
 
 from collections import deque
@@ -17,35 +17,35 @@ from r2s.physics.robot import SIM_DT, Robot
 
 NOISE_BLOCK = 1000  # cycles of noise drawn at once
 MAX_EXTRA_DELAY_S = 0.02
-STAYS = 2e-3  # rad, of an arm that holds where its encoders say that it is
+STAYS = 2e-3  # rad; a `move_to` that moves no joint farther may leave the tip pressed into the surface
 
 
 class TwinBase:
     """An `Arm` (r2s/arm/interface.py) whose parameters are hidden: only its seed is known.
 
-    Equal seed, noise stream and calls give bit-identical states. `move_to` begins an episode with a noise stream of
-    its own: the k-th episode of a twin has the same noise whatever its earlier episodes did.
+    The same seed, noise stream and calls lead to bit-identical states. `move_to` begins an episode with a noise
+    stream of its own: the noise of a twin's k-th episode does not depend on what happened in earlier episodes.
 
-    A variant implements `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command,
-    `_attach(payload)`, which changes the payload now, and `_sensors()`, which returns q, dq and tau_J. It sets `_q`
-    and `_dq`, which the reflexes check, `_cycle` and `_tau_J_d`, multiplies its friction by `_friction_scale`, and
-    adds the contact `_touch` to the forces on its links, which are at `_link_q`.
+    A variant implements `_start(q)`, which places the arm, `_advance(tau)`, which runs one cycle under a command,
+    `_attach(payload)`, which changes the payload at once, and `_sensors()`, which returns q, dq and tau_J. It sets
+    `_cycle`, `_tau_J_d`, and `_q` and `_dq`, which the reflexes check. It multiplies its friction by
+    `_friction_scale`, and adds the force of the contact `_touch` to its links, whose angles are `_link_q`.
 
     Attributes:
         robot, declared_payload: see below.
 
     Args:
-        robot: the nominal arm. seed: of the robot drawn around it.
+        robot: the nominal arm. seed: determines the hidden robot, which is drawn near the nominal one.
         payload: the carried body, see `r2s.physics.payload.payload_of`: kg of a point mass, or a mapping.
-        declared_payload: what the arm's gravity compensation assumes of it (libfranka's setLoad), in the same form;
-            None: nothing.
-        stiffness: Nm/rad of the strongest joints' gears; the other joints' in proportion to their torque limit.
-        noise: number of the sensor noise stream; two recordings of one robot need different ones.
+        declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), in the same form;
+            None: no payload.
+        stiffness: Nm/rad, gear stiffness of the strongest joints; of others in proportion to their torque limit.
+        noise: number of the sensor noise stream; two recordings of one robot need different numbers.
         friction_scale: factor of the drawn friction, except of its load-dependent part; below 1 for a warm arm.
         extra_delay_s: s, delay of commands in addition to the variant's own; whole milliseconds.
-        surface: what the robot's tool may touch, drawn from the seed: False: nothing. True: a table below the tip at
-            home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of that place, in the base frame.
-            box: a box on a table; see `draw_surface`.
+        surface: what the robot's tool may touch, drawn from the seed. False: nothing. True: a table below the tip at
+            home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of this one, in the base frame.
+            box: a box on a table. See `draw_surface`.
 
     Raises:
         UserError: an argument is out of its range.
@@ -87,15 +87,15 @@ class TwinBase:
         self._sent = np.zeros(robot.n)
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad; friction holds what gravity compensation leaves.
+        """Place the arm at rest at q (n,) rad; friction holds the torque that gravity compensation leaves.
 
-        A tip in the surface may stay, not be placed there.
+        A tip that already presses on the surface may stay there, but `move_to` places no tip inside the surface.
         """
         q = np.array(q, dtype=float)
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
             raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
         self._reflexes.state(q, np.zeros(self.robot.n))
-        stays = np.abs(q - self._q).max() < STAYS  # where it presses, as under the arm's own position control
+        stays = np.abs(q - self._q).max() < STAYS  # pressing, as under the arm's own position control
         if (depth := self._touch.start(q, [self._seed, 5, self._episode, self._stream])) > 0 and not stays:
             raise ArmStopped(f"move_to: the tool's tip would be {1e3 * depth:.1f} mm inside the surface")
         self._cycle = 0
@@ -107,7 +107,7 @@ class TwinBase:
         return self.read()
 
     def read(self) -> ArmState:
-        """Return the sensors' values of the current cycle; external torque: undeclared payload and contact, exact."""
+        """Return the sensor values of the current cycle; external torque (undeclared payload, contact) is exact."""
         q, dq, tau_J = self._sensors()
         load = mass_and_moment(self.robot, self._payload if self._carries else None) - self._declared
         external, wrench = self._load_torque(self._q, load), None
@@ -159,12 +159,12 @@ class TwinBase:
         """Queue a command (n,) Nm and return the one to execute now."""
         self._pending.append(tau)
         self._sent = tau
-        # rate-limited, because a variant may have lost the command before it
+        # rate-limited, because a variant may have lost the previous command
         executed, step = self._tau_J_d, self.robot.dtau_max * SIM_DT
         return executed + np.clip(self._pending.popleft() - executed, -step, step)
 
     def _update_payload(self) -> None:
-        """Attach or detach the payload at its time."""
+        """Attach or detach the payload if its time has come."""
         payload = self._payload
         if payload is not None and self._carries != (now := bool(payload.attached(self._cycle * SIM_DT))):
             self._attach(payload if now else None)

@@ -1,4 +1,4 @@
-"""contact.yaml and contact_posterior.npz: an identified surface as other stages and other programs read it."""
+"""contact.yaml and contact_posterior.npz: an identified surface for other stages and other programs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,13 +25,13 @@ LAWS = {
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedSurface:
-    """A surface of contact.yaml with 95 % intervals and draws.
+    """The surface in a contact.yaml, with 95 % intervals and posterior draws.
 
     Attributes:
         surface: the estimate. interval: {name: (low, high)} of stiffness, exponent, damping, friction, bristle, slope
-            (N/m at 10 N), height (m along the normal) and tilt_deg (about it).
-        identifiable: {name: whether the recording determines it}, with plane and slope.
-        draws: surfaces of the posterior.
+            (N/m at 10 N), height (m along the normal) and tilt_deg (angle from the normal).
+        identifiable: {name: whether the recording determines it}; names include plane and slope.
+        draws: surfaces drawn from the posterior.
     """
 
     surface: Surface
@@ -41,7 +41,7 @@ class IdentifiedSurface:
 
 
 def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mapping[str, Any]) -> None:
-    """Write contact.yaml, and contact_posterior.npz beside it.
+    """Write contact.yaml, and contact_posterior.npz to the same folder.
 
     Args:
         path: of contact.yaml. robot: with its tool. source: origin of the estimate (recording, calibration, run).
@@ -86,7 +86,7 @@ def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurfac
     where: the option that names the folder, for error messages.
 
     Raises:
-        UserError: no such file, or a damaged one.
+        UserError: a file is missing or damaged.
     """
     path = run_file(folder, "contact.yaml", where)
     try:

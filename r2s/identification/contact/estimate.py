@@ -1,4 +1,4 @@
-"""Identify the surface that an arm pressed on: stiffness, exponent, damping, friction and plane, with intervals."""
+"""Identification of a surface that an arm has pressed: stiffness, exponent, damping, friction, plane, intervals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,11 +16,11 @@ from r2s.identification.result import SHARPER
 from r2s.physics.surface import UNIT_DEPTH, Surface
 from r2s.recordings.recording import Recording
 
-STEPS, ROUNDS = 25, 4  # Jacobians of a search, and searches with weights from the one before
-AT_BOUND = 0.02  # of the range of the stiffness' logarithm
-COVERED = (2.5, 97.5)  # %, of a 95 % interval
-# Errors that more data do not lower (laws of friction, time steps), standard deviations: slope relative, damping s/m,
-# height m, tilt rad. They are those of simulated arms on exact surfaces (benchmarks/contact_identification.py).
+STEPS, ROUNDS = 25, 4  # Jacobians of a search; number of searches, reweighted in between
+AT_BOUND = 0.02  # share of the stiffness' logarithmic range that counts as its bound
+COVERED = (2.5, 97.5)  # %, percentiles of a 95 % interval
+# Standard deviations of errors that more data do not reduce (from friction laws and time steps): slope relative,
+# damping s/m, height m, tilt rad. Simulated arms on exact surfaces had them (benchmarks/contact_identification.py).
 SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
 SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
 
@@ -30,12 +30,12 @@ class ContactEstimate:
     """An identified surface.
 
     Attributes:
-        surface: the estimate. point is the place on the plane next to the mean contact.
-        draws: {name: (S, ...)} of the posterior: the numbers of a `Surface`, its point and normal, and `slope`, N/m,
+        surface: the estimate. Its `point` is the point of the plane that is closest to the mean contact.
+        draws: {name: (S, ...)} of the posterior: the values of a `Surface`, its point and normal, and `slope`, N/m,
             of the force at LOAD.
         identifiable: {name: whether the data determine it}.
-        penetration: (2,) m, range of the recording.
-        training, validation: its force on fitted presses and on others; None: there were no others.
+        penetration: (2,) m, smallest and largest penetration depth in the recording.
+        training, validation: predicted forces on the fitted presses and on others; None without others.
     """
 
     surface: Surface
@@ -46,25 +46,25 @@ class ContactEstimate:
     validation: Press | None
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Return the 95 % interval of a number."""
+        """Return the 95 % interval of the value `name` in `draws`."""
         low, high = np.percentile(self.draws[name], COVERED)
         return float(low), float(high)
 
     @property
     def slope(self) -> float:
-        """N/m, slope of the force at LOAD, the mean over the posterior: the exponent is seldom certain."""
+        """N/m, slope of the force at LOAD, as a posterior mean, because the exponent is seldom certain."""
         return float(self.draws["slope"].mean())
 
     @property
     def height(self) -> tuple[float, float]:
-        """m, 95 % interval of the plane's place along its normal, at `surface.point`, about the estimate."""
+        """m, 95 % interval of the plane's position along its normal at `surface.point`, relative to the estimate."""
         along = (self.draws["point"] - self.surface.point) @ self.surface.normal
         low, high = np.percentile(along, COVERED)
         return float(low), float(high)
 
     @property
     def tilt_deg(self) -> float:
-        """Degrees, angle about the normal that contains 95 % of the posterior."""
+        """Degrees, angle from the estimated normal within which 95 % of the drawn normals lie."""
         across = self.draws["normal"] - self.surface.normal
         return float(np.degrees(np.percentile(np.linalg.norm(across, axis=1), 95)))
 
@@ -77,15 +77,15 @@ def identify_contact(
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> ContactEstimate:
-    """Estimate the surface of a recording with contact.
+    """Estimate the surface from a recording with contact.
 
     Args:
         arm: with a tool. recording: free motion, presses and slides, with commanded torque.
         held_out: presses on the same surface for validation; None: a fit without the last press predicts that press.
-        seed: of the posterior's draws. report: called with the share that is done, and what is next.
+        seed: of the posterior's draws. report: called with the share of work that is done, and the next task.
 
     Raises:
-        UserError: no contact, or a stiffness that the recording does not bound.
+        UserError: there is too little contact, or the recording does not determine the stiffness.
     """
     report(0.0, "forces of the arm")
     surfaces, starts = first_guesses(arm.space, arm.x, recording)
@@ -109,7 +109,7 @@ def identify_contact(
 
 
 def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
-    """Return the problem with weights from its residual, and its solution (8,), from a start u (8,)."""
+    """Reweight and solve the problem repeatedly, from a start u (8,); return the problem and its solution (8,)."""
     for _ in range(ROUNDS):
         problem = problem.reweighted(u)
         u = problem.minimized(u, STEPS)[0]
@@ -117,7 +117,7 @@ def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.
 
 
 def _check(problem: ContactProblem, u: np.ndarray) -> None:
-    """Raise UserError if no joint slides in contact, or the surface is as stiff or soft as the bounds allow."""
+    """Raise UserError if joints hardly slide during contact, or the stiffness is at a bound."""
     rows = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum()
     if (touched := problem.torque.row_s * rows) < LEAST_S:
         raise UserError(
@@ -163,5 +163,5 @@ def _concluded(
 
 
 def _systematic(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return steps (S, 8) of u by the SYSTEMATIC errors."""
+    """Return random steps (S, 8) of u with the SYSTEMATIC standard deviations."""
     return rng.standard_normal((count, 8)) * [SYSTEMATIC[name] for name in NAMES] / WIDTH

@@ -1,8 +1,8 @@
-"""An identified surface for other simulators: contact parameters of MuJoCo and SDF, linear about 10 N.
+"""Export of an identified surface to other simulators: contact parameters of MuJoCo and SDF, linearized at 10 N.
 
 MuJoCo's contact force is d (aref - a0) / A with impedance d, inverse mass A and the acceleration a0 without contact
-(MuJoCo documentation, Computation: Constraint model). A small d leaves a spring and damper of N/m and Ns/m divided by
-A; a high `impratio` keeps friction stiff beside it.
+(MuJoCo documentation, Computation: Constraint model). With a small d the contact acts as a spring and damper
+whose N/m and Ns/m are those of solref divided by A; a high `impratio` makes friction stiff nevertheless.
 """
 
 import xml.etree.ElementTree as ET
@@ -19,15 +19,15 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.welds import make_pose
 
-IMPEDANCE = 0.01  # of MuJoCo, so that the spring is exact to this share
-WIDE = 1.0  # m, half the edge with which a plane is drawn
+IMPEDANCE = 0.01  # d of MuJoCo, also the relative error of the spring
+WIDE = 1.0  # m, half the edge length of a plane when it is drawn
 IMPRATIO = 1000.0  # makes the impedance of friction 0.91
 
 
 def linearized(surface: Surface, load: float = LOAD) -> tuple[float, float, float]:
-    """Return slope (N/m), damping (Ns/m) and depth (m) of the spring that touches the force curve at `load` N.
+    """Return slope (N/m), damping (Ns/m) and depth (m) of the spring that is tangent to the force curve at `load` N.
 
-    The depth is that at which the spring's force is 0: the plane lies so much deeper.
+    The spring's force is 0 at this depth, so the plane of the spring lies that much deeper than the surface.
     """
     depth = float((load / surface.coefficient) ** (1.0 / surface.exponent))
     slope = load * float(surface.exponent) / depth
@@ -35,15 +35,15 @@ def linearized(surface: Surface, load: float = LOAD) -> tuple[float, float, floa
 
 
 def inverse_mass(robot: Robot) -> float:
-    """Return 1/kg, MuJoCo's inverse mass of the last link (`body_invweight0`), which a geom of the tool has."""
+    """Return MuJoCo's inverse mass of the last link, 1/kg (`body_invweight0`); a geom of the tool uses it."""
     model = robot.model(gravity=False)
     return float(model.body_invweight0[model.jnt_bodyid[-1], 0])
 
 
 def mujoco_contact(surface: Surface, inverse_mass: float) -> dict[str, Any]:
-    """Return solref, solimp, friction, cone and impratio for a body of `inverse_mass`, 1/kg, on the plane.
+    """Return MuJoCo's contact parameters for a body of `inverse_mass`, 1/kg, on the plane.
 
-    solref is negative: (-stiffness, -damping). condim is 3; the other geom is fixed and has the same values.
+    solref has negative values: (-stiffness, -damping). The other geom must be fixed and have the same parameters.
     """
     slope, damping, deeper = linearized(surface)
     share = (1.0 - IMPEDANCE) * inverse_mass
@@ -63,7 +63,7 @@ def mujoco_contact(surface: Surface, inverse_mass: float) -> dict[str, Any]:
 
 
 def sdf_surface(surface: Surface) -> str:
-    """Return the <surface> element of an SDF collision (ODE's kp and kd, N/m and Ns/m)."""
+    """Return the <surface> element of an SDF collision, with ODE's kp and kd in N/m and Ns/m."""
     slope, damping, _ = linearized(surface)
     mu = f"<mu>{surface.friction:.6g}</mu><mu2>{surface.friction:.6g}</mu2>"
     ode = f"<kp>{slope:.6g}</kp><kd>{damping:.6g}</kd><min_depth>0</min_depth>"
@@ -71,9 +71,9 @@ def sdf_surface(surface: Surface) -> str:
 
 
 def write_surface(folder: Path, robot: Robot, surface: Surface) -> None:
-    """Write a surface and the tool's tip into arm.xml; the surface as surface.sdf, and the tip into arm.sdf.
+    """Write a surface and the tool's tip into arm.xml, the surface into surface.sdf, and the tip into arm.sdf.
 
-    A plane, or a box; nothing else in arm.xml touches. An arm.sdf may be missing.
+    The surface is a plane or a box. In arm.xml, only surface and tip can touch. A missing arm.sdf is skipped.
 
     Args:
         folder: of `write_description`. robot: with a tool. surface: of one arm.
@@ -103,7 +103,7 @@ def write_surface(folder: Path, robot: Robot, surface: Surface) -> None:
 
 
 def _write_sdf(folder: Path, surface: Surface, pose: np.ndarray, tip: tuple[np.ndarray, float]) -> None:
-    """Write surface.sdf with the surface at `pose` (4, 4), and the tip, place (3,) m and radius m, into arm.sdf."""
+    """Write surface.sdf with the surface at `pose` (4, 4), and add `tip`, (place (3,) m, radius m), to arm.sdf."""
     root = ET.Element("sdf", version="1.9")
     solid = ET.SubElement(root, "model", name="surface")
     add_text(solid, static="true", pose=pose_words(pose))
@@ -122,7 +122,7 @@ def _write_sdf(folder: Path, surface: Surface, pose: np.ndarray, tip: tuple[np.n
 
 
 def _collision(link: ET.Element, name: str, surface: Surface, pose: str = "0 0 0 0 0 0") -> ET.Element:
-    """Append a collision with the parameters of a surface to an SDF link; return its empty geometry."""
+    """Append a collision element with a surface's parameters to an SDF link; return its empty geometry."""
     collision = ET.SubElement(link, "collision", name=name)
     add_text(collision, pose=pose)
     geometry = ET.SubElement(collision, "geometry")

@@ -1,4 +1,4 @@
-"""Joint-torque residual of an arm that touches a surface: an unknown surface, an arm known up to its posterior."""
+"""Torque residual of an arm that touches an unknown surface; the arm is known up to its posterior."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,31 +15,31 @@ from r2s.identification.search.levenberg_marquardt import minimize
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
-SLOWEST = 0.01  # rad/s, below it residuals rise, because a joint that seems to slide may stick and slip
-DRIFT = 0.02  # of each joint's friction: change of friction and offset since the calibration, standard deviation
-EXACT = 1e-4  # of a joint's friction: no residual counts as smaller, not even that of a noise-free simulation
-SEEN = 0.03  # standard deviations: a direction of the arm's posterior with less effect on all rows does not count
-FTOL = 1e-6  # relative gain at the end of a search
-STEP = 1e-5  # of the unit cube, finite differences
-REACH = 10.0  # standard deviations of an arm direction within the unit cube
+SLOWEST = 0.01  # rad/s; below this speed residuals rise, because a joint that seems to slide may stick and slip
+DRIFT = 0.02  # of each joint's friction: sigma of the change of friction and offset since the calibration
+EXACT = 1e-4  # of a joint's friction: lower limit of a row's sigma, even in a noise-free simulation
+SEEN = 0.03  # standard deviations, all rows together: posterior directions with less effect are dropped
+FTOL = 1e-6  # relative gain of a step below which a search ends
+STEP = 1e-5  # finite-difference step on the unit cube
+REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
 PLAY = 3.0  # standard deviations of the tip's encoder noise below 40 Hz
 FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least squares over a surface u (8,) and the arm w (r,), standard normal.
+    """Least squares over a surface u (8,) and the arm's uncertainty w (r,), whose prior is standard normal.
 
-    Rows are the R windows in which a joint slides one way, as in `TorqueResidual`: friction of a resting joint may be
-    anything within its breakaway torques. The arm's part is linear, so it is eliminated in closed form (variable
-    projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+    Rows are the R windows in which a joint slides in one direction, as in `TorqueResidual`, because a resting joint's
+    friction may have any value within its breakaway torques. Rows are linear in w, so w is eliminated in closed form
+    (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
     Attributes:
         torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: the tip at F instants.
-        error: (T, n) Nm, the residual at x.
-        directions: (T, n, r) Nm, its change along the principal directions of the arm's posterior.
+        error: (T, n) Nm, the torque residual at x.
+        directions: (T, n, r) Nm, change of the residual per unit of each w.
         sigma: (T, n) Nm, standard deviation of an independent row.
-        space: the surfaces.
+        space: the space of the surfaces.
     """
 
     torque: TorqueResidual
@@ -52,30 +52,30 @@ class ContactProblem:
 
     @property
     def motion(self) -> SlidingMotion:
-        """The recording as windows."""
+        """The recording's motion in windows of sliding."""
         assert isinstance(self.torque.motion, SlidingMotion)
         return self.torque.motion
 
     @property
     def rows(self) -> np.ndarray:
-        """(T, n) bool, windows that count."""
+        """(T, n) bool, whether the window of a moment and joint counts as a row."""
         return self.torque.seen
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each row; errors of different blocks are independent."""
+        """(R,) block of each row; errors in different blocks count as independent."""
         return np.unique(self.torque.clusters[self.rows.ravel()], return_inverse=True)[1]
 
     def contact_torque(self, u: np.ndarray) -> np.ndarray:
-        """Return (T, n) Nm: the mean torque of a surface u (8,) over each window."""
+        """Return the mean joint torque (T, n) Nm of contact with a surface u (8,) over each window."""
         return self.motion.filtered(self.tip.contact_of(*self.space.plane(u), self.space.law(u))[0])
 
     def data(self, u: np.ndarray) -> np.ndarray:
-        """Return (R,) in standard deviations: residual of a surface u (8,) and the arm x."""
+        """Return the residual (R,), in standard deviations, for a surface u (8,) and the arm at x, w = 0."""
         return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
 
     def slope(self, u: np.ndarray) -> np.ndarray:
-        """Return (R, 8), the derivative of `data`."""
+        """Return the derivative (R, 8) of `data` with respect to u (8,)."""
         h, here = np.where(u > 0.5, -STEP, STEP), self.data(u)
         return np.stack([(self.data(stepped) - here) / s for stepped, s in zip(u + np.diag(h), h, strict=True)], 1)
 
@@ -89,7 +89,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return w (r,) of the least sum of squares for a surface u (8,)."""
+        """Return the w (r,) that minimizes the sum of squares for a surface u (8,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:
@@ -97,34 +97,34 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return (C, R + r + 8) for trials (C, 8) with the best w; the flat prior of u counts as a normal one."""
+        """Return rows (C, R + r + 8) of trials (C, 8) at the best w, with a normal prior instead of u's flat one."""
         return np.stack([np.concatenate([self._projected(self.data(u)), FLAT * (u - 0.5)]) for u in trials])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative of `residual` at u (8,)."""
+        """Return the derivative (R + r + 8, 8) of `residual` at u (8,)."""
         return np.concatenate([self._projected(self.slope(u)), FLAT * np.eye(len(u))])
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-        """Return u (8,) at a minimum near u, and the sum of squares there."""
+        """Return a local minimum (8,) near u, and its sum of squares."""
         u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with rows weighted by their residual at u (8,) and its correlation."""
+        """Return the problem with weights from the residual at u (8,) and the correlation of its rows."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
 
     def within(self, kept: np.ndarray) -> "ContactProblem":
-        """Return the problem of the moments `kept` (T,) bool."""
+        """Return the problem with only those moments for which `kept` (T,) is true."""
         return replace(self, torque=self.torque.within(kept))
 
     def whole(self, u: np.ndarray) -> np.ndarray:
-        """Return (8 + r,) on the unit cube: u (8,) and its best w, for `linearize`."""
+        """Return u (8,) and its best w, scaled to the unit cube, as one vector (8 + r,) for `linearize`."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return residual (R + 8 + r,) and derivative, in one part, at (8 + r,), surface and arm together."""
+        """Return residual (R + 8 + r,) and derivative, as a single part, at a vector (8 + r,) of surface and arm."""
         u, w = whole[:8], (whole[8:] - 0.5) * 2 * REACH
         prior = np.concatenate([np.full(8, FLAT), np.full(len(w), 2 * REACH)])
         r = np.concatenate([self.data(u) + self.arm @ w, prior * (whole - 0.5)])
@@ -137,9 +137,9 @@ def contact_problem(
     """Return the problem of a recording with contact.
 
     Args:
-        space, x: the arm's parameters, (P,); its robot has the tool.
-        samples: (S, P), draws of their posterior; None: the arm counts as known up to DRIFT.
-        recording: of commanded torque. surfaces: the unknown.
+        space, x: the arm's parameter space, with a tool, and values (P,).
+        samples: (S, P), draws of their posterior; None: only DRIFT is uncertain.
+        recording: with commanded torque. surfaces: the space of the unknown surface.
     """
     torque = TorqueResidual(space, recording, slowest=SLOWEST)
     motion = torque.motion

@@ -1,4 +1,4 @@
-"""First guess of an unknown surface: where forces appear, which way they point, and how they grow."""
+"""First guess of an unknown surface, from the place, direction and growth of the external force on the tip."""
 
 from collections.abc import Iterator
 
@@ -11,21 +11,21 @@ from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.recordings.recording import Recording
 
-MOVING = 0.02  # rad/s, below which friction of a joint counts as unknown
-KNOWN = 0.1  # standard error of known friction, as a share of the joint's friction
-SURE = 4.0  # standard deviations of a force that counts as contact
-LEAST_S = 0.2  # s of contact, at least
-STIFFNESS = (5e2, 2e5)  # N/m, of first guesses
-FLAT = 3.0  # spread within a plane over that across it, from which positions tell the normal
+MOVING = 0.02  # rad/s, speed below which a joint's friction counts as unknown
+KNOWN = 0.1  # standard error of a moving joint's friction, relative to it
+SURE = 4.0  # standard deviations above which a force counts as contact
+LEAST_S = 0.2  # s, least duration of contact
+STIFFNESS = (5e2, 2e5)  # N/m, range of first guesses
+FLAT = 3.0  # ratio of spread within a plane to across it, above which positions determine the normal
 
 
 def first_guesses(
     space: ParameterSpace, x: np.ndarray, recording: Recording
 ) -> tuple[SurfaceSpace, list[np.ndarray]]:
-    """Return surfaces about a first plane, and starts u (8,) among them.
+    """Return the space of surfaces about a first plane, and start vectors u (8,) in it.
 
     Args:
-        space, x: the arm's parameters (P,); its robot has the tool. recording: of commanded torque.
+        space, x: the arm's parameter space, with a tool, and values (P,). recording: with commanded torque.
 
     Raises:
         UserError: the recording shows no contact.
@@ -54,7 +54,7 @@ def first_guesses(
 def _starts(
     surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield starts for each normal (3,) and two exponents; a line through the forces gives stiffness and height."""
+    """Yield starts u for each normal (3,) and two exponents; a line fit of height to force gives their stiffness."""
     for normal in normals:
         height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
         slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0
@@ -67,9 +67,9 @@ def _starts(
 
 
 def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centre (T, 3) m, force on it (T, 3) N, and whether it is certain (T,), at the moments of `torque`.
+    """Return the tip's centre (T, 3) m, the force on it (T, 3) N, and whether this is certain (T,), at T moments.
 
-    Least squares over the joints, below 10 Hz; friction of a resting joint counts as unknown.
+    The force is a least-squares fit over the joints, below 10 Hz; a resting joint's friction counts as unknown.
     """
     space, motion = torque.space, torque.motion
     d = space.dynamics(x)

@@ -6,14 +6,14 @@ import numpy as np
 
 from r2s.physics.surface import UNIT_DEPTH, Surface
 
-LOAD = 10.0  # N, about which a surface is described, so that its exponent hardly changes the other numbers
-# bounds; slope of the force at LOAD (N/m) and bristle (m) are logarithmic: from foam to steel
-TILT = 0.6  # rad about the start, which is off by at most the angle of friction
-HEIGHT = 0.02  # m about the start
+LOAD = 10.0  # N, load at which a surface is described, so that other values depend little on its exponent
+# bounds from foam to steel; slope of the force at LOAD (N/m) and bristle (m) are logarithms
+TILT = 0.6  # rad about the first plane, whose error is at most the angle of friction
+HEIGHT = 0.02  # m about the first plane
 BOUNDS = {
     "tilt_a": (-TILT, TILT),
     "tilt_b": (-TILT, TILT),
-    "height": (-HEIGHT, HEIGHT),  # of the tip at LOAD
+    "height": (-HEIGHT, HEIGHT),  # position of the tip under LOAD
     "slope": (np.log(1e2), np.log(1e6)),
     "exponent": (1.0, 2.0),  # linear 1, Hertz 1.5, cone 2
     "damping": (0.0, 50.0),
@@ -29,8 +29,8 @@ WIDTH = UPPER - LOWER
 class SurfaceSpace:
     """Surfaces near a plane through `origin` (3,) m with the unit normal `normal` (3,).
 
-    The plane of a vector is tilted about two axes through the origin, and then shifted along its normal until a load
-    of LOAD presses the tip to `height`.
+    A vector u tilts the plane about two axes through the origin. The plane is then shifted along its normal such that
+    the force LOAD presses the tip to `height`.
     """
 
     origin: np.ndarray
@@ -38,13 +38,13 @@ class SurfaceSpace:
 
     @property
     def axes(self) -> np.ndarray:
-        """(2, 3) unit vectors along which the normal tilts."""
+        """(2, 3), the two unit vectors towards which the normal tilts."""
         first = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
         first /= np.linalg.norm(first)
         return np.stack([first, np.cross(self.normal, first)])
 
     def plane(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return point (..., 3) m and normal (..., 3) of u (..., 8)."""
+        """Return the plane's point (..., 3) m and normal (..., 3) for u (..., 8)."""
         p = LOWER + u * WIDTH
         normal = self.normal + p[..., :2] @ self.axes
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -52,22 +52,22 @@ class SurfaceSpace:
         return self.origin + height[..., None] * normal, normal
 
     def law(self, u: np.ndarray) -> np.ndarray:
-        """Return (..., 5): K, exponent, damping, friction and bristle of u (..., 8), see `contact_law`."""
+        """Return K, exponent, damping, friction and bristle (..., 5) for u (..., 8), as `contact_law` does."""
         p = LOWER + u * WIDTH
         K = LOAD / (LOAD * p[..., 4] / np.exp(p[..., 3])) ** p[..., 4]
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
 
     def surface(self, u: np.ndarray) -> Surface:
-        """Return the surface of u (8,)."""
+        """Return the surface that u (8,) describes."""
         point, normal = self.plane(u)
         K, *rest = self.law(u).tolist()
         return Surface(point, normal, K * UNIT_DEPTH ** (rest[0] - 1.0), *rest)
 
     def tilt_of(self, normal: np.ndarray) -> np.ndarray:
-        """Return the change (2,) of u that tilts the plane to another normal (3,)."""
+        """Return the change (2,) of u[:2] that tilts the plane to another normal (3,)."""
         return self.axes @ (normal / (normal @ self.normal)) / WIDTH[:2]
 
     def unit(self, height: float, slope: float, exponent: float, friction: float) -> np.ndarray:
-        """Return u (8,) of an untilted plane that LOAD presses to a height above the origin, m; slope: N/m there."""
+        """Return u (8,) of an untilted plane with the tip at `height`, m, under LOAD; slope: N/m at LOAD."""
         p = np.array([0.0, 0.0, height, np.log(slope), exponent, 0.0, friction, np.log(2e-4)])
         return np.clip((p - LOWER) / WIDTH, 0.0, 1.0)

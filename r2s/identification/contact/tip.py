@@ -1,4 +1,4 @@
-"""Motion of a tool's tip in a recording, and the joint torque of its contact with a surface."""
+"""Motion of a tool's tip in a recording, and the joint torque that its contact with a surface causes."""
 
 from dataclasses import dataclass
 
@@ -18,10 +18,10 @@ class TipMotion:
     """A spherical tip at F instants of an arm with n joints.
 
     Attributes:
-        step: s, between instants. starts: (F,) bool, first instants of stretches.
-        centre: (F, 3) m, of the tip. radius: m.
+        step: s, time between instants. starts: (F,) bool, whether a stretch starts at the instant.
+        centre: (F, 3) m, centre of the tip. radius: m.
         axes, origins: (F, n, 3), of the joints in the base frame. dq: (F, n) rad/s.
-        play: m, tip motion that encoder noise may imitate; it bends no bristles permanently.
+        play: m, tip motion that may be mere encoder noise, so it bends bristles elastically only.
     """
 
     step: float
@@ -47,18 +47,18 @@ class TipMotion:
         return TipMotion(step, starts, centre, robot.tool.radius, axes, origins, np.ascontiguousarray(dq), play)
 
     def jacobian(self, at: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Return the Jacobians (A, 3, n) m/rad of the deepest point at the instants `at` (A,)."""
+        """Return the Jacobians (A, 3, n) m/rad of the tip's deepest point at the instants `at` (A,)."""
         point = self.centre[at] - self.radius * normal
         return np.cross(self.axes[at], point[:, None] - self.origins[at]).swapaxes(1, 2)
 
     def contact(self, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return joint torque (F, n) Nm, normal force (F,) N, penetration (F,) m and its rate (F,) m/s."""
+        """Return joint torque (F, n) Nm, normal force (F,) N, penetration depth (F,) m and its rate (F,) m/s."""
         return self.contact_of(surface.point, surface.normal, contact_law(surface))
 
     def contact_of(
         self, point: np.ndarray, normal: np.ndarray, law: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return `contact` of a plane with the laws of `contact_law`."""
+        """Return the same as `contact`, for a plane by point and normal with the values of `contact_law`."""
         tau, out = np.empty_like(self.dq), np.empty((3, len(self.dq)))
         motion = self.centre, self.axes, self.origins, self.dq, self.starts
         _contact(motion, (self.radius, self.step, self.play), point, normal, law, tau, out)
@@ -66,7 +66,7 @@ class TipMotion:
 
 
 def contact_law(surface: Surface) -> np.ndarray:
-    """Return (5,): K, exponent, damping, friction and bristle of a surface."""
+    """Return the values (5,) of a surface's force law: K, exponent, damping, friction and bristle."""
     s = surface
     return np.array([s.coefficient, s.exponent, s.damping, s.friction, max(s.bristle, RIGID)])
 
@@ -79,11 +79,11 @@ def _frames(links, q, frames, axes):
 
 @njit(cache=True, error_model="numpy")
 def _contact(motion, settings, point, normal, law, tau, out):
-    """Write joint torque (F, n) and normal force, penetration and its rate (3, F).
+    """Write joint torque into tau (F, n), and normal force, penetration depth and its rate into out (3, F).
 
-    Friction is mu F z with z the deflection of the bristles (Dahl 1968 in two dimensions): dz = (dx - |dx| z) /
+    Friction is mu F z, where z is the deflection of the bristles (Dahl 1968 in two dimensions): dz = (dx - |dx| z) /
     bristle along the path x of the deepest point over the surface. Noise would lengthen the path of a resting tip and
-    relax z, so a path within `play` bends bristles elastically only.
+    so relax z. Hence a path within `play` bends bristles elastically only.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play = settings

@@ -1,4 +1,4 @@
-"""How well an identified surface predicts the normal force of presses, against the arm's own torques."""
+"""How well an identified surface predicts the normal force of presses, compared with that from joint torques."""
 
 from dataclasses import dataclass
 
@@ -6,19 +6,19 @@ import numpy as np
 
 from r2s.identification.contact.problem import ContactProblem
 
-PAUSE_S = 1.0  # s without contact between two presses; a slide may lose contact for a moment
-GUARD_S = 0.2  # s around a press, longer than a window
-KNOWN = 0.05  # of the largest force, 1 N of a Panda's 20 N: standard error of a force from torques that counts
+PAUSE_S = 1.0  # s without contact that separates two presses; a slide may lose contact for a moment
+GUARD_S = 0.2  # s before and after a press, longer than a window
+KNOWN = 0.05  # of the largest force (1 N of a Panda's 20 N): largest standard error of a force from torques
 
 
 @dataclass(frozen=True)
 class Press:
-    """Normal force of the surface against the one that joint torques show, where joints slide.
+    """Normal force predicted by the surface, and measured by joint torques, at moments when joints slide.
 
     Attributes:
-        t: (M,) s. force, seen: (M,) N, of the surface and of the torques.
-        depth, rate: (M,) m, m/s, penetration and its rate.
-        error: (M,) N, standard error of `seen`. row_s: s, between moments.
+        t: (M,) s. force, seen: (M,) N, normal force predicted by the surface, and from joint torques.
+        depth, rate: (M,) m, m/s, penetration depth and its rate.
+        error: (M,) N, standard error of `seen`. row_s: s, time between moments.
     """
 
     t: np.ndarray
@@ -30,19 +30,19 @@ class Press:
     row_s: float
 
     def summary(self) -> dict[str, float]:
-        """Return the entry of summary.json: seconds of force, and its error, N RMS, loading and unloading apart."""
+        """Return the entry of summary.json: seconds compared, and RMSE of force, N, also by loading and unloading."""
         sides = {"loading": 1.0, "unloading": -1.0}
         errors = {f"{name}_force_rmse_N": self.rmse(side) for name, side in sides.items()}
         return {"seconds": len(self.t) * self.row_s, "force_rmse_N": self.rmse(), **errors}
 
     def rmse(self, side: float = 0.0) -> float:
-        """Return the error, N RMS: of loading (1), unloading (-1) or all (0); nan without such moments."""
+        """Return the RMSE, N, of force in loading (side 1), unloading (-1) or both (0); nan without such moments."""
         some = self.rate * side > 0 if side else np.ones(len(self.t), dtype=bool)
         return float(np.sqrt(np.mean((self.force - self.seen)[some] ** 2))) if some.any() else float("nan")
 
 
 def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
-    """Return masks (T,) of the moments of each press of a surface u (8,), in time, with a guard around it."""
+    """Return a mask (T,) per press on a surface u (8,), in order of time; it includes GUARD_S before and after."""
     motion = problem.motion
     at = motion.instants[_depth(problem, u) > 0]
     if not len(at):
@@ -53,10 +53,10 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 
 
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
-    """Return the forces of a surface u (8,) and of the torques in the moments of `parts`.
+    """Return the forces predicted by a surface u (8,) and those from joint torques, at the moments in `parts`.
 
-    The joints that slide give the factor by which the force of the surface has to be multiplied (weighted least
-    squares), in the direction that the surface gives.
+    The force from torques is the predicted one times a factor, which weighted least squares fits to the torques of
+    the sliding joints. So it has the direction that the surface predicts.
     """
     motion = problem.motion
     tau, force, depth, rate = problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))

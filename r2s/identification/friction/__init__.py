@@ -1,1 +1,1 @@
-"""Friction at rest: breakaway from ramps, friction at the onset of sliding, presliding, stiction."""
+"""Friction at and near rest: breakaway from ramps, friction at the onset of sliding, presliding, stiction."""

@@ -1,21 +1,21 @@
 """Breakaway torque of each joint from recorded ramps: the paper's Table II.
 
 A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). By then the joint has
-accelerated for 10 to 150 ms while the command kept rising. A real joint also creeps before release: its bristles bend
-by millirads, ever faster. Neither a threshold nor a parabola through the first motion separates creep from release.
-So r2s fits a motion with creep and release to the positions; the release command U is a parameter:
+accelerated for 10 to 150 ms while the command kept rising. A real joint also creeps before its release: its bristles
+bend by millirads, ever faster. Neither a threshold nor a parabola through the first motion separates creep from
+release. So r2s fits a motion with creep and release to the positions; its release command U is a parameter:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
-u is the command at the joint in the ramp's direction and kappa the inverse inertia. Stiction balances u up to U while
-its bristles stretch over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976). After
-release friction is less than U (in eq. 6 of the paper it is 0, and z = 0): `jump` is the difference as an
-acceleration. This fit needs no model of the arm.
+u is the command at the joint in the ramp's direction, and kappa is the inverse inertia. Up to U, stiction balances u
+while its bristles stretch over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976).
+After release, friction is less than U (in eq. 6 of the paper it is 0, and z = 0): `jump` is the difference, as an
+acceleration. This free fit needs no model of the arm.
 
-If friction falls over a range of velocities (Stribeck), motion begins slowly, and a fit with a sudden `jump` finds
-release late: by 4 to 22 mNm on an arm of known truth. `Slide`, the sliding motion of an identified arm, has jump (1 -
-exp(-(v / fall)^2)) instead. With it only U is fitted, within 0.2 mNm on that arm. r2s uses this fit if it explains
-the motion as well as the free one.
+If friction falls over a range of velocities (Stribeck), motion begins slowly, and a fit with a sudden `jump` puts the
+release too late: by 4 to 22 mNm on an arm of known truth. `Slide`, the sliding motion of an identified arm, replaces
+it by jump (1 - exp(-(v / fall)^2)), with U as the main unknown; on that arm U was then within 0.2 mNm. r2s uses this
+second fit if it explains the motion as well as the free fit.
 """
 
 from collections.abc import Iterator
@@ -28,38 +28,38 @@ from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.recordings.ramps import Ramps
 
-MOVED = 5e-3  # rad, after which rows are not used; real joints and the twin creep by 1 to 3 mrad before release
-MIN_ROWS = 10  # up to there
-ENCODER = 2e-5  # rad, scale of position residuals: encoder noise of a Panda
-RELEASE_S = 2e-3  # s, accuracy of the moment of release
+MOVED = 5e-3  # rad, motion after which rows are not used; real joints and the twin creep 1 to 3 mrad before release
+MIN_ROWS = 10  # least number of rows up to MOVED
+ENCODER = 2e-5  # rad, standard deviation of position residuals: encoder noise of a Panda
+RELEASE_S = 2e-3  # s, accuracy of the fitted time of release
 STEP = 1e-3  # s, longest integration step
 # bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), rest (rad) and drift (rad/s)
 LOW = np.log(1e-5), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
 HIGH = np.log(1e4), np.log(3e-3), np.log(1e3), 1e3, 0.1, 0.1
 RIGID = 1e-8  # rad, creep length of a joint that does not creep
-DRIFT = 3e-4  # rad/s, prior sigma of a drift: a resting joint may still settle
+DRIFT = 3e-4  # rad/s, prior sigma of a slow drift: a resting joint may still settle
 SIDES = "negative", "positive"
-KAPPA_SIGMA = 0.1  # prior sigma of log kappa, if an identified arm gives it
-WORSE = 1.01  # misfit over that of a free fit, above which the identified slide does not describe this joint
+KAPPA_SIGMA = 0.1  # prior sigma of log kappa about an identified arm's value
+WORSE = 1.01  # ratio of misfits, above which an identified slide describes a joint worse than the free fit
 BACK = 0.0, 0.03, 0.1  # starts of U below the last command, as shares of the ramp
-DAMPING = np.log(10.0), 1.5  # log lambda and its prior sigma, for motion too short to determine it
-STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # creep length, rad; time since release, relative to its guess
+DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, as the motion may be too short to determine it
+STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # of free fits: creep length, rad; time since release over its guess
 
 
 @dataclass(frozen=True, eq=False)
 class Breakaway:
-    """Commands at which n joints broke away in K ramps; as commanded, without gravity.
+    """Commands (without gravity) at which n joints broke away in K ramps.
 
     Attributes:
-        command: (n, 2) Nm, negative and positive direction, mean over ramps; NaN without a release. Command plus
-            offset is the breakaway torque: ramps alone determine the width of the dead zone, not its centre.
+        command: (n, 2) Nm, mean over ramps in negative and positive direction; NaN without a release. The breakaway
+            torque is this command plus the offset: ramps alone determine the dead zone's width, not its centre.
         spread: (n, 2) Nm, standard deviation over ramps; NaN for fewer than two.
-        count: (n, 2) ramps with a release. ramped: (n, 2) ramps in all.
-        held: (n, 2) Nm, if no ramp released the joint, the largest command without motion; 0 without a ramp.
-        resolution: (n, 2) Nm, accuracy of the fit of one ramp: `RELEASE_S` times the ramp's rate.
-        value: (K,) Nm, of each ramp; NaN without a release.
+        count: (n, 2), number of ramps with a release. ramped: (n, 2), number of all ramps.
+        held: (n, 2) Nm, the largest command without motion if no ramp released the joint; 0 otherwise.
+        resolution: (n, 2) Nm, accuracy of the fit to one ramp: `RELEASE_S` times the ramp's rate.
+        value: (K,) Nm, release command of each ramp; NaN without a release.
         misfit: (K,) rad RMS between positions and fit. A value well above the encoder noise (or 5e-5 for real
-            stick-slip) means another kind of motion.
+            stick-slip) indicates another kind of motion.
         joint, sign, pose: (K,), see `Ramps`.
     """
 
@@ -77,7 +77,7 @@ class Breakaway:
 
     @property
     def unknown(self) -> dict[str, str]:
-        """Directions without a breakaway, and why: {"joint 3, positive": "not reached: held against 2.4 Nm"}."""
+        """Directions without a breakaway torque: {"joint 3, positive": "not reached: held against 2.4 Nm", ...}."""
         reasons = {}
         for j, side in np.argwhere(self.count == 0):
             held = abs(self.held[j, side])
@@ -88,14 +88,14 @@ class Breakaway:
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """Sliding motion of the joints of K ramps after release, in each ramp's direction, by an identified model.
+    """Parameters of the sliding after release in K ramps, in each ramp's direction, from an identified arm.
 
     Attributes:
-        kappa: (K,) rad/s^2 per Nm, inverse inertia with the other joints at rest.
+        kappa: (K,) rad/s^2 per Nm, inverse inertia of the joint while the other joints rest.
         level: (K,) Nm, command that sustains slow sliding above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad.
-        fall: (K,) rad/s, over which friction falls from breakaway to `level` as exp(-(v / fall)^2).
-        misfit: (K,) rad RMS of the free fit.
+        fall: (K,) rad/s, velocity over which friction falls from breakaway to `level`, as exp(-(v / fall)^2).
+        misfit: (K,) rad RMS of the previous fit to each ramp (`Breakaway.misfit`), for comparison.
     """
 
     kappa: np.ndarray
@@ -108,15 +108,15 @@ class Slide:
 def estimate_breakaway(
     ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, slide: Slide | None = None
 ) -> Breakaway:
-    """Estimate the command at which each ramped joint broke away, from t, q and tau alone.
+    """Estimate the command at which each ramped joint broke away, from t, q and tau; `slide` is optional.
 
-    A ramp gives NaN if its joint does not move by MOVED in its direction, or moves before the command rises.
+    The value is NaN if the joint does not move by MOVED in the ramp's direction, or moves before the command rises.
 
     Args:
         ramps: commands that rise (fall for sign -1) from rest, at any rate. The error is the rate times 0.5 to 3 ms
-            for an encoder of 2e-5 rad, largest for the largest inertia.
-        delay, lag: s, of the command, beyond its hold; each shifts the result.
-        slide: sliding motion by an identified model.
+            for an encoder noise of 2e-5 rad; it is largest for the largest inertia.
+        delay, lag: s, latency of the command beyond its hold; each shifts the result.
+        slide: sliding after release, from an identified arm.
 
     Raises:
         UserError: delay or lag out of range.
@@ -125,7 +125,7 @@ def estimate_breakaway(
     check_number("breakaway: lag", lag, "[0, 0.1)")
     r = ramps.recording
     count, hold = len(r.stretches), r.command_period or 1.0 / r.rate_hz
-    delay += 0.5 * hold  # of a command that is held until the next one
+    delay += 0.5 * hold  # mean latency of a command that is held until the next one
     value, misfit = (np.full(count, np.nan) for _ in range(2))
     held, blur = np.zeros(count), np.zeros(count)
     for k, (t, x, u) in enumerate(_in_direction(ramps)):
@@ -146,7 +146,7 @@ def estimate_breakaway(
 
 
 def _in_direction(ramps: Ramps) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield t (T,) s, x (T,) rad and u (T,) Nm of each ramp, in its direction; t and x count from the first row."""
+    """Yield t (T,) s, x (T,) rad and u (T,) Nm of each ramp, signed by its direction; t and x start at 0."""
     r = ramps.recording
     for rows, j, sign in zip(r.stretches, ramps.joint, ramps.sign, strict=True):
         yield r.t[rows] - r.t[rows.start], sign * (r.q[rows, j] - r.q[rows.start, j]), sign * r.tau[rows, j]
@@ -155,7 +155,7 @@ def _in_direction(ramps: Ramps) -> Iterator[tuple[np.ndarray, np.ndarray, np.nda
 def _summarize(
     ramps: Ramps, value: np.ndarray, misfit: np.ndarray, held_by: np.ndarray, blur: np.ndarray
 ) -> Breakaway:
-    """Return `Breakaway` by joint and direction from the fits of K ramps."""
+    """Return `Breakaway`, by joint and direction, from the fits to K ramps."""
     n = ramps.recording.n_joints
     command, spread, held, resolution = (np.full((n, 2), x) for x in (np.nan, np.nan, 0.0, 0.0))
     count, ramped = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
@@ -176,21 +176,21 @@ def _summarize(
 
 
 def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:
-    """Return the command u (T,) Nm as it acts on the joint at t (T,) s, after rest under its first value."""
+    """Return the command u (T,) Nm as it acts on the joint at t (T,) s; before, u had its first value."""
     late = np.interp(t - delay, t, u)
     if lag == 0:
         return late
     factor = -np.expm1(-np.diff(t) / lag)
     out = late.copy()
     for k in range(len(factor)):
-        # first-order response to a linear segment: behind a lag a ramp is the ramp `lag` later
+        # first-order response to a linear segment: in the steady state, a lag shifts a ramp by `lag` s
         slope = (late[k + 1] - late[k]) / (t[k + 1] - t[k])
         out[k + 1] = out[k] + factor[k] * (late[k] - out[k] - lag * slope) + (late[k + 1] - late[k])
     return out
 
 
 def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Fit the motion to x (T,) rad under u (T,) Nm; return U, Nm (NaN: below any command), and misfit, rad."""
+    """Fit the free motion to x (T,) rad under u (T,) Nm; return U, Nm (NaN: below all commands), and misfit, rad."""
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -222,7 +222,7 @@ def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, fl
 def _fit_slide(
     t: np.ndarray, x: np.ndarray, u: np.ndarray, kappa: float, level: float, viscous: float, fall: float
 ) -> tuple[float, float]:
-    """Fit U of a `Slide` to x (T,) rad under u (T,) Nm; return U, Nm, and misfit, rad."""
+    """Fit the motion with a known `Slide` to x (T,) rad under u (T,) Nm; return U, Nm, and misfit, rad."""
     span = u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -244,16 +244,16 @@ def _fit_slide(
 
 
 def _parts(x: np.ndarray) -> tuple[int, slice]:
-    """Return the last row before x (T,) clearly moves, and the rows to fit."""
+    """Return the last row before x (T,) moves clearly, and the rows to fit."""
     near = int(np.flatnonzero(x < x[-1] / 9)[-1])
-    return near, slice(near // 4, None)  # the first rows may still settle from the motion before
+    return near, slice(near // 4, None)  # in the first rows the joint may still settle
 
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Return x (T,) of the motion in this module's docstring; u is linear between samples, and fall = 0 means a jump.
+    """Return x (T,) of the motion in this module's docstring; u is linear between samples; fall = 0: sudden jump.
 
-    Steps are implicit in velocity, so that creep lengths far below the encoder noise stay stable.
+    Steps are implicit in velocity, so that integration is stable even for creep lengths far below the encoder noise.
     """
     x = np.zeros(len(t))
     v = 0.0

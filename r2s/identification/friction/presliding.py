@@ -1,7 +1,7 @@
-"""Presliding distance, over which friction with memory reverses: the softness of its bristles.
+"""Presliding distance, over which the bristles of friction with memory bend after a reversal.
 
-Torque rows begin where bristles are already bent, so they contain nothing about bending. Replays of short windows
-show it at every reversal. The torque fit gives all other parameters, and replays give this one.
+Torque rows begin where bristles are already bent, so they contain no information on bending. Replays of short windows
+show it at every reversal. So the torque fit determines all other parameters, and replays determine this one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,9 +20,9 @@ from r2s.physics.dynamics import Dynamics
 from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
-WINDOW_S, STRIDE = 0.2, 5  # s, ms of the replays: a joint reverses within some 50 ms
-ROUNDS, STEPS, FTOL = 2, 4, 1e-3  # reweighted fits, with steps and relative gain of each
-MIN_SIGMA = 1e-3  # of the logarithm
+WINDOW_S, STRIDE = 0.2, 5  # s; ms; of the replays: friction reverses within some 50 ms
+ROUNDS, STEPS, FTOL = 2, 4, 1e-3  # number of reweighted fits; steps and relative gain at the end of each
+MIN_SIGMA = 1e-3  # lower limit of sigma, of the logarithm
 
 
 def estimate_presliding(
@@ -36,11 +36,11 @@ def estimate_presliding(
     seed: int,
     nthread: int,
 ) -> dict[str, np.ndarray]:
-    """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of its logarithm} from replays.
+    """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of its logarithm}, estimated from replays.
 
     Args:
-        dynamics: values of all other parameters. torque_data: their torque residual.
-        bounds, prior: as for all parameters.
+        dynamics: values of all other parameters. torque_data: the torque residual that determined them.
+        bounds, prior: of all parameters, of which only this one's are used.
         seed: of the posterior's draws.
     """
     robot = torque_data.space.robot
@@ -57,11 +57,11 @@ def estimate_presliding(
 
 
 class Presliding:
-    """Residual rows that hold log presliding at the result of `estimate_presliding`, in standard deviations."""
+    """Residual of log presliding about the result of `estimate_presliding`, in standard deviations."""
 
     def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
         self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return (C, n) for x (C, P)."""
+        """Return the residual (C, n) of candidates x (C, P)."""
         return (np.log(space.block(x, NAME)) - self._value) / self._sigma

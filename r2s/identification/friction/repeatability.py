@@ -1,10 +1,10 @@
 """Standard error of breakaway commands from repeated ramps.
 
-Friction scatters from ramp to ramp, with posture, load and cable. Two ramps per joint and direction give next to no
-variance estimate (Student's t with one degree of freedom: 12.7 deviations). So each variance is averaged with the
-variance of joints of the same size, which counts as `PRIOR_REPEATS` repeats (Smyth, Stat. Appl. Genet. Mol. Biol.
-3(1), 2004). These are few, because joints of the same size differ in scatter, on twins by factors of 3 and more. If
-nothing was repeated, the scatter is `REPEATS`.
+Friction scatters from ramp to ramp, with posture, load and cable. Two ramps per joint and direction hardly determine
+a variance (in Student's t with one degree of freedom, a 95 % interval has +-12.7 standard errors). So each variance
+is averaged with that of joints of the same size, which counts as `PRIOR_REPEATS` repeats (Smyth, Stat. Appl. Genet.
+Mol. Biol. 3(1), 2004). This number is small, because even joints of the same size differ in scatter, on twins by
+factors of 3 and more. If no ramp was repeated, the scatter is `REPEATS`.
 """
 
 from typing import NamedTuple
@@ -13,12 +13,12 @@ import numpy as np
 
 from r2s.identification.friction.breakaway import Breakaway
 
-PRIOR_REPEATS = 2.0  # weight of the scatter of like joints, in repeats
-REPEATS = 1e-3  # of tau_max, standard deviation from ramp to ramp: 0.8e-3 to 1e-3 on twins
+PRIOR_REPEATS = 2.0  # weight of the scatter of joints of the same size, in repeats
+REPEATS = 1e-3  # of tau_max, standard deviation between repeated ramps; 0.8e-3 to 1e-3 on twins
 
 
 class Certainty(NamedTuple):
-    """Standard error sigma (n, 2) Nm of mean commands, NaN without a release; degrees of freedom (n, 2) of its t."""
+    """Standard error sigma (n, 2) Nm of mean commands (NaN without a release), and Student's degrees of freedom."""
 
     sigma: np.ndarray
     freedom: np.ndarray
@@ -27,7 +27,7 @@ class Certainty(NamedTuple):
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
     """Return the certainty of the mean commands; joints with the same torque limit tau_max (n,) Nm share a scatter.
 
-    If no like joint has a repeat, the scatter of all other joints is used, in proportion to tau_max.
+    If no joint with this limit has a repeat, the scatter of all other joints is used, in proportion to tau_max.
     """
     more = np.maximum(found.count - 1, 0)
     square = np.nan_to_num(found.spread, nan=0.0) ** 2 / tau_max[:, None] ** 2

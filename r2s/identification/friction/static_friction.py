@@ -1,4 +1,4 @@
-"""Friction at the onset of sliding, from breakaway ramps: extra residual rows of a fit."""
+"""Friction at the onset of sliding, from breakaway ramps, as extra residual rows of a fit."""
 
 import numpy as np
 
@@ -9,15 +9,15 @@ from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 
-# of its level: standard deviation between breakaway command and friction at standstill, from creep and onset
+# relative standard deviation between breakaway command and friction at standstill, due to creep and onset
 SIGMA = 0.03
-LEAST = 1e-3  # of tau_max, level of a command below which the deviation no longer shrinks
+LEAST = 1e-3  # of tau_max, command below which the standard deviation does not shrink further
 
 
 class StaticFriction:
-    """K ramps with a release: the command, the posture, and the other torques on the joint at release.
+    """Residual of K ramps with a release, from command, posture and the other torques on the joint at release.
 
-    Stribeck friction rises towards standstill, where recordings of motion have little information.
+    Stribeck friction rises towards standstill, where recordings of motion contain little information.
     """
 
     def __init__(self, robot: Robot, ramps: Ramps, edges: Breakaway):
@@ -35,7 +35,7 @@ class StaticFriction:
         self._inertia = regressor(robot, q, still, unit)[own, self.joint].reshape(len(kept), -1)
 
     def net_torque(self, d: Dynamics) -> np.ndarray:
-        """Return (..., K) Nm: the torque on the joint at release, without friction."""
+        """Return the total torque (..., K) Nm on the joint at release, apart from friction."""
         standard = LinkInertia(d.mass, d.com, d.inertia).standard()
         left = (standard.reshape(*standard.shape[:-2], -1) - self._nominal) @ self._gravity.T
         drag = d.drag[..., self.joint, :]
@@ -43,7 +43,7 @@ class StaticFriction:
         return self.command + pull - left
 
     def slide(self, d: Dynamics) -> Slide:
-        """Return the sliding motion in all ramps, for a family with a Stribeck rise; NaN without a release."""
+        """Return the sliding after release in all ramps, for a family with a Stribeck rise; NaN without a release."""
         phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
         sign = np.where(self.side, 1.0, -1.0)
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
@@ -56,14 +56,14 @@ class StaticFriction:
         return Slide(kappa, level, viscous, fall, self._misfit)
 
     def breakaway(self, d: Dynamics) -> np.ndarray:
-        """Return (n, 2) Nm: net torques at release, mean over ramps; without a ramp, the breakaway torques of d."""
+        """Return breakaway torques (n, 2) Nm: mean net torque at release over ramps; without a ramp, those of d."""
         net, out = self.net_torque(d), d.breakaway.copy()
         for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
             out[j, side] = net[(self.joint == j) & (self.side == side)].mean()
         return np.stack([np.minimum(out[:, 0], 0.0), np.maximum(out[:, 1], 0.0)], -1)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return (C, K), net torque minus friction at the onset, in standard deviations, for x (C, P)."""
+        """Return net torque minus friction at the onset, (C, K) in standard deviations, of candidates x (C, P)."""
         d = space.dynamics(x)
         sign, still = np.where(self.side, 1.0, -1.0), np.zeros(d.phi.shape[:-1])
         sides = np.stack([d.friction(still, still - 1.0), d.friction(still, still + 1.0)], -1)

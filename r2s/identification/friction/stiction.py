@@ -1,6 +1,6 @@
-"""Stiction model of joints at rest, and their breakaway torques if no ramps were recorded.
+"""Choice of the stiction model of joints at rest, and of breakaway torques if no ramps were recorded.
 
-r2s scans both, because the error has no gradient with respect to them.
+r2s scans over both, because the replay error has no useful gradient with respect to them.
 """
 
 from dataclasses import replace
@@ -16,11 +16,11 @@ from r2s.physics.dynamics import STICTION_MODELS, Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-CREEP = 2e-3  # rad/s, below which a joint may stick: above the rest of a stop after a 1 ms step, below any motion
-HORIZON, WINDOWS = 0.5, 60  # s and number of the replays that choose a model: long enough for stops
-SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # of `scan_breakaway`: windows, passes, and coarse ones among them
-LEAST = 5e-4  # of tau_max, friction below which nothing sticks
-POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points of a coarse pass, on each side of a fine one; finer by that factor
+CREEP = 2e-3  # rad/s, below which a joint may stick: above the remaining speed of a stop after 1 ms, below any motion
+HORIZON, WINDOWS = 0.5, 60  # length, s, and number of the replays that choose a model: long enough for stops
+SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # of `scan_breakaway`: windows, passes, and coarse passes among them
+LEAST = 5e-4  # of tau_max, least friction that scales the scan range
+POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points of a coarse pass; on each side in a fine one; its refinement
 
 
 def choose_stiction(
@@ -36,8 +36,8 @@ def choose_stiction(
 ) -> dict[str, np.ndarray | float]:
     """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm} that replay stops best.
 
-    largest: upper limit of the breakaway torques to scan for, over the identified friction; None if ramps gave them.
-    The present model stays if no trajectory is as long as a window.
+    largest: upper limit of the scan for breakaway torques, relative to the identified friction; None: they come from
+    ramps. If no trajectory is as long as a window, the present model is returned.
     """
     windows = windows_or_none(recording, HORIZON, WINDOWS)
     scanned = largest is None or windows_or_none(recording, window_s, 1) is not None
@@ -71,11 +71,11 @@ def scan_breakaway(
     nthread: int,
     report: Report,
 ) -> np.ndarray:
-    """Return the breakaway torques (n, 2) Nm that replay the recording best; `dynamics` gives all else.
+    """Return the breakaway torques (n, 2) Nm that replay the recording best; other values are those of `dynamics`.
 
-    The error jumps when a joint is released one step sooner. So all torques are scanned at once, each judged by its
-    own joint: first over [0, largest], (n,) Nm, then ever finer about the best value. The coarse scan runs twice,
-    because wrong torques of other joints disturb the first pass.
+    The error jumps when a joint is released one step sooner, hence the scan. One batch tries values for all torques,
+    each judged by the error of its joint: first over [0, largest], (n,) Nm, then ever finer about the best value. The
+    coarse scan runs twice, because wrong torques of other joints disturb the first pass.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
@@ -86,7 +86,7 @@ def scan_breakaway(
     step = most / (POINTS - 1)
     sign = np.repeat([-1.0, 1.0], robot.n)
     joint = np.tile(np.arange(robot.n), 2)
-    evaluations = 1 + 3 * robot.n  # finite differences of the residual's weights
+    evaluations = 1 + 3 * robot.n  # finite differences for the residual's weights
     for k in range(PASSES):
         coarse = k < COARSE
         offsets = most * np.linspace(0, 1, POINTS) if coarse else step * np.arange(-FINE_POINTS, FINE_POINTS + 1)

@@ -1,1 +1,1 @@
-"""The payload of an identified arm: mass, centre and tensor from a loaded recording."""
+"""Identification of an arm's payload: mass, centre of mass and inertia tensor, from a loaded recording."""

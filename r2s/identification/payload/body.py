@@ -1,4 +1,4 @@
-"""A rigid body by ten coordinates that are physical at every value, with a prior for what arms carry."""
+"""A rigid body as ten coordinates, with a prior for bodies that arms carry; any positive mass is consistent."""
 
 from dataclasses import dataclass
 
@@ -8,23 +8,23 @@ from r2s.physics.payload import WATER
 from r2s.physics.rigid_body import LinkInertia
 
 NAMES = ("mass", "x", "y", "z", "d1", "d2", "d3", "s12", "s13", "s23")
-# standard deviations of the prior: a body's size along an axis relative to that of a ball of water of its mass (a
-# steel block is half as large, an empty box of 2 kg three times), and its shear
+# standard deviations of the prior: of the logarithm of a body's size along an axis, relative to a ball of water of
+# the same mass (a steel block is half as large, an empty box of 2 kg three times as large); of its shear
 SIZE, SHEAR = 0.7, 0.5
-HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: of the rated mass; of the distance's and the other priors' sigma
-STEP = 1e-6  # of the bounds, finite differences
+HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: mass over rated mass; distance, and shape, over their sigma
+STEP = 1e-6  # finite-difference step, of the width of the bounds
 
 
 @dataclass(frozen=True)
 class BodySpace:
-    """Coordinates z (10,) of a body in the end effector's frame: mass, centre, and the shape of its second moment.
+    """Coordinates z (10,) of a body in the end effector's frame: mass, centre of mass, shape of the second moment.
 
     The second moment about the centre is mass gyration^2 V V^T, V = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]]
-    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022), so a positive mass at every place makes it.
+    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). So every z with positive mass is a body that can exist.
 
     Attributes:
-        heaviest: kg, mass that the arm may carry. far: m, standard deviation of its centre.
-        gyration: m, of a ball of water with about the mass of the body.
+        heaviest: kg, mass that the arm may carry. far: m, prior standard deviation of the centre's coordinates.
+        gyration: m, size parameter of a ball of water with about the body's mass.
     """
 
     heaviest: float
@@ -33,13 +33,13 @@ class BodySpace:
 
     @classmethod
     def about(cls, heaviest: float, far: float, mass: float) -> "BodySpace":
-        """Return the space for bodies of about `mass` kg."""
+        """Return the space for bodies with a mass of about `mass` kg."""
         radius = (3 * mass / (4 * np.pi * WATER)) ** (1 / 3)
         return cls(heaviest, far, float(radius / np.sqrt(5)))
 
     @property
     def sigma(self) -> np.ndarray:
-        """(10,), the prior's standard deviation about 0; inf: flat."""
+        """(10,), standard deviation of the prior, whose mean is 0; inf: flat."""
         return np.array([np.inf, *[self.far] * 3, *[SIZE] * 3, *[SHEAR] * 3])
 
     @property
@@ -49,7 +49,7 @@ class BodySpace:
         return -reach, reach + HEAVIEST * self.heaviest * np.eye(10)[0]
 
     def body(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mass (...) kg, centre (..., 3) m and tensor (..., 3, 3) kg m^2 about it, of z (..., 10)."""
+        """Return mass (...) kg, centre (..., 3) m and tensor about it (..., 3, 3) kg m^2 of bodies z (..., 10)."""
         v = np.zeros((*z.shape[:-1], 3, 3))
         for i in range(3):
             v[..., i, i] = np.exp(z[..., 4 + i])
@@ -58,7 +58,7 @@ class BodySpace:
         return z[..., 0], z[..., 1:4], np.trace(second, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - second
 
     def standard(self, z: np.ndarray) -> np.ndarray:
-        """Return the ten standard parameters (..., 10) about the end effector: mass, first moments, tensor."""
+        """Return the standard parameters (..., 10) of z about the end effector: mass, first moments, tensor."""
         mass, centre, tensor = self.body(z)
         return LinkInertia(mass, centre, tensor).standard()
 
@@ -68,5 +68,5 @@ class BodySpace:
         return ((self.standard(z + h) - self.standard(z - h)) / (2 * h.diagonal()[:, None])).T
 
     def prior(self, z: np.ndarray) -> np.ndarray:
-        """Return (9,), the coordinates with a prior in its standard deviations."""
+        """Return the prior's residual (9,) for all coordinates but the mass, in standard deviations."""
         return z[1:] / self.sigma[1:]

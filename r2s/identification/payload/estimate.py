@@ -1,4 +1,4 @@
-"""Identify the payload of a loaded arm: mass, centre and tensor, with intervals."""
+"""Identification of a loaded arm's payload: mass, centre of mass and inertia tensor, with intervals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from r2s.physics.payload import Payload
 from r2s.physics.rigid_body import tensor_elements
 from r2s.recordings.recording import Recording
 
-ROUNDS = 5  # fits with weights from the residual of the one before
-LEAST_SHARE = 0.02  # of the rated mass: weight from which a ball of water gets its size
-COVERED = 2.5, 97.5  # %, of a 95 % interval
+ROUNDS = 5  # number of fits, each with weights from the residual of the previous one
+LEAST_SHARE = 0.02  # of the rated mass: least mass that sets the size of the prior's ball of water
+COVERED = 2.5, 97.5  # %, percentiles of a 95 % interval
 ELEMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 
@@ -27,11 +27,11 @@ class PayloadEstimate:
     """An identified payload, in the end effector's frame.
 
     Attributes:
-        mass: kg. centre: (3,) m. tensor: (3, 3) kg m^2 about it, of a body that exists.
-        draws: {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)} of the posterior; inertia by ELEMENTS.
-        identifiable: {name: bool, or one per element}: whether the recording determines them.
-        t, measured, without, predicted: (T,) s and (T, n) Nm of the loaded recording, low-passed: recorded torque,
-            and that of the arm without and with payload. seen: (T, n) bool, rows that count.
+        mass: kg. centre: (3,) m. tensor: (3, 3) kg m^2 about the centre, physically consistent.
+        draws: {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)} of the posterior; inertia in the order of ELEMENTS.
+        identifiable: {name: bool, or one per element}, whether the recording determines it.
+        t: (T,) s. measured: (T, n) Nm, recorded torque, filtered. without, predicted: (T, n) Nm, torque of the
+            identified arm without and with payload. seen: (T, n) bool, rows that count.
     """
 
     mass: float
@@ -47,7 +47,7 @@ class PayloadEstimate:
 
     @property
     def values(self) -> dict[str, np.ndarray]:
-        """{"mass": (), "centre": (3,), "inertia": (6,)}."""
+        """The estimated values {"mass": (), "centre": (3,), "inertia": (6,)}."""
         return {"mass": np.array(self.mass), "centre": self.centre, "inertia": tensor_elements(self.tensor)}
 
     def interval(self, name: str) -> np.ndarray:
@@ -56,18 +56,18 @@ class PayloadEstimate:
 
     @property
     def payload(self) -> Payload:
-        """The payload, as arms carry it."""
+        """The payload as an object that a simulated arm can carry."""
         return Payload(np.array(self.mass), self.centre, self.tensor)
 
     def rmse(self, predicted: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm, the root mean square of a predicted minus the recorded torque; nan for a resting joint."""
+        """Return the RMSE (n,) Nm of a predicted torque (T, n) against the recorded one; nan for a resting joint."""
         square = np.where(self.seen, (predicted - self.measured) ** 2, 0.0).sum(0)
         return np.sqrt(square / np.where(self.seen.any(0), self.seen.sum(0), np.nan))
 
 
 @dataclass(frozen=True, eq=False)
 class _Linearized:
-    """A loaded recording about its fit, on the unit cube of body and arm, for `posterior`."""
+    """The problem of a loaded recording, linearized at its fit, for `posterior`; u contains body and arm."""
 
     rows: Rows
     space: BodySpace
@@ -105,17 +105,17 @@ def identify_payload(
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> PayloadEstimate:
-    """Estimate the payload of a loaded recording.
+    """Estimate the payload of an arm from a loaded recording.
 
     Args:
-        arm: identified from the same kind of torque, without the payload; its uncertainty enters the intervals.
-        recording: of the arm with the payload.
+        arm: identified without the payload from the same kind of torque; its uncertainty widens the intervals.
+        recording: motion of the arm with the payload.
         declared: payload that gravity compensation assumed (commanded torque).
-        cutoff_hz: of the low-pass of measured or motor torque. seed: of the posterior's draws.
-        report: called with the share that is done, and what is next.
+        cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: of the posterior's draws.
+        report: called with the share of work that is done, and the next task.
 
     Raises:
-        UserError: the recording does not move, or its payload is beyond HEAVIEST times the rated mass.
+        UserError: no joint moves fast enough, or the payload exceeds HEAVIEST times the rated mass.
     """
     report(0.0, "torque of the loaded arm")
     loaded = LoadedTorque(arm, recording, declared, cutoff_hz)
@@ -136,7 +136,7 @@ def identify_payload(
 
 
 def _fit(rows: Rows, space: BodySpace) -> np.ndarray:
-    """Return z (10,) of the least sum of squares of rows and prior."""
+    """Return the body z (10,) that minimizes the sum of squares of rows and prior."""
     slope, constant = rows.reduced
 
     def residual(z: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ def _fit(rows: Rows, space: BodySpace) -> np.ndarray:
 
 
 def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEstimate:
-    """Return the estimate with its draws."""
+    """Return the estimate at a fit, with the draws of its posterior."""
     rng, (low, high) = np.random.default_rng(seed), fit.space.bounds
     u = fit.u
     if u[0] > 1 - EDGE:
@@ -163,7 +163,7 @@ def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEsti
     drawn = np.clip(u + posterior(fit, u, seed).steps, 0.0, 1.0)[:, :10] * (high - low) + low
     mass, centre, tensor = fit.space.body(drawn)
     draws = {"mass": mass, "centre": centre, "inertia": tensor_elements(tensor)}
-    # what the prior alone says of such a mass: a value is identifiable if its interval is far narrower
+    # spread by the prior alone at this mass: a value is identifiable if its interval is far narrower
     alone = np.where(
         np.isinf(fit.space.sigma), fit.z, rng.normal(size=drawn.shape) * np.nan_to_num(fit.space.sigma, posinf=0.0)
     )

@@ -1,4 +1,4 @@
-"""payload.yaml and payload_posterior.npz: an identified payload as arms, other stages and libfranka read it."""
+"""payload.yaml and payload_posterior.npz: an identified payload for arms, other stages and libfranka."""
 
 import json
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ UNITS = {"mass": "kg", "centre": "m", "inertia": "kg m^2"}
 
 
 def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mapping[str, Any]) -> None:
-    """Write payload.yaml, payload_posterior.npz beside it, and the tool's file with its mass if the robot has one.
+    """Write payload.yaml, payload_posterior.npz and, if the robot has a tool, tool.json with the identified mass.
 
-    `arm.payload`, `arm.declared_payload` and `data.declared_payload` read the file; tool.json is for `robot.tool`.
+    `arm.payload`, `arm.declared_payload` and `data.declared_payload` read payload.yaml; `robot.tool` reads tool.json.
 
     Args:
         path: of payload.yaml. robot: that carried it. source: origin of the estimate (recording, calibration, run).
@@ -36,7 +36,7 @@ def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mappi
         entry = {"unit": UNITS[name], "value": numbers(value)}
         entry |= {"interval95_low": numbers(low), "interval95_high": numbers(high)}
         document["parameters"][name] = entry | {"identifiable": np.asarray(found.identifiable[name]).tolist()}
-    # to the last digit: a rounded tensor of a thin body may be no body's
+    # all digits: a thin body's tensor may become inconsistent by rounding
     document["payload"] = {name: np.asarray(value).tolist() for name, value in found.values.items()}
     columns = found.tensor.T.ravel().tolist()
     document["libfranka"] = {"load_mass": found.mass, "F_x_Cload": found.centre.tolist(), "load_inertia": columns}

@@ -1,4 +1,4 @@
-"""Joint torque of a loaded arm, linear in the payload's standard parameters and in the arm's uncertainty."""
+"""Torque residual of a loaded arm, linear in the payload's standard parameters and in the arm's uncertainty."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -14,12 +14,12 @@ from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass
 from r2s.physics.rigid_body import LinkInertia, nominal_torque
 from r2s.recordings.recording import Recording
 
-# changes since the calibration, standard deviations: friction warms by as much in minutes (WARMED in adaptation); an
-# offset, of the joint's friction; one of link-side sensors, of the largest torque (the prior of conf/identify)
+# standard deviations of changes since the calibration: of friction, relative (warming changes it as much in minutes,
+# WARMED in adaptation); of offsets, relative to friction; of link-side offsets, to the largest torque (conf/identify)
 FRICTION_DRIFT, OFFSET_DRIFT, SENSOR_DRIFT = 0.07, 0.02, 7e-4
-LOAD_FRICTION = 0.015  # Nm of friction per Nm of load, of gears (adaptation/tuning.py: PAYLOAD_FRICTION)
-RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; of longer recordings fewer
-REACH = 10.0  # standard deviations of an arm direction within the unit cube
+LOAD_FRICTION = 0.015  # Nm of gear friction per Nm of load (adaptation/tuning.py: PAYLOAD_FRICTION)
+RATE_HZ, LONG_S = 100.0, 240.0  # rows per second, fewer for recordings longer than LONG_S
+REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class LoadedSpace(ParameterSpace):
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The R rows of a loaded recording that count, in standard deviations: error + body phi + arm w.
+    """Residual rows of a loaded recording, in standard deviations: error + body phi + arm w.
 
     Attributes:
-        error: (R,) without payload. body: (R, 10), per standard parameter phi about the end effector.
-        arm: (R, r), per direction w of the arm's uncertainty, standard normal. clusters: (R,) independent blocks.
+        error: (R,), without payload. body: (R, 10), per standard parameter phi of the payload about the end effector.
+        arm: (R, r), per coordinate w of the arm's uncertainty, standard normal. clusters: (R,), independent blocks.
     """
 
     error: np.ndarray
@@ -49,14 +49,14 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """(r, 10), (r,): the best w is their product with phi plus the constant."""
+        """Gain (r, 10) and constant (r,): the best w for a payload phi is gain @ phi + constant."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,): sum((slope @ phi + constant)^2) is all rows' at the best w."""
+        """Slope (K, 10), constant (K,): sum((slope @ phi + constant)^2) is all rows' at best w, up to a number."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -67,18 +67,18 @@ class Rows:
         return root / size, np.linalg.lstsq(root.T, size * b, rcond=None)[0]
 
     def best_arm(self, phi: np.ndarray) -> np.ndarray:
-        """Return w (r,) of the least sum of squares for a payload phi (10,)."""
+        """Return the w (r,) that minimizes the sum of squares for a payload phi (10,)."""
         gain, constant = self._eliminated
         return gain @ phi + constant
 
 
 class LoadedTorque:
-    """The torque residual of an arm with a payload to be found.
+    """The torque residual of an arm with an unknown payload.
 
     Args:
-        arm: identified without it. recording: loaded, of the same kind of torque as the identification.
+        arm: identified without the payload. recording: with the payload and the same kind of torque.
         declared: payload that gravity compensation assumed (commanded torque).
-        cutoff_hz: of the low-pass of measured or motor torque.
+        cutoff_hz: cutoff of the low-pass for measured or motor torque.
     """
 
     def __init__(self, arm: Arm, recording: Recording, declared: Payload | None = None, cutoff_hz: float = 10.0):
@@ -97,18 +97,18 @@ class LoadedTorque:
         self._sign = m.filtered(sliding_sign(self.torque))
 
     def with_payload(self, payload: Payload | None, unexplained: np.ndarray | float = 0.0) -> TorqueResidual:
-        """Return the residual of the arm with a payload, weighted by its error.
+        """Return the residual of the arm with a payload, reweighted by its error.
 
-        unexplained: (T, n) Nm of this error that the arm's uncertainty explains.
+        unexplained: (T, n) Nm, torque that is subtracted from this error because the arm's uncertainty explains it.
         """
         own = self.torque.on(replace(self._space, payload=payload)).with_external(self._declared + unexplained)
         return own.reweighted(self.arm.x, fitted=True)
 
     def body_torque(self, torque: TorqueResidual, payload: Payload | None) -> np.ndarray:
-        """Return (T, n, 10) Nm per standard parameter of a body at the end effector, besides `payload`."""
+        """Return (T, n, 10) Nm per standard parameter of a body at the end effector, in addition to `payload`."""
         d, robot = self.arm.space.dynamics(self.arm.x), self.arm.robot
         d = dynamics_with_payload(robot, d, payload)
-        # ten bodies of 1 kg, points and tensors, whose standard parameters are independent
+        # ten bodies of 1 kg whose standard parameters are linearly independent
         centre, tensor = np.zeros((10, 3)), np.zeros((10, 3, 3))
         centre[1:4] = np.eye(3)
         for k, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4):
@@ -121,21 +121,21 @@ class LoadedTorque:
         return np.stack(moved, -1) @ np.linalg.inv(LinkInertia(np.ones(10), centre, tensor).standard()).T
 
     def load_friction(self, payload: Payload | None) -> np.ndarray:
-        """Return (T, n) Nm: change of friction by a payload's weight, per Nm of friction per Nm of load."""
+        """Return the change of friction (T, n) Nm by a payload's weight, for 1 Nm of friction per Nm of load."""
         m = self.torque.motion
         carried = mass_and_moment(self.arm.robot, payload)
         loaded = self._weight + np.array([self._load(q, carried) for q in m.q])
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Return the rows, linearized and weighted at a payload of standard parameters phi (10,) and an arm w."""
+        """Return the rows, linearized and weighted at a payload (its standard parameters: phi (10,)) and an arm w."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level
         given = FRICTION_DRIFT, np.broadcast_to(offset, d.level.shape)
         arm = arm_directions(torque, x, self.arm.samples, *given)
         error = torque.error(torque.space.dynamics(x))
-        if self.kind != "measured" and payload is not None:  # a link-side sensor does not measure it
+        if self.kind != "measured" and payload is not None:  # a link-side sensor does not measure gear friction
             change = self.load_friction(payload)
             error = error + d.load * change
             arm = np.concatenate([arm, LOAD_FRICTION * change[..., None] * np.eye(len(d.load))], -1)

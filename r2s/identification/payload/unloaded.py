@@ -1,4 +1,4 @@
-"""A recording of an arm with a known payload, as if the arm had not carried it."""
+"""Removal of a known payload's torque from a recording."""
 
 from dataclasses import replace
 
@@ -13,13 +13,13 @@ from r2s.recordings.recording import Recording
 
 
 def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff_hz: float) -> Recording:
-    """Return the recording with the payload's torque taken out of tau.
+    """Return the recording with the payload's torque subtracted from tau.
 
-    Rigid-body torque is linear in what the last link carries. Measured and motor torque contain the payload's weight;
-    of a command the gravity compensation, to which it was declared, takes the weight.
+    Rigid-body torque is linear in the inertial parameters of a payload. Measured and motor torque contain its weight;
+    commands do not, because gravity compensation, to which the payload was declared, carries the weight.
 
     Args:
-        payload: as `payload_of` returns it. cutoff_hz: of the identification; accelerations pass a higher one.
+        payload: as `payload_of` returns it. cutoff_hz: of the identification; accelerations have a higher cutoff.
     """
     grid = recording.resample(SIM_DT)
     smooth = grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 * recording.rate_hz))
@@ -33,7 +33,7 @@ def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff
         loaded += sign * mujoco_inverse_dynamics(model, smooth.q, smooth.dq, ddq)
     tau, of_grid = recording.tau.copy(), {int(grid.trajectory[s.start]): s for s in grid.stretches}
     for s in recording.stretches:
-        if (rows := of_grid.get(int(recording.trajectory[s.start]))) is None:  # shorter than a step
+        if (rows := of_grid.get(int(recording.trajectory[s.start]))) is None:  # this stretch is shorter than a step
             continue
         for j in range(robot.n):
             tau[s, j] -= np.interp(recording.t[s], grid.t[rows], loaded[rows, j])

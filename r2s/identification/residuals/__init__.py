@@ -1,1 +1,1 @@
-"""Residuals between a model and a recording: of torque (equation error) and of replayed motion (output error)."""
+"""Residuals between model and recording: of predicted torque (equation error) or replayed motion (output error)."""

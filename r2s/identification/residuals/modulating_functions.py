@@ -1,9 +1,9 @@
-"""A recording as weighted means over short windows in which a joint slides in one direction.
+"""Weighted means of a recording over short windows in which a joint slides in one direction.
 
 Friction at standstill and at a reversal is not a function of velocity, and a low-pass spreads such moments over a
 tenth of a second. So each row of a joint is a weighted mean over a window that ends before the joint stops or
-reverses (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command have the same
-weights. Close reversals make windows shorter and rows noisier; the encoder noise gives the amount.
+reverses (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command get the same
+weights. Close reversals make windows shorter and rows noisier; how much noisier is computed from the encoder noise.
 """
 
 from collections.abc import Sequence
@@ -20,29 +20,29 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 250  # rate at which torques are evaluated before averaging
-CUTOFF_HZ = 40.0  # of angles before differentiation: with a curved friction law velocity noise becomes a bias
-NORMAL = 0.6745  # median magnitude of a normal variable, in standard deviations
-SHORTEST, LONGEST = 0.024, 0.1  # s, half a window
-GUARD = 8e-3  # s, over which the low-pass spreads a stop
+CUTOFF_HZ = 40.0  # of angles before differentiation: with a curved friction law, velocity noise causes bias
+NORMAL = 0.6745  # median magnitude of a normal variable over its standard deviation
+SHORTEST, LONGEST = 0.024, 0.1  # s, half the length of a window
+GUARD = 8e-3  # s, distance to a stop, which the low-pass spreads this far
 STEADY = 0.2  # relative change of velocity allowed over PRESLIDING, for a friction law with memory
-STEADY_ROWS = 101  # rows of the polynomial that tests this; over five rows noise looks like acceleration
-MAX_LATENCY = 0.04  # s, of a command
+STEADY_ROWS = 101  # rows of the polynomial fit that tests this; over five rows, noise looks like acceleration
+MAX_LATENCY = 0.04  # s, longest latency of a command
 HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of the step for which a command is held
 LAG_POINTS, LAG_WEIGHTS = np.polynomial.laguerre.laggauss(16)  # quadrature of a first-order lag, over exp(-x)
 
 
 @dataclass(frozen=True)
 class SlidingMotion:
-    """A recording at F instants, and windows about T moments.
+    """A recording sampled at F instants, and windows centred at T moments.
 
     Attributes:
-        t: (T,) s. q, dq, ddq: (F, n) rad, rad/s, rad/s^2. bristle: (F, n), the presliding state.
-        means: n sparse matrices (T, F), the weights of a joint's windows; rows without a window are empty.
-        seen: (T, n) bool, moments with a window in which the joint slides in one direction.
+        t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2. bristle: (F, n), the presliding state.
+        means: n sparse matrices (T, F), the window weights of each joint; rows without a window are empty.
+        seen: (T, n) bool, whether the moment has a window, in which the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of the mean acceleration per rad of white encoder noise.
         encoder: (n,) rad, standard deviation of the encoder noise.
-        delayed: (T, L, n) Nm, mean of the command 1 ms after the moment, at it, and each ms before.
-        instants: (F,) s. starts: (F,) bool, first instants of trajectories.
+        delayed: (T, L, n) Nm, window means of the command with L delays: -1 ms, 0, 1 ms, ...
+        instants: (F,) s. starts: (F,) bool, whether a trajectory starts at the instant.
     """
 
     t: np.ndarray
@@ -66,18 +66,18 @@ class SlidingMotion:
         slid: float = 0.0,
         presliding_rad: np.ndarray | float = PRESLIDING,
     ) -> "SlidingMotion":
-        """Find windows about moments at `rate_hz` in which a joint is faster than `slowest` rad/s.
+        """Find windows, centred at moments at `rate_hz`, in which a joint is faster than `slowest` rad/s.
 
-        For a friction law with memory, a window starts once the joint has slid `slid` rad since its reversal, because
-        bristles bend first, over `presliding_rad`, one distance or (n,). Its velocity must also be steady over
-        PRESLIDING, because bristles remember the friction of earlier velocities.
+        For a friction law with memory (`slid` > 0), a window starts only after the joint has slid `slid` rad since
+        its reversal, because bristles bend first, over `presliding_rad`, one distance or (n,). The velocity must also
+        be steady over PRESLIDING, because bristles remember the friction of earlier velocities.
 
         Raises:
             UserError: no trajectory is long enough.
         """
         grid = recording.resample(SIM_DT)
         smooth = grid.smooth(CUTOFF_HZ)
-        # central differences would lose half a percent of an acceleration at such rates
+        # central differences would underestimate accelerations near CUTOFF_HZ by half a percent
         dq, ddq = (_derivative(smooth, order) for order in (1, 2))
         above = 1.0 - 2.0 * CUTOFF_HZ * SIM_DT  # share of white noise above the cutoff
         encoder = np.median(np.abs(grid.q - smooth.q), axis=0) / NORMAL / np.sqrt(above)
@@ -115,7 +115,7 @@ class SlidingMotion:
 
     @staticmethod
     def joined(parts: "Sequence[SlidingMotion]") -> "SlidingMotion":
-        """Return consecutive parts of a recording as one; they lose their arrays, so that no two copies are kept."""
+        """Join consecutive parts of a recording; the parts lose their arrays, so that no second copy takes memory."""
         if len(parts) == 1:
             return parts[0]
         names = [f.name for f in fields(SlidingMotion) if f.name not in ("means", "encoder")]
@@ -126,24 +126,24 @@ class SlidingMotion:
 
     @property
     def friction_dq(self) -> np.ndarray:
-        """(F, n) rad/s, velocity in the friction law."""
+        """(F, n) rad/s, velocity at which friction is evaluated."""
         return self.dq
 
     @property
     def tau(self) -> np.ndarray:
-        """(T, n) Nm, mean of the command."""
+        """(T, n) Nm, window means of the command without delay."""
         return self.delayed[:, 1]
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
-        """Return (T, n, ...): the means of x (F, n, ...) over the windows of each joint."""
+        """Return the means (T, n, ...) of x (F, n, ...) over the windows of each joint."""
         return _averaged(self.means, x)
 
     rows = filtered  # functions of q, dq, ddq are averaged, too
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return (T, n) Nm: the mean command at the joints, held for a step, `delay` s late, behind a lag.
+        """Return window means (T, n) Nm of the command that acts at the joints after hold, delay and lag, both in s.
 
-        It is the mean of u(t - delay - hold - x) over hold, uniform within a step, and x, exponential with mean lag.
+        This is the mean of u(t - delay - hold - x), with hold uniform over a step and x exponential with mean lag.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
@@ -155,7 +155,7 @@ class SlidingMotion:
 
 
 def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
-    """Return (T, n), a derivative of the angles, by polynomials of at most fourth order through `most` rows."""
+    """Return a derivative (T, n) of the angles, by polynomials of at most fourth order through up to `most` rows."""
     out = np.zeros_like(recording.q)
     for s in recording.stretches:
         rows = min(most, s.stop - s.start - (s.stop - s.start + 1) % 2)
@@ -165,7 +165,7 @@ def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
 
 
 def _block_diagonal(parts: Sequence[csr_array]) -> csr_array:
-    """Return matrices as the diagonal blocks of one; scipy's function takes several times the memory."""
+    """Return the block-diagonal matrix of some matrices; scipy's function takes several times the memory."""
     rows, columns = (np.cumsum([0, *(m.shape[k] for m in parts)]) for k in (0, 1))
     entries = np.cumsum([0, *(m.nnz for m in parts)])
     data = np.concatenate([m.data for m in parts])
@@ -179,7 +179,7 @@ def _averaged(means: tuple[csr_array, ...], x: np.ndarray) -> np.ndarray:
 
 
 def _weights(half: int) -> np.ndarray:
-    """Return the weights (2 half + 1,) of a window; they and two derivatives vanish at its ends."""
+    """Return the weights (2 half + 1,) of a window; they and their first two derivatives vanish at its ends."""
     weights = (1.0 - (np.arange(-half, half + 1) / (half + 1)) ** 2) ** 3
     return weights / weights.sum()
 
@@ -187,14 +187,14 @@ def _weights(half: int) -> np.ndarray:
 def _noise(half: int) -> float:
     """Return the standard deviation of the mean acceleration, 1/s^2, for white angle noise of 1 rad.
 
-    Integration by parts moves both derivatives to the window. An instant stands for 1 / (RATE_HZ SIM_DT) rows.
+    Integration by parts moves both derivatives to the weights. Each instant represents 1 / (RATE_HZ SIM_DT) rows.
     """
     second = np.diff(np.pad(_weights(half), 2), 2) * RATE_HZ**2
     return float(np.linalg.norm(second) * np.sqrt(SIM_DT * RATE_HZ))
 
 
 def _windows(q: np.ndarray, way: np.ndarray, at: np.ndarray, slid: float) -> tuple[csr_array, np.ndarray]:
-    """Return the weights (T, F) of one joint's windows about the instants `at` (T,), and half their widths (T,).
+    """Return the weights (T, F) of one joint's windows centred at the instants `at` (T,), and half their widths (T,).
 
     way (F,) is the sliding direction, 0 where the joint may stick. A width of 0 marks a moment without a window.
     """

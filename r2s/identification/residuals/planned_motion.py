@@ -1,4 +1,4 @@
-"""A planned motion in place of a recording: exact, so that no filter is needed."""
+"""A planned motion in place of a recording; it is exact and needs no filter."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,10 @@ from r2s.physics.robot import Robot
 
 @dataclass(frozen=True)
 class PlannedMotion:
-    """Samples of B motions, one after the other, with the interface of `SmoothMotion`.
+    """Samples of B motions, concatenated, with the interface of `SmoothMotion`.
 
     Attributes:
-        t: (T,) s. q, dq, ddq, tau: (T, n); tau is that of the nominal arm. change: (T, n) Nm/s, its slope over time.
+        t: (T,) s. q, dq, ddq, tau: (T, n); tau is the nominal arm's torque. change: (T, n) Nm/s, its time derivative.
         torque: kind of tau, as in `Recording`.
     """
 
@@ -34,7 +34,7 @@ class PlannedMotion:
         t: np.ndarray,
         motions: tuple[np.ndarray, ...],
     ) -> "PlannedMotion":
-        """Return B motions, q, dq and ddq (B, T, n) at times t (T,), with the torque of the nominal arm."""
+        """Return B motions (q, dq and ddq, each (B, T, n)) at times t (T,) s, with the torque of the nominal arm."""
         q, dq, ddq = (x.reshape(-1, robot.n) for x in motions)
         tau = nominal_torque(robot, q, dq, ddq, torque != "commanded") + nominal.friction(dq, np.sign(dq))
         change = np.gradient(tau.reshape(motions[0].shape), t, axis=1).reshape(tau.shape)
@@ -42,20 +42,20 @@ class PlannedMotion:
 
     @property
     def friction_dq(self) -> np.ndarray:
-        """(T, n) rad/s, velocity in the friction law."""
+        """(T, n) rad/s, velocity at which friction is evaluated."""
         return self.dq
 
     @property
     def bristle(self) -> np.ndarray:
-        """(T, n), presliding state of joints that slide."""
+        """(T, n), presliding state; all joints count as sliding."""
         return np.sign(self.dq)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
-        """Return x (T, n, ...) as it is."""
+        """Return x (T, n, ...) unchanged."""
         return x
 
     rows = filtered
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return (T, n) Nm: the command at the joints."""
+        """Return the command (T, n) Nm that acts at the joints, to first order in delay and lag, s."""
         return self.tau - (delay + lag) * self.change

@@ -1,7 +1,7 @@
 """Replay residual (output error) of commanded motion: simulated minus recorded joint angles, eq. (8) of the paper.
 
-Every candidate starts each window at the measured state and receives the recorded commands; all candidates and
-windows run in one batch. Rows are in units of their own standard deviation, see `reweighted`.
+Every candidate starts each window at the measured state and receives the recorded commands. All windows of many
+candidates are simulated in one batch. Each row is divided by its standard deviation, see `reweighted`.
 """
 
 from copy import copy
@@ -16,26 +16,24 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-USUAL = 0.9  # share of the windows, without the worst, that noise is estimated from
-HUBER = 1.5  # RMS of a window's residual over the median from which it is down-weighted
-Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite differences of start state and torque
-TORQUE_SIGMA, MIN_TORQUE_SIGMA = 0.05, 1e-4  # Nm, start value and lower limit of the unexplained torque of a window
+USUAL = 0.9  # share of the windows from which noise is estimated; the worst are left out
+HUBER = 1.5  # ratio of a window's RMS residual to the median, above which the window is down-weighted
+Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite-difference steps
+TORQUE_SIGMA, MIN_TORQUE_SIGMA = 0.05, 1e-4  # Nm, first guess and lower limit of a window's unexplained torque
 BAYES_ROUNDS = 30  # fixed-point iterations of `_random_effects`
 
 
 class ReplayResidual:
-    """Residual of a commanded recording, averaged over `stride` ms and whitened. Immutable: see `reweighted`.
+    """Replay residual, averaged over `stride` ms and whitened. Immutable: `reweighted` returns a copy.
 
-    A window's error has three sources, which generalized least squares weights together:
-        error = Z b + e,   b ~ N(0, diag(d)): start angle, start velocity and an unexplained torque, constant over the
-        window, per joint;   e ~ N(0, s^2): encoder noise.
-    Z is computed by finite differences about a candidate; d and s come from the recording, later from the residual.
-
-    `clusters` (R,) is the block of each row, at first its window.
+    The error of a window is modelled as Z b + e. b ~ N(0, diag(d)) has each joint's errors of start angle and start
+    velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise. Generalized
+    least squares weights the rows accordingly. Z is computed by finite differences at a candidate; d and s come first
+    from the recording and later from the residual. `clusters` (R,) is the block of each row, at first its window.
 
     Args:
-        space, recording, windows: see `cut_windows`.
-        stride: ms. batch: candidates simulated at once. nthread: 0 uses all cores.
+        space: the parameters. recording, windows: the data, see `cut_windows`.
+        stride: ms. batch: candidates that are simulated at once. nthread: 0 uses all cores.
     """
 
     def __init__(
@@ -64,11 +62,11 @@ class ReplayResidual:
         self._reweigh(space.start, fitted=False)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
+        """Return the residuals (C, R), in standard deviations, of candidates x (C, P)."""
         return (self._white(self.errors(x)) * self._trust[:, None]).reshape(len(x), -1)
 
     def errors(self, x: np.ndarray) -> np.ndarray:
-        """Return (C, W, S' n) rad: simulated minus recorded angles, 0 in padding rows."""
+        """Return simulated minus recorded angles (C, W, S' n) rad of candidates x (C, P); padding rows are 0."""
         return np.concatenate([self._chunk(x[i : i + self._batch]) for i in range(0, len(x), self._batch)])
 
     def _chunk(self, x: np.ndarray) -> np.ndarray:
@@ -79,7 +77,7 @@ class ReplayResidual:
         return self._simulate(d, delayed[kind.ravel()], w.q0, w.dq0)
 
     def _simulate(self, d: Dynamics, tau: np.ndarray, q0: np.ndarray, dq0: np.ndarray) -> np.ndarray:
-        """Return `errors` of C candidates for joint torques tau (C, W, S, n) and starts (C, W, n) or (W, n)."""
+        """Return `errors` of C candidates for joint torques tau (C, W, S, n) and start states (C, W, n) or (W, n)."""
         count = len(tau)
         ids = np.arange(count * self.count)
         shape = (count, *self.windows.q0.shape)
@@ -92,13 +90,13 @@ class ReplayResidual:
         return np.nan_to_num(error.reshape(count, self.count, -1), nan=1e3, posinf=1e3, neginf=-1e3)
 
     def _means(self, q: np.ndarray) -> np.ndarray:
-        """Return (..., S', n): means of `stride` rows of q (..., S, n); their noise is independent."""
+        """Return the means (..., S', n) of each `stride` successive rows of q (..., S, n)."""
         whole = q.shape[-2] // self._stride
         parts = q[..., : whole * self._stride, :].reshape(*q.shape[:-2], whole, self._stride, q.shape[-1])
         return parts.mean(-2)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "ReplayResidual":
-        """Return this residual whitened about x (P,); with `fitted`, d and s are estimated from the residual at x."""
+        """Return this residual whitened at x (P,); if x was `fitted`, d and s are estimated from its errors."""
         other = copy(self)
         other._reweigh(x, fitted)
         return other
@@ -124,7 +122,7 @@ class ReplayResidual:
             block = blocks_of(w.t, w.q0, self._period, mean, seconds)
             self.clusters = np.repeat(block, self._target[0].size)
         self._trust = np.ones(self.count)
-        moves = self._seen.any((1, 2))  # the other windows are all padding
+        moves = self._seen.any((1, 2))  # windows without a row that counts are all padding
         if fitted and moves.any():
             usual = moves
             for _ in range(2):  # an outlier window must not set the noise of the others
@@ -138,35 +136,35 @@ class ReplayResidual:
         self._whiten(z)
 
     def _window_rms(self, error: np.ndarray) -> np.ndarray:
-        """Return (W,) the RMS of a window's white residual over rows that count."""
+        """Return (W,) the RMS of each window's whitened residual over the rows that count."""
         r = self._white(error[None])[0]
         return np.sqrt((r**2).sum(1) / np.maximum(self._seen.reshape(self.count, -1).sum(1), 1))
 
     def _white(self, error: np.ndarray) -> np.ndarray:
-        """Return (C, W, R') in standard deviations."""
+        """Return an error (C, W, R') rad whitened, in standard deviations."""
         r = error / np.tile(self._noise, self._target.shape[1])
         part = (r[..., None, :] @ self._axes) * self._shrink[:, None] @ self._axes.transpose(0, 2, 1)
         return r - part[..., 0, :]
 
     def _whiten(self, z: np.ndarray) -> None:
-        """Set axes and factors of (I + E E^T)^(-1/2) = I - A (1 - 1 / sqrt(1 + l^2)) A^T, E = z d / s."""
+        """Set A and f = 1 - 1 / sqrt(1 + l^2) in (I + E E^T)^(-1/2) = I - A f A^T, for E = z sigma / s = A l V^T."""
         effect = z * self._sigma / np.tile(self._noise, self._target.shape[1])[:, None]
         self._axes, size, _ = np.linalg.svd(effect, full_matrices=False)
         self._shrink = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
 
     def joint_error(self, x: np.ndarray) -> np.ndarray:
-        """Return (C, n) mrad^2: the mean square error of each joint."""
+        """Return the mean square error (C, n) mrad^2 of each joint for candidates x (C, P)."""
         return 1e6 * (self.errors(x).reshape(len(x), -1, self.space.n) ** 2).mean(1)
 
 
 def _random_effects(
     z: np.ndarray, error: np.ndarray, seen: np.ndarray, sigma: np.ndarray, noise: np.ndarray, min_sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return standard deviations of b (K,) and e (n,) of error (W, R') = z b + e, by maximum evidence.
+    """Return the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e that maximize the evidence.
 
-    The fixed point of MacKay, Neural Computation 4(3), 1992: d = sum(mean^2) / (number of well-determined b),
-    starting at `sigma` and `noise`. The mean of b over all windows comes from a wrong parameter, mostly an offset. It
-    does not count as noise, so that the next fit can correct it. No d falls below `min_sigma` (K,), the encoder's.
+    The fixed-point iteration of MacKay, Neural Computation 4(3), 1992, from `sigma` and `noise`: the variance of b is
+    sum(mean^2) / (number of well-determined b). A mean of b over all windows comes from a wrong parameter, mostly an
+    offset; it does not count as noise, so that the next fit can correct it. `min_sigma` (K,) is b's lower limit.
     """
     _, rows, k = z.shape
     n = len(noise)

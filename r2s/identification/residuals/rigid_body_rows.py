@@ -1,4 +1,4 @@
-"""Rigid-body torque at the moments of a torque residual, linear in the standard parameters of the links."""
+"""Rigid-body torque at the moments of a torque residual, linear in the links' standard inertial parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -17,12 +17,12 @@ class RigidBodyRows:
 
     Attributes:
         q: (T, n) rad.
-        rest: (T, n) Nm, torque of what is no link: damping of the file, springs.
+        rest: (T, n) Nm, torque that does not come from links or rotors: damping and springs of the robot's file.
         y: (T, n, 10 n), regressor of the torque.
-        compensation: (T, n, 10 n), regressor of the gravity compensation's error; without rows unless commanded.
+        compensation: (T, n, 10 n), regressor of the gravity compensation's error; empty unless commanded.
         load: (T, n) Nm, magnitude of the nominal gravity torque.
-        rotors: (T, n) rad/s^2, acceleration of the rotors that the torque moves.
-        encoder: (T, n) Nm per unit of `SlidingMotion.noise`, torque of the encoder noise.
+        rotors: (T, n) rad/s^2, rotor acceleration; 0 if the recorded torque does not accelerate the rotors.
+        encoder: (T, n) Nm per unit of `SlidingMotion.noise`, torque error due to encoder noise.
     """
 
     q: np.ndarray
@@ -35,7 +35,7 @@ class RigidBodyRows:
 
     @staticmethod
     def of(robot: Robot, m: SmoothMotion | SlidingMotion, torque: str) -> "RigidBodyRows":
-        """Return the rows at the motion m of a recording of this kind of torque."""
+        """Return the rows for the motion m of a recording with this kind of torque."""
         commanded, still, shape = torque == "commanded", np.zeros_like(m.q), (*m.q.shape, -1)
         rest, y = rigid_body(robot, m.q, m.dq, m.ddq, None if commanded else robot.gravity)
         rest = m.rows(rest - robot.armature * m.ddq)  # the candidate adds its own rotors
@@ -48,7 +48,7 @@ class RigidBodyRows:
             q=m.rows(m.q),
             rest=rest,
             y=m.rows(y.reshape(shape)),
-            compensation=weight if commanded else weight[:0].copy(),  # a view would keep all of it
+            compensation=weight if commanded else weight[:0].copy(),  # a view would not free the array
             load=np.abs(weight @ nominal),
             # a link-side sensor does not measure the torque that accelerates the rotors
             rotors=np.zeros_like(rest) if torque == "measured" else m.rows(m.ddq),
@@ -57,6 +57,6 @@ class RigidBodyRows:
 
     @staticmethod
     def joined(parts: "Sequence[RigidBodyRows]") -> "RigidBodyRows":
-        """Return consecutive parts of a recording as one; they lose their arrays, so that no two copies are kept."""
+        """Join consecutive parts of a recording; the parts lose their arrays, so that no second copy takes memory."""
         names = [f.name for f in fields(RigidBodyRows)]
         return RigidBodyRows(**{name: np.concatenate([vars(p).pop(name) for p in parts]) for name in names})

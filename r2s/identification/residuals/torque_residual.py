@@ -1,7 +1,7 @@
 """Torque residual (equation error): torque predicted at the measured motion minus recorded torque.
 
-Link-side and motor torque include gravity and have no command to replay, so this is their only residual. For
-commanded torque it is the fast start of a fit. Rows are in units of their own standard deviation, see `reweighted`.
+It is the only residual of link-side and motor torque, because these are no commands that can be replayed. For
+commanded torque it is a fast start of a fit. Each row is divided by its standard deviation, see `reweighted`.
 """
 
 from collections.abc import Iterator
@@ -25,27 +25,27 @@ from r2s.recordings.lateness import from_q, lateness
 from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
-STEP = 1e-4  # of the unit cube: finite differences, far above round-off and far below the residual's curvature
-MAX_CORRELATION = 40  # rows: a slowly drifting residual still counts as more than one row
+STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, small against the residual's curvature
+MAX_CORRELATION = 40  # rows, upper limit: a slowly drifting residual still counts as more than one row
 MIN_SIGMA = 1e-9  # Nm
-MOST_ROWS = 30_000  # moments: from five minutes on they are farther apart; the cutoff needs 20 of the 100 in a second
-PIECE_S = 60.0  # s of a recording that are filtered at once
-PART = 2048  # moments whose Jacobian is in memory at once
+MOST_ROWS = 30_000  # of longer recordings (from 5 min at 100 Hz) fewer rows per s; the cutoff needs 20 per s
+PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
+PART = 2048  # number of moments whose Jacobian is in memory at once
 FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
 
 
 class TorqueResidual:
-    """Residual of any recording, zero-phase filtered, at `rate_hz`. Immutable: `on` and `reweighted` return copies.
+    """Torque residual of a zero-phase filtered recording, immutable: `on` and `reweighted` return copies.
 
-    The rigid-body part is a product with a regressor computed once. Friction is evaluated at velocities with a higher
-    cutoff and then filtered like the torque, because a filter rounds the step of friction at a reversal.
+    The rigid-body torque is linear in a regressor that is computed once. Friction is evaluated at velocities with a
+    higher cutoff and then filtered like the torque, because the filter rounds friction's step at a reversal.
 
     Args:
-        space, recording: the parameters, and the data, or a planned motion, which needs no filter.
-        cutoff_hz, rate_hz: of the zero-phase filter, and of the rows.
+        space: the parameters. recording: the data, or a planned motion, which needs no filter.
+        cutoff_hz: cutoff of the filter. rate_hz: rows per second.
         presliding_rad: distance over which bristles bend, one or (n,).
         slowest: rad/s. If positive, rows are means over windows in which a joint is faster and does not reverse
-            (modulating_functions.py), weighted by their encoder noise.
+            (modulating_functions.py); the encoder noise in each window contributes to the row's weight.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class TorqueResidual:
             if slowest:
                 of: Any = partial(SlidingMotion.of, slowest=slowest, slid=slid)
             else:
-                # with commands the delay is estimated, and logged velocities lag by a filter or a step
+                # with commands, velocity is the slope of q: logged dq lags by a filter or a step
                 late = from_q(robot.n) if self.commanded else lateness(recording, cutoff_hz)
                 late = late.as_logged if space.nominal.late_alike else late
                 of = partial(SmoothMotion.of, cutoff_hz=cutoff_hz, late=late)
@@ -80,24 +80,24 @@ class TorqueResidual:
         self.seen: np.ndarray = m.seen if sliding else np.abs(m.dq) >= slowest * isinstance(m, PlannedMotion)
         self._noise: np.ndarray = self._rigid.encoder * (m.noise if sliding else 1.0)
         self._sin, self._cos = m.rows(np.sin(m.q)), m.rows(np.cos(m.q))
-        # sign of friction, by has_memory; a sliding joint has its full friction however slow it is
+        # sign of friction by family.has_memory; in sliding windows friction is full at any speed
         dq = m.friction_dq
         self._sign = {False: np.sign(dq) if slowest else np.tanh(dq / WIDTH_DQ), True: m.bristle}
         self._mean_sign = {memory: m.filtered(sign) for memory, sign in self._sign.items()}
         self.block = blocks_of(m.t, self._rigid.q, self._period)
-        # of held-out rows in selections: trajectories on one clock count once, or many short ones would decide
+        # block of a held-out row in selections; rows at equal clock share one, or short trajectories would decide
         self.half_second: np.ndarray = np.unique(np.floor(m.t / BLOCK_S), return_inverse=True)[1]
         self.lead_s, self._external = 0.0, np.zeros(1)
         self._weights = self._weights_at(self._seen_errors(space.start), fitted=False)
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each row; errors of different blocks are independent."""
+        """(R,) block of each row; errors in different blocks count as independent."""
         return np.repeat(self.block, self.space.n)
 
     @property
     def row_s(self) -> float:
-        """s, median time step in whole milliseconds."""
+        """s, median time between rows, rounded to milliseconds."""
         return SIM_DT * max(1, round(float(np.median(np.diff(self.motion.t))) / SIM_DT))
 
     def _with(self, **changes: Any) -> "TorqueResidual":
@@ -106,28 +106,28 @@ class TorqueResidual:
         return other
 
     def on(self, space: ParameterSpace) -> "TorqueResidual":
-        """Return this residual for another parameter space."""
+        """Return this residual for another parameter space, reweighted at its start."""
         return self._with(space=space).reweighted(space.start, fitted=False)
 
     def with_lead(self, lead_s: float) -> "TorqueResidual":
-        """Return this residual with friction evaluated `lead_s` ahead, see `implicit_friction` in problem.py."""
+        """Return this residual for implicit friction, evaluated `lead_s` ahead (problem.py: `implicit_friction`)."""
         return self._with(lead_s=lead_s)
 
     def within(self, kept: np.ndarray) -> "TorqueResidual":
-        """Return this residual without the moments that are not `kept` (T,) bool."""
+        """Return this residual with only those moments for which `kept` (T,) is true."""
         return self._with(seen=self.seen & kept[:, None])
 
     def with_external(self, tau: np.ndarray) -> "TorqueResidual":
-        """Return this residual for an arm on which its environment exerts the joint torque tau (T, n) Nm."""
+        """Return this residual for an arm on which its environment exerts the joint torques tau (T, n) Nm."""
         return self._with(_external=tau)
 
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
-        """Return (T, n) Nm: torque of rigid bodies, rotors and friction minus offset, at the measured motion.
+        """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: of an arm like this one, to which only what differs is added.
+        known: parts of a prediction for a similar arm; parts that do not differ are reused.
         """
         d, own = dynamics, self._known(dynamics, known)
-        # a link-side sensor sits before friction
+        # a link-side sensor's gain does not scale friction
         out = own.rigid.copy() if self.commanded or self.at_motor else own.rigid * (1.0 + d.gain)
         out += own.friction - d.offset
         if self.commanded:  # error of the gravity compensation
@@ -137,7 +137,7 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None) -> "_Known":
-        """Return the costly parts of a prediction, from `like` where links and rotors, or friction, are the same."""
+        """Return the expensive parts of a prediction; those with the same parameters as `like` are taken from it."""
         m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
         if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
             torque, compensation = like.rigid, like.compensation
@@ -152,10 +152,10 @@ class TorqueResidual:
         return _Known(standard, d.armature, torque, compensation, d.phi, friction)
 
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
-        """Return friction before filtering, Nm, in some rows of F.
+        """Return friction before filtering, Nm, in `rows` of the F instants.
 
-        A simulator that integrates friction implicitly uses the velocity of the step before, `lead_s` too old, and
-        corrects it where friction rises.
+        A simulator with implicit friction evaluates it at the velocity of the previous step, `lead_s` earlier, and
+        corrects it if friction rises with speed.
         """
         dq, sign = self.motion.friction_dq[rows], self._sign[d.family.has_memory][rows]
         if not self.lead_s:
@@ -166,7 +166,7 @@ class TorqueResidual:
         return d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(ddq)
 
     def error(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
-        """Return (T, n) Nm, predicted minus recorded torque; a command is shifted to when it acts on the joints."""
+        """Return predicted minus recorded torque (T, n) Nm; a command is shifted to the time at which it acts."""
         m, free = self.motion, self.predict(dynamics, known) - self._external
         if self.commanded:
             return free - m.command(float(dynamics.delay), float(dynamics.lag))
@@ -174,7 +174,7 @@ class TorqueResidual:
         return free - (m.earlier(-late) if late and isinstance(m, SmoothMotion) else m.tau)
 
     def errors(self, x: np.ndarray) -> np.ndarray:
-        """Return `error` (C, T, n) for candidates x (C, P)."""
+        """Return the `error` (C, T, n) Nm of candidates x (C, P)."""
         d = self.space.dynamics(x)
         out = np.empty((len(x), *self.seen.shape))
         for i in range(len(x)):
@@ -182,15 +182,15 @@ class TorqueResidual:
         return out
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
+        """Return the residuals (C, R), in standard deviations, of candidates x (C, P)."""
         return (self.errors(x) * (self.seen / self.scale)).reshape(len(x), -1)
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (R, P) at u (P,) of the unit cube."""
+        """Return the Jacobian (R, P) with respect to u (P,) on the unit cube."""
         return np.concatenate([j for _, j in self.linearize(u)])
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield residual (r,) and Jacobian (r, P) at u (P,) of the unit cube, for parts of the rows in turn."""
+        """Yield residual (r,) and Jacobian (r, P) at u (P,) on the unit cube, for successive parts of the rows."""
         h = np.where(u > 0.5, -STEP, STEP)
         x, stepped = self.space.from_unit(u), self.space.from_unit(u + h)
         r, changes = self(x[None])[0], self._changes(x, stepped)
@@ -199,13 +199,13 @@ class TorqueResidual:
             yield r[first * self.space.n :][: PART * self.space.n], self._assembled(changes, rows, len(x)) / h
 
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
-        """Return (R, P): the change of the residual at x (P,) as each value in turn goes to `stepped` (P,)."""
+        """Return (R, P): in column k the residual's change if only value k moves from x (P,) to `stepped` (P,)."""
         return self._assembled(self._changes(x, stepped), slice(None), len(x))
 
     def _changes(self, x: np.ndarray, stepped: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return (block, places in x, change) of each block: of torque (T, n), or of link parameters (n, 10 n, n).
+        """Return (block, indices in x, change): of torque (T, n), or for L link values of parameters (n, 10 n, L).
 
-        A dozen evaluations suffice: friction acts on its own joint, and torque is linear in standard parameters.
+        A dozen evaluations suffice: friction acts on its own joint only, and torque is linear in standard parameters.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -228,7 +228,7 @@ class TorqueResidual:
         return out
 
     def _assembled(self, changes: list, rows: slice, count: int) -> np.ndarray:
-        """Return the change of the residual in `rows` of the moments, (., P)."""
+        """Return the change (., P) of the residual in standard deviations, for the moments in `rows`."""
         n, weight = self.space.n, (self.seen[rows] / self.scale[rows])[..., None]
         reach = self._rigid.y[rows] + self._rigid.compensation[rows] if self.commanded else self._rigid.y[rows]
         out = np.zeros((len(reach), n, count))
@@ -243,18 +243,18 @@ class TorqueResidual:
         return (out * weight).reshape(-1, count)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
-        """Return this residual in units of the standard deviation of an independent row at x (P,).
+        """Return this residual divided by the standard deviation of an independent row, from its error at x (P,).
 
-        Per joint this is the RMS at a `fitted` x, else half of it, times the square root of the correlation length.
-        If the encoder noise is known, the RMS is that noise, larger for short windows, plus a constant. At a `fitted`
-        x, the residual also sets the length of independent blocks.
+        For each joint it is the RMS if x was `fitted`, else half the RMS, times the square root of the correlation
+        length. In sliding windows, encoder noise (larger in short windows) and a constant share the RMS. If x was
+        `fitted`, the residual also sets the length of independent blocks.
         """
         r = self._seen_errors(x)
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
         return self._with(_weights=self._weights_at(r, fitted), **own)
 
     def rigid_body_of_last_link(self) -> np.ndarray:
-        """Return (T, n, 10): torque per standard parameter of a body on the last link that nothing declares."""
+        """Return (T, n, 10): torque per standard parameter of an additional, undeclared body on the last link."""
         y, weight = self._rigid.y[..., -10:], self._rigid.compensation[..., -10:]
         return y + weight if self.commanded else y
 
@@ -278,7 +278,7 @@ class TorqueResidual:
 
 
 class _Known(NamedTuple):
-    """Parts of a prediction: (T, n) Nm of links and rotors, of compensation and of friction, and what they are of."""
+    """Parts of a prediction, rigid, compensation and friction (T, n) Nm, and the parameters that they belong to."""
 
     standard: np.ndarray
     armature: np.ndarray
@@ -289,7 +289,7 @@ class _Known(NamedTuple):
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
-    """Return the motion of a recording, made by `of` piece by piece, and its rigid-body torque."""
+    """Return the motion that `of` computes from a recording, piece by piece, and its rigid-body torque."""
     motions = [of(piece) for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     joined = type(motions[0]).joined(motions)
@@ -299,12 +299,12 @@ def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any
 
 
 def _standard(d: Dynamics) -> np.ndarray:
-    """Return (..., n, 10) standard inertial parameters."""
+    """Return the links' standard inertial parameters (..., n, 10)."""
     return LinkInertia(d.mass, d.com, d.inertia).standard()
 
 
 def _constant_sigma(r: np.ndarray, noise: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return (n,) Nm: the constant deviation that with noise (T, n) scales the residual r (T, n) to an RMS of 1."""
+    """Return the constant sigma (n,) Nm such that r (T, n) over sqrt(sigma^2 + noise^2) has an RMS of 1."""
     count = np.maximum(seen.sum(0), 1)
     high = np.maximum((r**2).sum(0) / count, MIN_SIGMA**2)
     low = np.full_like(high, MIN_SIGMA**2)
@@ -316,7 +316,7 @@ def _constant_sigma(r: np.ndarray, noise: np.ndarray, seen: np.ndarray) -> np.nd
 
 
 def _correlation_length(r: np.ndarray) -> np.ndarray:
-    """Return (n,) rows: the lag at which the autocorrelation of r (T, n) first falls below 1/e."""
+    """Return (n,) the lag, in rows, at which the autocorrelation of r (T, n) first falls below 1/e."""
     centred = r - r.mean(0)
     out = np.ones(r.shape[1])
     for j, x in enumerate(centred.T):

@@ -1,7 +1,7 @@
-"""A commanded recording cut into short windows that candidates replay from measured states: eq. (8) of the paper.
+"""Short windows of a commanded recording, which candidates replay from measured states: eq. (8) of the paper.
 
-Short windows keep the problem well-posed: an arm without feedback drifts, and after seconds the error shows the drift
-rather than the parameters.
+Windows are short because a simulated arm without feedback drifts: after seconds the error shows this drift rather
+than the parameters.
 """
 
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-STATE_SAMPLES = 31  # ms, of the local fit that gives a window's start state
+STATE_SAMPLES = 31  # ms, length of the local fit for a window's start state
 HALF = STATE_SAMPLES // 2
-SHORTEST = 0.25  # of the window length: a shorter window costs more than it contributes
-MOVED = 0.02  # rad, range of a joint that moves
+SHORTEST = 0.25  # of the window length: shorter windows cost more than they contribute
+MOVED = 0.02  # rad, least range of a joint that counts as moving
 # of the largest tau_max, 0.1 Nm for a Panda's 87 Nm: scatter of breakaway commands between postures
 SCATTER = 0.1 / 87.0
 MAX_LATENCY_STEPS = 11  # ms, odd: longest latency of a command
-HISTORY = 40  # ms of commands before a window, the memory of delay and lag
+HISTORY = 40  # ms of commands before a window, which delay and lag bring into the window
 
 
 @dataclass(frozen=True)
 class Windows:
-    """W stretches of a recording: start states, commands and the joint angles that followed.
+    """W windows of a recording: start states, commands and the joint angles that followed.
 
     Attributes:
-        t: (W,) s, start. q0, dq0: (W, n) rad, rad/s. tau: (W, S, n) Nm, one row per 1 ms step.
-        before: (W, HISTORY, n) Nm, the commands before the start. bristle: (W, n), presliding state at the start.
-        q: (W, S, n) rad, after each step.
-        length: (W,) steps that count; later rows are padding.
+        t: (W,) s, start. q0, dq0: (W, n) rad, rad/s, at the start. tau: (W, S, n) Nm, commands, a row per 1 ms step.
+        before: (W, HISTORY, n) Nm, commands before the start. bristle: (W, n), presliding state at the start.
+        q: (W, S, n) rad, recorded angles after each step.
+        length: (W,) number of steps that count; later rows are padding.
     """
 
     t: np.ndarray
@@ -50,7 +50,7 @@ class Windows:
     length: np.ndarray
 
     def delayed(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
-        """Return (W, S, n) Nm, the torques at the joints after `delay` and `lag`, s."""
+        """Return the torques (W, S, n) Nm that act on the joints, behind a `delay` and a `lag`, s."""
         motors = Motors(len(self.t), self.tau.shape[-1], delay, lag)
         motors.reset(tau=self.before[:, 0])
         return motors(np.concatenate([self.before, self.tau], 1))[:, HISTORY:]
@@ -66,15 +66,15 @@ def cut_windows(
     """Cut a commanded recording into consecutive windows of at most `seconds`, none across two trajectories.
 
     Args:
-        limit: keep that many windows, evenly spread.
-        slowest: rad/s. A window ends where a joint gets slower, and the next starts when all are faster again. At
-            rest the smallest change of a parameter shifts the release of a joint by a step, which disturbs all
-            joints. Joints that never move are ignored.
-        edges: (n, 2) Nm, commands at which resting joints break away, with their scatter. A joint counts as slow only
-            while its command lies between them.
+        limit: largest number of windows; those that are kept are evenly spread.
+        slowest: rad/s. A window ends when a joint becomes slower, and the next one starts when all joints are faster
+            again. If a joint rests, the smallest change of a parameter shifts its release by a step, which disturbs
+            all joints. Joints that never move are ignored.
+        edges: (n, 2) Nm, commands at which resting joints break away, widened by their scatter. A joint counts as
+            slow only while its command lies between them.
 
     Raises:
-        UserError: no trajectory is as long as a window, or all joints hardly ever move at once.
+        UserError: no trajectory is as long as a window, or all joints hardly ever move at the same time.
     """
     grid = recording.resample(SIM_DT)
     steps = round(seconds / SIM_DT)
@@ -123,10 +123,10 @@ def cut_windows(
 
 
 def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, int]]:
-    """Return start and length of windows of at most `steps` between the slow rows of a stretch of `count` rows."""
+    """Return (start, length) of windows of at most `steps` rows between the `slow` rows of a stretch of `count`."""
     out = []
     for a, b in pairwise([-1, *slow.tolist(), count - 1]):
-        run = b - a - 2 - HALF  # the fit of the start state must not include earlier rows
+        run = b - a - 2 - HALF  # the start state is fitted to rows without a slow joint
         if run < SHORTEST * steps:
             continue
         parts = -(-run // steps)
@@ -136,14 +136,14 @@ def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, 
 
 @dataclass(frozen=True)
 class StartState:
-    """Start state of a replay: a cubic through 31 ms of measured angles and velocities, weighted by their noise.
+    """Start state of a replay: a cubic fitted to 31 ms of measured angles and velocities, weighted by their noise.
 
-    Logged velocities are late, by half a step in a simulator or by a filter on an arm. Comparison with the derivative
-    of the angles gives the latency of each joint.
+    Logged velocities are late, by half a step in a simulator or by a filter on an arm. Their lateness is estimated
+    for each joint from the derivative of the angles.
 
     Attributes:
-        noise: (n,) rad, of the angles, robust. kernel: (n, 2, 2 STATE_SAMPLES), maps angles and velocities to q, dq.
-        sigma: (2, n) rad, rad/s, standard deviation of the state.
+        noise: (n,) rad, robust estimate of the angles' noise. kernel: (n, 2, 2 STATE_SAMPLES), maps measured angles
+            and velocities to q and dq. sigma: (2, n) rad, rad/s, standard deviation of the start state.
     """
 
     noise: np.ndarray
@@ -152,7 +152,7 @@ class StartState:
 
     @staticmethod
     def of(grid: Recording) -> "StartState":
-        """Return the fit for a recording at 1 kHz."""
+        """Return the start-state fit for a recording at 1 kHz."""
         n = grid.n_joints
         seen = [s for s in grid.stretches if s.stop - s.start > STATE_SAMPLES]
 
@@ -177,7 +177,7 @@ class StartState:
         return StartState(noise, kernel, np.sqrt(((kernel * size[:, None]) ** 2).sum(-1)).T)
 
     def __call__(self, grid: Recording, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return q, dq (W, n) rad, rad/s at rows `at` (W,), each at least HALF rows from its stretch's ends."""
+        """Return q, dq (W, n) rad, rad/s at rows `at` (W,), which must be HALF or more rows from a stretch's ends."""
         rows = at[:, None] + np.arange(STATE_SAMPLES) - HALF
         seen = np.concatenate([grid.q[rows], grid.dq[rows]], 1)
         q, dq = np.einsum("nks,wsn->kwn", self.kernel, seen)
@@ -185,7 +185,7 @@ class StartState:
 
 
 def windows_or_none(recording: Recording, seconds: float, limit: int | None = None) -> Windows | None:
-    """Return `cut_windows`, or None if no trajectory is as long as a window, such as blocks of a short period."""
+    """Return `cut_windows`, or None if no trajectory is long enough, such as blocks of a short period."""
     try:
         return cut_windows(recording, seconds, limit)
     except UserError:
@@ -193,7 +193,7 @@ def windows_or_none(recording: Recording, seconds: float, limit: int | None = No
 
 
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
-    """Return q (W, S, n) rad of an arm with these dynamics in each window."""
+    """Return the angles q (W, S, n) rad of an arm with these dynamics, simulated over each window."""
     sim = Simulator(robot, dynamics, len(windows.q0), nthread)
     sim.reset(windows.q0, windows.dq0, bristle=windows.bristle)
     return sim.rollout(windows.delayed(dynamics.delay, dynamics.lag))["qpos"]

@@ -1,4 +1,4 @@
-"""A recording low-pass filtered without phase lag, for differentiation; friction passes the same filter."""
+"""A recording after a zero-phase low-pass, for differentiation; friction passes through the same filter."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,25 +14,25 @@ from r2s.recordings.lateness import Lateness
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
-HOLD_STEPS = 0.5  # mean latency of a command that is held for one step
-FRICTION_CUTOFF = 4.0  # cutoff of the velocity in the friction law over that of the torque: keeps reversals sharp
-SHIFT = 0.05  # periods of the cutoff between the stored shifts of the torque: cubic interpolation errs by 2e-4
-SHIFTS = -0.03, 0.05  # s, that torque may be early or late
-MOST_SHIFT = 20  # ms: four shifts, as many as the interpolation needs
-AT_ONCE = 1024  # moments whose kernels are in memory at once
+HOLD_STEPS = 0.5  # mean latency of a command that is held for one step, in steps
+FRICTION_CUTOFF = 4.0  # velocity's cutoff in the friction law over that of torque, for sharp reversals
+SHIFT = 0.05  # step of stored time shifts, in cutoff periods; cubic interpolation between them errs by 2e-4
+SHIFTS = -0.03, 0.05  # s, range of the stored time shifts of torque
+MOST_SHIFT = 20  # ms, largest step: SHIFTS then contains the four shifts for an interpolation
+AT_ONCE = 1024  # moments that are filtered at once, to limit memory
 EDGE_S = 0.05  # s, dropped at both ends of a trajectory, where the filter has transients
 
 
 @dataclass(frozen=True)
 class SmoothMotion:
-    """A recording low-pass filtered at T moments.
+    """A low-pass filtered recording at T moments.
 
     Attributes:
         t: (T,) s. q, dq, ddq, tau: (T, n), low-passed forward and backward.
         friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), its presliding state. Both
-            repeat the ends of a trajectory for the length of the kernel.
-        kernel: (K,) of `filtered`. spans: first row in F of each moment's kernel, by trajectory.
-        delayed: (T, L, n) Nm, tau each `shift_s` s, from the first of SHIFTS after the moment on.
+            are padded with their end values at both ends of a trajectory, by half the kernel.
+        kernel: (K,), weights of `filtered`. spans: for runs of moments, the first of the F rows under each kernel.
+        delayed: (T, L, n) Nm, tau with L time shifts over the range SHIFTS, `shift_s` s apart.
     """
 
     t: np.ndarray
@@ -55,9 +55,9 @@ class SmoothMotion:
         presliding_rad: np.ndarray | float = PRESLIDING,
         late: Lateness | None = None,
     ) -> "SmoothMotion":
-        """Resample to 1 kHz, low-pass forward and backward, differentiate, and keep `rate_hz` without the edges.
+        """Resample to 1 kHz, low-pass forward and backward, differentiate; keep rows at `rate_hz` without the edges.
 
-        rate_hz: at most FRICTION_HZ. late: of the logged dq against q, which is corrected; None: dq as logged.
+        rate_hz: at most FRICTION_HZ. late: lateness of the logged dq, which is corrected; None: no correction.
 
         Raises:
             UserError: no trajectory is long enough.
@@ -96,7 +96,7 @@ class SmoothMotion:
 
     @staticmethod
     def joined(parts: "Sequence[SmoothMotion]") -> "SmoothMotion":
-        """Return consecutive parts of a recording as one; they lose their arrays, so that no two copies are kept."""
+        """Join consecutive parts of a recording; the parts lose their arrays, so that no second copy takes memory."""
         if len(parts) == 1:
             return parts[0]
         names = ("t", "q", "dq", "ddq", "tau", "friction_dq", "bristle", "delayed")
@@ -106,9 +106,9 @@ class SmoothMotion:
         return SmoothMotion(kernel=parts[0].kernel, spans=tuple(spans), shift_s=parts[0].shift_s, **arrays)
 
     def filtered(self, x: "np.ndarray | Callable[[slice], np.ndarray]") -> np.ndarray:
-        """Return (T, n): the low-pass of x at the moments; x is (F, n), or a function that returns some of its rows.
+        """Return x low-passed at the moments, (T, n); x is (F, n), or a function that returns a slice of these rows.
 
-        Rows are evaluated where they are needed, span by span: those of an hour would be written and read again.
+        A function is evaluated span by span: writing all rows of an hour to memory and reading them is slower.
         """
         parts = []
         for s in self.spans:
@@ -118,15 +118,15 @@ class SmoothMotion:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def rows(self, x: np.ndarray) -> np.ndarray:
-        """Return (T, n, ...), a function of q, dq, ddq at the moments; its arguments are already filtered."""
+        """Return x (T, n, ...), a function of q, dq and ddq at the moments, unchanged: these are already filtered."""
         return x
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return (T, n) Nm: the command at the joints; below the cutoff a lag acts like a delay."""
+        """Return the command (T, n) Nm that acts at the joints; below the cutoff a lag acts like a delay."""
         return self.earlier(delay + lag + HOLD_STEPS * SIM_DT)
 
     def earlier(self, seconds: float) -> np.ndarray:
-        """Return (T, n) Nm: tau as it was logged `seconds` before the moments; negative: after them."""
+        """Return tau (T, n) Nm at `seconds` before each moment; a negative time means after it."""
         at = (seconds - SHIFTS[0]) / self.shift_s
         k = int(np.clip(at, 1, self.delayed.shape[1] - 3))
         weights = cubic(min(max(at - k, -1.0), 2.0))
@@ -134,12 +134,12 @@ class SmoothMotion:
 
 
 def too_short(recording: Recording) -> UserError:
-    """Return the error for a recording whose trajectories are shorter than both edges."""
+    """Return the error for a recording whose trajectories are all shorter than the two dropped edges."""
     return UserError(f"no trajectory is longer than {2 * EDGE_S:g} s; the recording lasts {recording.duration:g} s")
 
 
 def cubic(x: float | np.ndarray) -> np.ndarray:
-    """Return (4, ...): weights of samples at -1, 0, 1 and 2 in their Lagrange interpolation at x in [0, 1]."""
+    """Return (4, ...) the weights of samples at -1, 0, 1 and 2 in a cubic Lagrange interpolation at x in [0, 1]."""
     return np.stack([
         -x * (x - 1) * (x - 2) / 6,
         (x + 1) * (x - 1) * (x - 2) / 2,
@@ -149,7 +149,7 @@ def cubic(x: float | np.ndarray) -> np.ndarray:
 
 
 def _impulse_response(cutoff_hz: float, rate_hz: float) -> np.ndarray:
-    """Return the two-sided kernel of `Recording.smooth` at a rate, truncated and normalized to a sum of 1."""
+    """Return the two-sided impulse response of `Recording.smooth` at a rate, truncated and scaled to a sum of 1."""
     reach = int(3.0 * rate_hz / cutoff_hz)  # a shorter kernel biases friction by 0.3 % of its level
     pulse = np.zeros(8 * reach + 1)
     pulse[4 * reach] = 1.0

@@ -1,1 +1,1 @@
-"""One file per search; each minimizes a `Problem` on the unit cube. Their solver: levenberg_marquardt.py."""
+"""Searches, which minimize a `Problem` on the unit cube: genetic.py, and least_squares.py with its solver."""

@@ -1,7 +1,7 @@
-"""The paper's genetic algorithm (Alg. 1: select, mutate, update until convergence or G_max), as pymoo's GA.
+"""The paper's genetic algorithm (Alg. 1: select, mutate, update until convergence or G_max), with pymoo's GA.
 
-The population starts around the nominal model: with default operators a population that is uniform in the bounds
-converges long before the friction curves do.
+The population starts around the nominal model. With default operators, a population that starts uniformly in the
+bounds loses its diversity long before the friction curves are right.
 """
 
 import time
@@ -19,16 +19,15 @@ from r2s.identification.problem import Problem, Report
 
 @dataclass(frozen=True)
 class Genetic:
-    """The search.
+    """The genetic search.
 
     Attributes:
-        population: individuals, all simulated at once.
+        population: number of individuals, all simulated at once.
         generations: G_max. minutes: time limit.
-        spread: standard deviation of the first population about the nominal model, on the unit cube; at most the
-            prior's.
+        spread: standard deviation of the first population about the start, on the unit cube; at most the prior's.
         patience, tolerance: the search ends if the best cost improved by less than `tolerance` (relative) over
             `patience` generations.
-        seed: of every draw.
+        seed: of all random draws.
     """
 
     population: int = 72
@@ -41,7 +40,7 @@ class Genetic:
     local = False
 
     def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-        """Return u (P,) from `start` (P,)."""
+        """Return the best u (P,) of a search from `start` (P,)."""
         rng = np.random.default_rng(self.seed)
         spread = np.minimum(self.spread, problem.prior_width)
         first = np.clip(start + spread * rng.normal(size=(self.population, len(start))), 0, 1)

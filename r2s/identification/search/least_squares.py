@@ -1,4 +1,4 @@
-"""Least squares on replays or on torque (solver: levenberg_marquardt.py)."""
+"""Least-squares search on replays or on torque (solver: levenberg_marquardt.py)."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ import numpy as np
 from r2s.identification.problem import Problem, Report
 from r2s.identification.search.levenberg_marquardt import minimize
 
-ROUNDS = 4  # reweighted fits on torque; the first weights are those of the nominal arm
+ROUNDS = 4  # reweighted fits on torque; the first weights come from the nominal arm's residual
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """The search.
+    """The least-squares search.
 
     Attributes:
-        max_evaluations: largest number of Jacobians. ftol: least relative gain of a step. minutes: time limit.
-        level: "residual" for the problem's data, or "torque" for its torque residual, a regression in seconds.
+        max_evaluations: largest number of Jacobians. ftol: least relative gain to go on. minutes: time limit.
+        level: "residual" to fit the problem's data, or "torque" to fit its torque residual, which takes seconds.
     """
 
     max_evaluations: int = 40
@@ -26,7 +26,7 @@ class LeastSquares:
     local = True
 
     def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-        """Return u (P,) from `start` (P,)."""
+        """Return the solution u (P,) of a search from `start` (P,)."""
         limits = (self.max_evaluations, self.ftol, self.minutes, report)
         if self.level != "torque":
             return minimize(problem.residual, problem.linearize, start, *limits)

@@ -1,7 +1,7 @@
-"""Bounded least squares on the unit cube: Levenberg-Marquardt that tries several damping factors in one batch.
+"""Bounded least squares on the unit cube: Levenberg-Marquardt with several damping factors tried in one batch.
 
-scipy's trust region factors the whole Jacobian by SVD at every step, which costs more than the physics (14,000 rows,
-110 columns), and tries one step at a time.
+scipy's trust-region solver factors the whole Jacobian (14,000 rows, 110 columns) by SVD at every step, which costs
+more than the physics, and tries one step at a time.
 """
 
 import time
@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-DAMPING = 1e-3  # of the first step, relative to the diagonal of J^T J (Marquardt's scaling)
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # a Gauss-Newton step, and no step, in double precision
+DAMPING = 1e-3  # first damping factor, relative to the diagonal of J^T J (Marquardt's scaling)
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # in double precision: a pure Gauss-Newton step, and no step
 TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful one
-RETRIES = 3  # batches of trials at one Jacobian
+RETRIES = 3  # batches of trials per Jacobian
 
 
 def minimize(
@@ -25,12 +25,12 @@ def minimize(
     report: Callable[[dict], None] = lambda row: None,
     name: str = "least_squares",
 ) -> np.ndarray:
-    """Return u (P,) in the unit cube at a local minimum of the sum of squares near `start` (P,).
+    """Return a local minimum u (P,) of the sum of squares in the unit cube, near `start` (P,).
 
     Args:
         residual: (C, P) -> (C, R). linearize: (P,) -> parts of the residual and its Jacobian, (r,) and (r, P).
         start, max_evaluations, ftol, minutes: see r2s/identification/search/least_squares.py.
-        report: called after every step. name: of the search, in its rows.
+        report: called with a row of progress after every step. name: name of the search in these rows.
     """
     u, damping, began = np.clip(start, 0.0, 1.0), DAMPING, time.perf_counter()
     r = residual(u[None])[0]
@@ -58,7 +58,7 @@ def minimize(
 
 
 def normal_equations(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return J^T r (P,) and J^T J (P, P), summed over parts r (r,), J (r, P)."""
+    """Return J^T r (P,) and J^T J (P, P), each summed over the parts (r, J)."""
     gradient, hessian = 0.0, 0.0
     for r, j in parts:
         gradient, hessian = gradient + j.T @ r, hessian + j.T @ j
@@ -66,7 +66,7 @@ def normal_equations(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np
 
 
 def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
-    """Return u (P,) after a damped Gauss-Newton step of the `free` coordinates, clipped to the cube."""
+    """Return u (P,) after a damped Gauss-Newton step in the `free` coordinates, clipped to the cube."""
     h = hessian[np.ix_(free, free)]
     diagonal = np.diag(h)
     h = h + np.diag(damping * diagonal + 1e-12 * max(diagonal.max(initial=0.0), 1e-30))

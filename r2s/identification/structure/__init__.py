@@ -1,1 +1,1 @@
-"""Model structure, selected by cross-validation: the friction family and the other terms."""
+"""Selection of the model structure by cross-validation: friction family, and terms besides it."""

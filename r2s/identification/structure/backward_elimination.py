@@ -1,7 +1,7 @@
-"""Backward elimination: remove a term if held-out torque is predicted as well without it.
+"""Backward elimination: remove a term if held-out torque is predicted equally well without it.
 
-Gravity hardly distinguishes links from a payload, and fewer parameters generalize better: an arm with correct
-published links needs only a payload term, an arm without payload only link terms.
+Gravity hardly distinguishes link masses from a payload, and fewer parameters generalize better. An arm whose
+published link parameters are correct needs only a payload term; an arm without payload needs only link terms.
 """
 
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from r2s.identification.terms import blocks_of
 
 
 def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequence[str]) -> dict[str, list[bool]]:
-    """Return {"needed": whether held-out motion needs each of the `terms`}; only `prunable` ones are tried.
+    """Return {"needed": [whether prediction needs each of the `terms`]}; removal is tried only for `prunable` ones.
 
-    The term with the most parameters is tried first. It is removed unless the model without it predicts clearly worse
-    than the best one so far.
+    The term with the most parameters is tried first. A term is removed unless the model without it predicts clearly
+    worse than the best model so far.
     """
     base = cv.space(terms)
     folds = list(cv.split(base))
     done = 0
 
     def score(some: Sequence[str]) -> np.ndarray:
-        """Return (blocks, n) Nm^2, mean squares of held-out torque."""
+        """Return the mean square error (blocks, n) Nm^2 of held-out torque with these terms."""
         nonlocal done
         space = cv.space(some)
         squares = np.concatenate([fold.score(space, cv.prior) for fold in folds])

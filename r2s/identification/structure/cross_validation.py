@@ -1,4 +1,4 @@
-"""Cross-validation within a recording: whole blocks of time, or of phase for periodic motion, are held out."""
+"""Cross-validation within a recording: whole blocks of time, or of phase if motion repeats, are held out."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,12 +17,12 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-RATE_HZ = 50.0  # rows per second: model structures are compared on every second row of a fit
-GUARD_S = 0.1  # s, distance of the fitted rows from a held-out block: the low-pass spreads motion that far
+RATE_HZ = 50.0  # rows per second for comparing structures: half as many as in a fit
+GUARD_S = 0.1  # s, gap between fitted rows and a held-out block, because the low-pass spreads motion so far
 
 
 def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
-    """Return (rest, held-out rows) of each fold, which holds out `blocks` blocks; the rest keeps GUARD_S away."""
+    """Return (fitted part, held-out part) of each fold, which holds out `blocks` blocks with gaps of GUARD_S."""
     period = recording.period or np.inf
     clock = recording.t % period if recording.period else recording.t
     edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
@@ -32,20 +32,20 @@ def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Re
         for low, high in edges[k::folds]:
             inside = (clock >= low) & (clock <= high)
             out |= inside
-            # distance on the circle of phases; without a period the way round is infinite
+            # distance on the circle of phases; without a period its circumference is infinite
             near |= inside | ((low - clock) % period < GUARD_S) | ((clock - high) % period < GUARD_S)
         pairs.append((recording.select(~near), recording.select(out)))
     return pairs
 
 
 class Fold(NamedTuple):
-    """Torque residuals of the fitted and of the held-out motion."""
+    """One fold: the torque residuals of the fitted and of the held-out motion."""
 
     fit: TorqueResidual
     test: TorqueResidual
 
     def score(self, space: ParameterSpace, prior: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Fit, and return (blocks, n) Nm^2: mean square error of held-out torque over blocks of half a second."""
+        """Fit, and return the mean square error (blocks, n) Nm^2 of held-out torque in blocks of half a second."""
         own, test = self.fit.on(space), self.test
         u, _ = fit_torque(Problem.of(own, own, prior))
         square = test.seen * test.error(space.dynamics(space.from_unit(u)[None]).one(0)) ** 2
@@ -59,12 +59,12 @@ class CrossValidation:
     """Data and settings that the selections of family and terms share.
 
     Attributes:
-        robot, nominal: the arm, and the start of every fit.
+        robot, nominal: the arm, and the dynamics at which every fit starts.
         recording: training motion.
         bounds, prior: see `search_space` and `Problem.of`.
         folds: number of folds.
         cutoff_hz: cutoff of the zero-phase filter.
-        report: called with a row of progress. stated: fixed values.
+        report: called with rows of progress. stated: the user's statements, of which fixed values are used.
     """
 
     robot: Robot
@@ -78,11 +78,11 @@ class CrossValidation:
     stated: Stated = field(default_factory=dict)
 
     def space(self, terms: Sequence[str], nominal: Dynamics | None = None) -> ParameterSpace:
-        """Return the parameter space of `terms`."""
+        """Return the parameter space of the friction family and `terms`, about `nominal` or the usual nominal arm."""
         return search_space(self.robot, nominal or self.nominal, self.bounds, terms, self.recording, self.stated)
 
     def split(self, space: ParameterSpace, *, blocks: int = 1, slowest: float = 0.0) -> Iterator[Fold]:
-        """Yield the folds; see `held_out` and `TorqueResidual`."""
+        """Yield the folds; for the arguments see `held_out` and `TorqueResidual`."""
         for pair in held_out(self.recording, self.folds, blocks):
             fit, test = (
                 TorqueResidual(space, part, cutoff_hz=self.cutoff_hz, rate_hz=RATE_HZ, slowest=slowest)
@@ -92,16 +92,16 @@ class CrossValidation:
 
 
 def per_joint(squares: np.ndarray) -> np.ndarray:
-    """Return (n,) the factors that make joints with the mean squares (n,) count alike.
+    """Return the factors (n,) that give joints with mean square errors `squares` (n,) equal weight.
 
-    A joint without error has no held-out rows: with `slowest`, one that never slides. It counts nothing.
+    A joint whose error is 0 has no held-out rows, because it never slides faster than `slowest`; its factor is 0.
     """
     return np.divide(1.0, squares, out=np.zeros_like(squares), where=squares > 0)
 
 
 def clearly_worse(more: np.ndarray) -> bool:
-    """Return whether the mean of an error increase, `more` (blocks,), exceeds its standard error.
+    """Return whether the mean of an increase in error, `more` (blocks,), exceeds its standard error.
 
-    The one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984.
+    This is the one-standard-error rule of Breiman et al., Classification and Regression Trees, 1984.
     """
     return bool(more.mean() > more.std() / np.sqrt(len(more)))

@@ -1,4 +1,4 @@
-"""Friction family, chosen by the prediction of held-out torque."""
+"""Selection of the friction family by how well it predicts held-out torque."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,18 +10,18 @@ from r2s.identification.structure.cross_validation import CrossValidation, clear
 from r2s.physics.dynamics import with_family
 from r2s.physics.friction import FAMILIES, Family
 
-# error over the least one that a simpler family may have on windows of sliding; on simulated arms 1.00 to 1.20 where
-# Coulomb friction was the truth, 1.86 to 6.8 where friction fell with velocity (seeds 1 to 31 of independent_arms.py)
+# largest error of a simpler family over the least one, on windows of sliding. On simulated arms (independent_arms.py,
+# seeds 1 to 31) it was 1.00 to 1.20 if Coulomb friction was the truth, 1.86 to 6.8 if friction fell with velocity
 CLOSE = 1.45
 
 
 def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float = 0.0) -> dict[str, Any]:
-    """Return {"error": (F,) relative to the least, "best": index}: error of held-out torque by friction family.
+    """Return {"error": (F,) error of held-out torque over the least one, "best": index} for the F friction families.
 
-    A family with more parameters has to predict clearly better. Slow sliding shows whether friction falls with
-    velocity, but a filter spreads stops and reversals over slow rows, and no family explains those. So with
-    `slowest`, rad/s, families without memory are compared again on windows of faster sliding
-    (modulating_functions.py), which give their "error". Families with memory need other windows.
+    A family with more parameters is chosen only if it predicts clearly better. Slow sliding shows whether friction
+    falls with velocity, but a filter spreads stops and reversals over slow rows, and no family explains these. So if
+    `slowest` > 0, rad/s, families without memory are compared again on windows of faster sliding
+    (modulating_functions.py); their "error" is then from these. Families with memory need other windows.
 
     Raises:
         UserError: the recording is too short to hold out motion.
@@ -41,9 +41,9 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
 def _compare(
     cv: CrossValidation, families: Sequence[Family], terms: Sequence[str], slowest: float = 0.0, close: float = 1.0
 ) -> tuple[np.ndarray, int] | None:
-    """Return the error (F,) relative to the least, and the first family that is `close` or not clearly worse.
+    """Return the errors (F,) over the least one, and the first family that is within `close` or not clearly worse.
 
-    None if no joint has a held-out row: with `slowest`, in a recording of a few seconds.
+    Return None if no joint has a held-out row, such as with `slowest` in a recording of a few seconds.
     """
     spaces = [cv.space(terms, with_family(cv.nominal, f.name)) for f in families]
     scores: list[list[np.ndarray]] = [[] for _ in spaces]

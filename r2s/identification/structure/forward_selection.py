@@ -1,7 +1,7 @@
 """Forward selection: add terms that clearly improve the prediction of held-out torque.
 
-Terms are correlated (an offset with cable drag, a mass with a centre of mass), so a fit gives a value even to a term
-that the arm lacks, and changes the others. So a term must improve the prediction to enter.
+Terms are correlated (an offset with cable drag, a mass with a centre of mass). So a fit assigns a value even to a
+term that the arm lacks, and distorts the others. A term is therefore added only if it improves the prediction.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from r2s.identification.terms import blocks_of, scaled_bounds
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
-BLOCKS = 4  # of each fold, so that held-out motion has fast and slow parts like the rest
-CLEARLY = 2.0  # standard errors of the mean improvement, about 95 %
+BLOCKS = 4  # held-out blocks per fold, so that they have fast and slow parts like the rest
+CLEARLY = 2.0  # least mean improvement in standard errors, about 95 % confidence
 
 
 def select_terms(
     cv: CrossValidation, terms: Sequence[str], candidates: Sequence[str], slowest: float
 ) -> dict[str, list[bool]]:
-    """Return {"entered": whether each of the `candidates` improves a model with `terms`}.
+    """Return {"entered": [whether each of the `candidates` is added to a model with `terms`]}.
 
-    The best candidate enters if it lowers the error by more than CLEARLY standard errors over half-second blocks;
-    this repeats with the rest. Torque is linear in most parameters, so each fold is fitted once without candidates
-    and each selection is one Gauss-Newton step from there.
+    The best candidate is added if it lowers the error by more than CLEARLY standard errors over half-second blocks;
+    then the remaining ones are tried. Torque is linear in most parameters, so each fold is fitted once without
+    candidates, and a trial with candidates is one Gauss-Newton step from this fit.
     """
     space, folds = cv.space(terms), []
     for k, fold in enumerate(cv.split(space, blocks=BLOCKS, slowest=slowest)):
@@ -36,7 +36,7 @@ def select_terms(
     alike = per_joint(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
 
     def score(chosen: Sequence[str]) -> np.ndarray:
-        """Return (blocks,) squared errors, summed over joints of equal weight."""
+        """Return the squared errors (blocks,) with the `chosen` candidates, summed over joints with equal weight."""
         return np.concatenate([f.squares(chosen) for f in folds]) @ alike
 
     chosen: list[str] = []
@@ -53,14 +53,14 @@ def select_terms(
 
 
 class _LinearizedFold:
-    """A fit to a part of a recording, linearized in its own and in the candidates' parameters."""
+    """The fit to a fold, linearized in its own parameters and in those of the candidate terms."""
 
     def __init__(self, cv: CrossValidation, fold: Fold, candidates: Sequence[str]):
         fit, test = fold
         space = fit.space
         u, problem = fit_torque(Problem.of(fit, fit, cv.prior))
         if fit.commanded and implicit_friction(problem, u, 0.0):
-            # a simulator's implicit friction would pass for a rotor that adds to the inertia
+            # a simulator's implicit friction would otherwise look like additional rotor inertia
             test = test.with_lead(EARLY * SIM_DT)
             u, problem = fit_torque(problem.with_torque_data(problem.torque_data.with_lead(EARLY * SIM_DT)))
         problem = problem.reweighted(u, fitted=True)
@@ -85,7 +85,7 @@ class _LinearizedFold:
         self._joints, self._block = space.n, np.repeat(test.half_second, space.n)
 
     def squares(self, chosen: Sequence[str]) -> np.ndarray:
-        """Return (blocks, n), the sum of squares of held-out torque in each block with the terms `chosen`."""
+        """Return the sum of squared errors (blocks, n) of held-out torque with the `chosen` candidate terms."""
         free = np.concatenate([np.arange(self._own), *(self._own + w for name in chosen for w in self._where[name])])
         step = -np.linalg.solve(self._hessian[np.ix_(free, free)], self._gradient[free])
         r = self._left + self._change[:, free] @ step

@@ -1,10 +1,10 @@
-"""Which lateness of link-side torque and of the logged dq an identification corrects.
+"""Choice of the lateness that an identification corrects: of link-side torque, and of the logged dq.
 
-That dq is late against q is measured on the log alone (r2s/recordings/lateness.py); how late torque is, only a fit
-shows. An arm filters both alike, and correcting one alone does harm: on a physical Panda dq is 5.3 ms late and torque
-about 2 ± 0.5 ms. Dropping these 2 ms as uncertain while dq was corrected raised the error of motion held out within
-the training part, and the training residual did not show it. Equal lateness of both does no harm: inertial torque and
-friction then meet at one time.
+The lateness of dq behind q follows from the log alone (r2s/recordings/lateness.py); that of torque needs a fit. An
+arm may filter both in the same way, and then correcting only one does harm. On a physical Panda dq is 5.3 ms late and
+torque about 2 ± 0.5 ms. Correcting dq but not these uncertain 2 ms raised the error of motion held out within the
+training part, while the training residual did not show it. If both are equally late, no correction is needed:
+inertial torque and friction then refer to the same time.
 """
 
 from collections.abc import Sequence
@@ -20,16 +20,16 @@ from r2s.identification.structure.cross_validation import RATE_HZ, CrossValidati
 from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
-SURE = 4.0  # standard deviations: three, and a third more, as intervals cover 85 instead of 95 % where models misfit
-BLOCKS = 4  # of each fold, so that held-out motion has fast and slow parts like the rest
+SURE = 4.0  # standard deviations: 3, plus a third, because with model error 95 % intervals covered only 85 %
+BLOCKS = 4  # held-out blocks per fold, so that they have fast and slow parts like the rest
 
 
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
-    """Return {"delayed": whether torque is clearly late, "alike": whether it counts as late as the logged dq}.
+    """Return {"delayed": whether torque is clearly late, "alike": whether torque and dq count as equally late}.
 
-    1. Fit the delay of torque with dq corrected; if it is clearly not 0, correct both.
-    2. Otherwise correct dq alone if this clearly improves the prediction of held-out torque, by more than a
-       standard error; if not, treat both as equally late and leave them as logged.
+    1. Fit the delay of torque with a corrected dq; if the delay is clearly not 0, correct both.
+    2. Otherwise correct only dq if this improves the prediction of held-out torque by more than a standard error; if
+       it does not, treat both as equally late and use them as logged.
     """
     if DELAY in terms and torque_is_late(cv, terms):
         return {"delayed": True, "alike": False}
@@ -47,7 +47,7 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
 
 
 def torque_is_late(cv: CrossValidation, terms: Sequence[str]) -> bool:
-    """Return whether a fit with the delay of torque among its `terms` finds one that is clearly not 0."""
+    """Return whether a fit whose `terms` include the torque's delay finds a delay that is clearly not 0."""
     space = cv.space(terms)
     recording = cv.recording if cv.recording.period else cv.recording.in_phase()  # repetitions are one block
     data = TorqueResidual(space, recording, cutoff_hz=cv.cutoff_hz, rate_hz=RATE_HZ)

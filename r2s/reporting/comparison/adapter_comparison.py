@@ -1,7 +1,7 @@
 """Adapter comparison: transfers of one policy, a row per adapter and a column per condition of the arm.
 
-Means are over arms and episodes. The bootstrap is paired: it draws arms, and episodes of each arm, the same for all
-rows of a condition.
+Means are over arms and episodes. The bootstrap is paired: it draws arms, and episodes of each drawn arm. All rows of
+a condition share these draws.
 """
 
 import os
@@ -27,14 +27,14 @@ class AdapterComparison:
     """Scores of adapters.
 
     Attributes:
-        measures: {key: Measure}, the compared ones. headline: the measure that sums up a row.
-        scores: a row per measure, condition and row: mean and 95 % interval low, high; difference to the row
-            `reference` (None without one), its interval worse_low to worse_high; numbers of stopped, requested and
-            averaged episodes, and of arms.
-        losses: a row per condition and row: mean of the headline measure, `value`, and `nominal`, its mean over the
+        measures: {key: Measure}, the compared ones. headline: the measure that summarizes a row.
+        scores: a line per measure, condition and row: mean and its 95 % interval low, high; difference from the row
+            `reference` (None: none); worse_low, worse_high, 95 % interval of how much worse the row is; numbers of
+            stopped, requested (`asked`) and averaged (`episodes`) episodes, and of arms.
+        losses: a line per condition and row: `value`, mean of the headline measure, and `nominal`, its mean over the
             same arms and episodes in the nominal condition.
-        costs: a row per row: us per cycle.
-        runs: {row: its transfers}. key: lines that explain the names. left_out: lines about left-out episodes.
+        costs: a line per row: us per cycle.
+        runs: {row: its transfers}. key: lines that explain policy names. left_out: lines about left-out episodes.
     """
 
     measures: Mapping[str, Measure]
@@ -81,7 +81,7 @@ def compare_adapters(found: Sequence[Transferred]) -> AdapterComparison:
 
 
 def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """Return the arms and episodes of one condition that all its rows have, and lines about those left out."""
+    """Return the arms and episodes that all rows of one condition have, and lines about those left out."""
     count = part["row"].nunique()
     of_all = part.groupby(["arm", "goal"], sort=False)["row"].transform("nunique") == count
     shared, words = part[of_all], []
@@ -96,7 +96,7 @@ def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return `AdapterComparison.losses` for the arms and episodes in common."""
+    """Return `AdapterComparison.losses`; shared: arms and episodes in common, of all conditions."""
     key = ["row", "arm", "goal"]
     values = shared.rename(columns={measure: "value"})
     nominal = values.loc[values["condition"] == NOMINAL, [*key, "value"]].rename(columns={"value": "nominal"})
@@ -105,10 +105,10 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
-    """Return a row per row of one condition, with the columns of `AdapterComparison.scores`.
+    """Return the columns of `AdapterComparison.scores` for each row of one condition.
 
     If an episode has no value in one row (a stopped episode has no RMSE, no gap and an infinite distance), all rows
-    omit it; rows without any value do not count. A single episode has no interval.
+    omit it. A row without any value is ignored in this. A single episode has no interval.
 
     Args:
         shared: output of `in_common`. measure: key and direction. reference: {row: row to compare with}. seed: of the
@@ -145,8 +145,8 @@ def _interval(draws: np.ndarray, count: int) -> tuple[float, float]:
 def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]], list[str]]:
     """Return the transfers by row, with the shortest distinct names, and lines that explain the names.
 
-    A row is an adapter; if an arm ran several policies, an adapter with a policy. If each arm has its own policy, the
-    policies count as one.
+    A row is an adapter or, if an arm ran several policies, an adapter with a policy. If each arm ran only one policy,
+    the policies count as one.
     """
     of_arm: dict[str, set[str]] = {}
     for r in found:
@@ -172,7 +172,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return the last parts of each path, as few as make them distinct."""
+    """Return {path: its last parts}, with as few parts as keep the names distinct."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -181,7 +181,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the row of adapt=none with the same policies, or the only row of adapt=none; None without one."""
+    """Return the row of adapt=none with a policy of this row, else the only row of adapt=none, else None."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]
@@ -189,7 +189,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Return a line: a row's headline measure in its worst condition, and where it is worse than its reference."""
+    """Return a line about a row: headline measure in its worst condition, and where the reference is better."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:

@@ -25,7 +25,7 @@ ABOUT = (
 
 
 def tables(found: AdapterComparison) -> dict[str, pd.DataFrame]:
-    """Return {title: table of strings}: one per measure, of stopped episodes if there are any, and of costs."""
+    """Return {title: table of strings}: one per measure, one of stopped episodes if there are any, one of costs."""
     s = found.scores
     out = {m.heading: _cells(s[s["measure"] == key], m) for key, m in found.measures.items() if len(s)}
     first = s[s["measure"] == found.headline.key]
@@ -38,7 +38,7 @@ def tables(found: AdapterComparison) -> dict[str, pd.DataFrame]:
 
 
 def _cells(scores: pd.DataFrame, m: Measure) -> pd.DataFrame:
-    """Return the means of one measure over their intervals."""
+    """Return a table of one measure; each cell has a mean and, below it, the interval."""
 
     def cell(mean: float, low: float, high: float) -> str:
         return m.cell(mean) + (f"\n[{m.cell(low)}, {m.cell(high)}]" if np.isfinite(low) else "")
@@ -48,14 +48,14 @@ def _cells(scores: pd.DataFrame, m: Measure) -> pd.DataFrame:
 
 
 def _square(scores: pd.DataFrame) -> pd.DataFrame:
-    """Return the column `cell`, a line per row and a column per condition, in their order."""
+    """Return the column `cell` as a table with a line per row and a column per condition, in order of occurrence."""
     wide = scores.pivot(index="row", columns="condition", values="cell").fillna("-")
     wide = wide.loc[list(scores["row"].unique()), list(scores["condition"].unique())]
     return wide.rename_axis("adapter").rename_axis(None, axis=1)
 
 
 def lines(found: AdapterComparison) -> list[str]:
-    """Return the lines below the tables: a verdict per row, names, and the episodes that are not averaged."""
+    """Return the lines about the tables: a verdict per row, names of policies, and episodes that are not averaged."""
     s = found.scores
     out = [verdict(found, row) for row in found.runs]
     if len(s) and not s["stopped"].any():

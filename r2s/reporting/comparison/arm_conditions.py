@@ -1,10 +1,10 @@
-"""Test conditions of an arm in words: payload, warm friction, late commands."""
+"""Test conditions of an arm in words: payload, friction of a warm arm, delayed commands."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 NOMINAL = "nominal"
-IDENTITY = ("_target_", "name", "variant", "seed", "noise")  # keys of conf/arm that say which arm it is
+IDENTITY = ("_target_", "name", "variant", "seed", "noise")  # keys of conf/arm that identify the arm
 SETTINGS: dict[str, tuple[Any, str]] = {  # keys that set a condition: nominal value, words
     "payload": (0.0, "{} kg"),
     "declared_payload": (0.0, "{} kg declared"),
@@ -31,12 +31,12 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
 
 
 def in_words(settings: Mapping[str, Any]) -> str:
-    """Return a `condition` as "1.0 kg, 0.005 s later"; NOMINAL if it is empty."""
+    """Return a `condition` in words, as "1.0 kg, 0.005 s later"; NOMINAL if it is empty."""
     return ", ".join(_words(k, v) for k, v in settings.items()) or NOMINAL
 
 
 def order(settings: Mapping[str, Any]) -> tuple:
-    """Return the sort key of a `condition`: nominal first, then by setting and size."""
+    """Return the sort key of a `condition`: by number of settings, so nominal is first, then by setting and size."""
     keys = list(SETTINGS)
     each = [(keys.index(k) if k in keys else len(keys), k, _size(v), str(v)) for k, v in settings.items()]
     return len(each), each

@@ -7,7 +7,7 @@ from typing import Any
 
 from r2s.reporting.comparison.trainings import Trained
 
-LONGEST = 40  # letters of a label: a longer one takes the room of the figure
+LONGEST = 40  # most letters of a label; a longer one would take space from the figure
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Groups:
 def group(runs: Sequence[Trained]) -> Groups:
     """Return the runs grouped by settings, all seeds together.
 
-    A label is the algorithm and the overrides of the settings that differ; the rest is default. A label too long for
-    figures becomes a number, explained in `Groups.key`.
+    A label is the algorithm and the overrides of the settings that differ; all others are default. A label too long
+    for figures is replaced by a number, which `Groups.key` explains.
     """
     sets: dict[str, list[Trained]] = {}
     for run in runs:
@@ -45,7 +45,7 @@ def group(runs: Sequence[Trained]) -> Groups:
 
 
 def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
-    """Return a name per set."""
+    """Return a name for each set of seeds, as `group` describes."""
     varied = _varied(sets)
     typed = [{k: v for run in seeds for k, v in run.typed.items()} for seeds in sets]
     parts = []
@@ -70,7 +70,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return per algorithm the settings that differ: its own among its runs, all others among all runs."""
+    """Return {algorithm: settings that differ}: those of algo= among its own runs, all others among all runs."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}

@@ -39,7 +39,7 @@ OVER = {  # x axes of learning curves: title, scale
 def comparison_page(
     run: Run, robot: Robot, grouped: Groups, apart: Mapping[str, str], others: Mapping[str, str]
 ) -> dict[str, pd.DataFrame]:
-    """Write tables as CSV, figures, report.md and recording.rrd.
+    """Write tables (CSV), figures, report.md and recording.rrd of a comparison of trainings.
 
     Args:
         run: run folder of the comparison. robot: the arm. grouped: trainings. apart: {run: why not comparable}.
@@ -96,15 +96,15 @@ def _sections(
 
 
 def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]:
-    """Return a section per heading of {heading: {run: reason}}; a heading without runs has none."""
+    """Return a section per heading of {heading: {run: reason}}; headings without runs are left out."""
     return {heading: [[f"{k}: {v}" for k, v in why.items()]] for heading, why in parts.items() if why}
 
 
 def bands_figure(path: Path, groups: Groups) -> Path:
     """Draw interquartile mean and range of the seeds over env steps, updates and minutes, one row per measure.
 
-    If there are more groups than colours, the figure has the best by the last evaluation. A model-based controller is
-    a dotted line.
+    If there are more groups than colours, only the best groups of the last evaluation are drawn. A model-based
+    controller is a dotted line.
     """
     grouped, table = groups.members, measures_in(groups.members)
     by = table[table.selection[-1]]

@@ -19,7 +19,7 @@ def measures_in(grouped: Grouped) -> MeasureTable:
 
 
 def scores(group: Sequence[Trained], measure: str) -> np.ndarray:
-    """Return the last evaluation (S,) of every seed."""
+    """Return a measure (S,) of the last evaluation of every seed."""
     return np.array([r.last[measure] for r in group])
 
 
@@ -52,10 +52,10 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
     """Return per algorithm how much a measure depends on its settings; empty if no algorithm has two settings.
 
-    best, median and worst are over settings, each the interquartile mean of its seeds. The seeds that choose the best
-    setting flatter it. held_out scores it without them: for each seed, the setting that is best by the other seeds,
-    at this seed; mean over seeds. spread is held_out minus the median setting at the same seed, with a 95 % interval
-    over seeds; nan with fewer than two seeds that all settings have. A small spread means little need for tuning.
+    best, median and worst are over the interquartile means of the settings. best is optimistic: the same seeds choose
+    and score it. For held_out, each seed scores the setting that the other seeds choose; mean over seeds.
+    spread is held_out minus the median setting at the same seed, with a 95 % interval over seeds; nan if the settings
+    share fewer than two seeds. A small spread means little need for tuning.
 
     Args:
         grouped: trainings. measure: key; None: the last of `MeasureTable.selection`.
@@ -79,11 +79,11 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return per held-out seed (S,) the score of the other seeds' best setting, and the median over settings.
+    """Return, at each held-out seed (S,), the score of the best setting by the other seeds, and the median setting's.
 
     Args:
-        settings: {seed: score} of each, larger is better; the seeds that all of them have count. None if these are
-            fewer than two.
+        settings: {seed: score} of each, where larger is better. Only seeds that all settings have are used; the
+            result is None if there are fewer than two.
     """
     seeds = sorted(set.intersection(*(set(s) for s in settings)))
     if len(seeds) < 2:
@@ -94,7 +94,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line per setting of algo= or reward= whose best value is at an edge of three or more tried."""
+    """Return a line per setting of algo= or reward= whose best value is at an end of three or more tried values."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -108,17 +108,17 @@ def at_edges(grouped: Grouped) -> list[str]:
 
 
 def edge(what: str, key: str, value: float, largest: bool) -> str:
-    """Return the line of a winner at the edge of what was tried."""
+    """Return a line about a best value at the edge of the tried values."""
     return f"{what}: {key}={value:g} is the {'largest' if largest else 'smallest'} tried; a better one may lie beyond"
 
 
 def is_number(value: object) -> bool:
-    """Return whether a setting is a number and no switch."""
+    """Return whether a setting is a number, and not a boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return one measure of an `improvement_table` as strings: the probability that row beats column, numbered."""
+    """Return one measure of an `improvement_table` as strings: probability that row beats numbered column."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}
@@ -130,10 +130,10 @@ def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
 def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
     """Return a grid of x (points,), and y (3, points): interquartile mean, minimum, maximum over seeds.
 
-    The seeds' curves are interpolated on the range that all of them cover.
+    The curves of the seeds are interpolated on the range of x that all of them cover.
     """
     curves = [r.curve for r in group]
     grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)
-    with np.errstate(invalid="ignore"):  # infinite if arms were stopped: no curve there
+    with np.errstate(invalid="ignore"):  # values are infinite where arms were stopped: no curve there
         values = np.stack([np.interp(grid, c[x], c[y]) for c in curves], -1)
     return grid, np.stack([interquartile_mean(values), values.min(-1), values.max(-1)])

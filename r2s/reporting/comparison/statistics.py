@@ -22,7 +22,7 @@ def interquartile_mean(x: np.ndarray) -> np.ndarray:
 def interval(
     strata: Sequence[np.ndarray], statistic: Callable[[list[np.ndarray]], np.ndarray], seed: int = 0
 ) -> tuple[float, float]:
-    """Return the 95 % interval of a statistic by a stratified bootstrap; nan if a stratum has one score only.
+    """Return the 95 % interval of a statistic by a stratified bootstrap; nan if a stratum has only one score.
 
     Args:
         strata: arrays (S,), a score per seed. seed: of the bootstrap.
@@ -41,10 +41,10 @@ def interval(
 
 
 def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return the means (DRAWS, A) of a paired bootstrap: it draws arms, and episodes of each arm, the same for all A.
+    """Return the means (DRAWS, A) of a bootstrap over arms, and over episodes of each drawn arm, paired among the A.
 
     Args:
-        each: per arm (E, A), a row per episode. rng: of the draws.
+        each: per arm (E, A): values of E episodes in A rows of a comparison. rng: of the draws.
     """
     draws = []
     for _ in range(DRAWS):

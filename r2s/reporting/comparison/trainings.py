@@ -1,4 +1,4 @@
-"""Finished trainings, read from their run folders, and which of them are comparable."""
+"""Read finished trainings from their run folders, and select comparable ones."""
 
 import json
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -16,12 +16,12 @@ from r2s.reporting.trackers.tracker import flat
 from r2s.runs import parts_of
 from r2s.tasks.measures import MeasureTable
 
-# config groups that a training reads, beside its seed; runs with equal values are seeds of one group
+# config groups that a training reads besides its seed; runs with equal values form one group of seeds
 READ = (
     *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
 )
 ALIKE = ("robot", "task")  # config groups that comparable runs share
-# where a run came from, which comparable runs share: code changes what is learned, a machine how much in a minute
+# origin, equal for comparable runs: the code affects what is learned, the machine how much is learned per minute
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
@@ -35,13 +35,13 @@ class Trained:
 
     Attributes:
         folder, seed, algo: of the run.
-        settings: values that it used: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
-        alike: values that comparable runs share: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
-        origin: commit, machine, threads and device, None where meta.json has none; of a controller the commit only.
-        typed: overrides of its settings: {"dr": "paper", "algo.lr": "5e-4"}.
+        settings: config values that it read: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
+        alike: config values that are equal in comparable runs: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
+        origin: commit, machine, threads and device, None where meta.json has none; for a controller only the commit.
+        typed: overrides of its settings, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether it ran with +experiment=toy, which is too short to learn.
         minutes: its budget, None if the budget is in env_steps.
-        measures: of its task. curve: evaluations.csv, on the goals that selected its best policy.
+        measures: of its task. curve: evaluations.csv, on the goals by which its best policy was selected.
         last: measures of its last policy, from summary.json, on goals not used for selection.
     """
 
@@ -60,7 +60,7 @@ class Trained:
 
     @property
     def learned(self) -> bool:
-        """False for a model-based controller."""
+        """Whether the run trained a policy; False for a model-based controller."""
         return self.last["env_steps"] > 0
 
 
@@ -78,7 +78,7 @@ def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[s
 
 
 def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
-    """Return the same as `read_trainings`; the list may be empty."""
+    """Return the same as `read_trainings`, but allow an empty list."""
     trained, others = [], {}
     for folder in map(Path, folders):
         if why := why_not(folder, "train", FILES):
@@ -107,7 +107,7 @@ def why_not(folder: Path, stage: str, files: Iterable[str]) -> str:
 
 
 def typed_in(folder: Path) -> dict[str, str]:
-    """Return the overrides of a run: {"dr": "paper", "algo.lr": "5e-4"}."""
+    """Return the overrides of a run, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}."""
     words = yaml.safe_load((folder / "overrides.yaml").read_text()) or []
     pairs = (word.lstrip("+~").partition("=") for word in words)
     return {key: value for key, _, value in pairs}
@@ -144,7 +144,7 @@ def _read(folder: Path) -> Trained:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    """Return commit, machine, threads and device of a run; of a resumed one the values of all its parts."""
+    """Return commit, machine, threads and device of a run; for a resumed run, the values of all its parts."""
     found: dict[str, set[str]] = {key: set() for key in ORIGIN}
     for part in parts_of(json.loads((folder / "meta.json").read_text())):
         git, machine = part["git"] or {}, part["machine"] or {}
@@ -156,18 +156,18 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 
 def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, Any]:
-    """Return {"dr.phi_relative": 0.1, ...} of these groups of a config, without `_target_`."""
+    """Return the values in these groups of a config, {"dr.phi_relative": 0.1, ...}, without `_target_`."""
     own = flat({group: node for group, node in config.items() if group in groups})
     return {key: value for key, value in own if not key.endswith("_target_")}
 
 
 def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, dict[str, float]]:
-    """Return evaluations.csv and the last policy's row; a lower-is-better measure without a value is infinite.
+    """Return evaluations.csv and the last policy's row; a missing value is infinite if lower is better.
 
-    Such a measure has no value if the arm was stopped in all episodes. summary.json has null there.
+    Such a value is missing (null in summary.json) if the arm was stopped in all episodes.
 
     Raises:
-        ValueError: another measure has no value, or there is no evaluation.
+        ValueError: a value of another measure is missing, or there is no evaluation.
     """
     curve = pd.read_csv(folder / "evaluations.csv")
     if curve.empty:
@@ -188,8 +188,8 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
     """Return the largest set of comparable runs, and {name: reason} of the others.
 
     Runs are comparable if robot, task, evaluation, commit and machine agree and budgets differ by at most the factor
-    `MOST_BUDGETS`. Of two sets of equal size the one without toys wins, then the one with more env steps. Of two runs
-    with equal settings and seed the first counts: the second adds no evidence.
+    `MOST_BUDGETS`. Of sets of equal size, one without +experiment=toy is preferred, then one with more env steps. Of
+    two runs with equal settings and seed, the first counts: the second adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -208,7 +208,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why a run is not comparable with `first`, which has the smallest budget of its set; "" if it is."""
+    """Return why a run is not comparable with `first`, the run with the smallest budget of a set; "" if it is."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]

@@ -1,4 +1,4 @@
-"""Finished transfers to an arm, read from their run folders, and which of them are comparable."""
+"""Read finished transfers to an arm from their run folders, and select comparable ones."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
 FILES = ("config.yaml", "policy.yaml", "overrides.yaml", "summary.json")
-ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that are no settings of the adapter
+ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that depend on the arm and are no settings of the adapter
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Transferred:
     Attributes:
         folder: of the run. start: its start time, from meta.json. policy: absolute path of the policy's run folder.
         adapter: name in conf/adapt. settings: of the adapter: {"filter_s": 0.087}.
-        arm: "twin, rigid, seed 0". condition: settings of the arm (`condition`). robot: its config in the training.
+        arm: "twin, rigid, seed 0". condition: settings of the arm (`condition`). robot: its config in training.
         measures: of the task. length: of an episode, with the policy's rate: "4 s at 100 Hz". goals: their number.
         us: median time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
         episodes: a row per episode, indexed by goal: `MeasureTable.transfer`, the gap, and arm_stopped (0 or 1).
@@ -103,7 +103,7 @@ def _cost(path: Path) -> float:
 
 
 def _names(goals: np.ndarray) -> Iterator[str]:
-    """Yield a name per goal that all transfers share; equal goals are numbered.
+    """Yield a name per goal, the same in all transfers; equal goals are numbered.
 
     Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometres.
     """

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 KNOWN = {"measured": "#9aa0a6", "nominal": "#f28e2b", "identified": "#3b8fe0"}
-# twelve distant colours in OKLab; WCAG contrast to black and to white is at least 2.4
+# twelve colours far apart in OKLab; their WCAG contrast to black and to white is at least 2.4
 OTHERS = (
     "#3daa6d", "#d65f9e", "#9b7ede", "#c9a227", "#784800", "#005484",
     "#cc0018", "#5400f0", "#007800", "#d800fc", "#607878", "#900c90",
@@ -13,8 +13,8 @@ OTHERS = (
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
-    A label with "measured", "nominal" or "identified" in it ("twin, nominal") has the colour of that word. The others
-    take twelve different colours in turn.
+    The first label with "measured", "nominal" or "identified" in it ("twin, nominal") gets the colour of that word.
+    The other labels get the twelve colours of OTHERS in order, from the first again after the twelfth.
     """
     found: dict[str, str] = {}
     others = 0

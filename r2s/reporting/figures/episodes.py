@@ -11,7 +11,7 @@ from r2s.reporting.viewer.layout import Episode
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.rollout import Episodes
 
-SHOWN = 4  # goals of a figure, as in the paper's
+SHOWN = 4  # most goals in a figure, as in the paper's
 
 
 def error_figure(path: Path, episodes: Mapping[str, Sequence[Episode]], measures: MeasureTable) -> Path:
@@ -53,7 +53,7 @@ def traces_figure(path: Path, episodes: Mapping[str, Episodes], reward: str) -> 
 
 
 def latency_figure(path: Path, seconds: Mapping[str, Sequence[float]]) -> Path:
-    """Draw a histogram of each latency of {name: s}, in ms, with logarithmic axes."""
+    """Draw a histogram in ms for each {name: latencies in s}, with logarithmic axes."""
     present = {name: 1e3 * np.array(values) for name, values in seconds.items() if len(values)}
     with panels(path, len(present), len(present), "latencies on this computer", height=2.4) as axes:
         for axis, (name, ms) in zip(axes, present.items(), strict=True):

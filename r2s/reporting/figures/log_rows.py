@@ -1,4 +1,4 @@
-"""Thinning of long logs for figures, and clocks without pauses."""
+"""Reduce the rows of long logs for figures, and shorten the pauses of their clocks."""
 
 import numpy as np
 
@@ -12,13 +12,13 @@ def thin(count: int, most: int = MOST_POINTS) -> slice:
 
 
 def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
-    """Return the indices of t (T,) s nearest to a clock of `rate` Hz, first and last row included."""
+    """Return indices of t (T,) s that sample it at about `rate` Hz; the first and the last row are included."""
     grid = np.arange(t[0], t[-1], 1 / rate)
     return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
 
 
 def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a clock (T,) s from zero in which each pause of t (T,) s lasts `PAUSE`, and the rows after a pause.
+    """Return a clock (T,) s from zero in which each pause of t (T,) s lasts `PAUSE`, and the first row after each.
 
     A pause is a step of more than five median steps, or a step back (a log that restarts its clock).
     """

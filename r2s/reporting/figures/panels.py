@@ -12,11 +12,11 @@ from r2s.tasks.measures import Measure
 
 DPI = 120
 WIDTH = 12.0  # inches
-LEGEND_WIDTH = 160  # letters that fit beside each other in WIDTH
+LEGEND_WIDTH = 160  # letters of a legend's line that fit into WIDTH
 # inches around and between panels: matplotlib's own layouts measure every text, which takes most of a figure's time
 LEFT, RIGHT, TOP, BOTTOM, ACROSS, DOWN, LINE = 0.8, 0.15, 0.75, 0.5, 0.85, 0.75, 0.22
 LETTER = 0.085  # inches per letter of a label beside the first panel
-TITLE, AGAIN = 0.9, 0.2  # inches beyond the row heights: once, and per further row
+TITLE, AGAIN = 0.9, 0.2  # inches added to the heights of the rows: once, and for each row after the first
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def joint_panels(path: Path, n: int, title: str) -> AbstractContextManager[list[
 
 
 def label_axis(axis: Axes, m: Measure) -> None:
-    """Title a panel of a measure; a percentage has the whole range."""
+    """Set the title of a measure's panel; a percentage gets its whole range as the y axis."""
     axis.set_title(m.heading, loc="left")
     if m.unit == "%":
         axis.set_ylim(-3, 103)

@@ -14,8 +14,8 @@ from r2s.reporting.figures.colours import colours
 from r2s.reporting.figures.log_rows import thin, without_pauses
 from r2s.reporting.figures.panels import joint_panels, log_axis, panels
 
-LONGEST = 30.0  # s of torque in a figure: more is a solid band
-SCANS = {  # steps of the history without a cost that compares, and their shade
+LONGEST = 30.0  # s of torque in a figure; more would look like a solid band
+SCANS = {  # steps of the history whose costs are not comparable: title and colour of their shade
     "family": ("comparison of friction families", "#9aa0a6"),
     "terms": ("choice of terms", "#57ab5a"),
     "breakaway": ("search for breakaway", "#c9a227"),
@@ -29,7 +29,7 @@ def torque_figure(
 ) -> Path:
     """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s (figure 4 of the paper).
 
-    The figure has the first `LONGEST` seconds with pauses cut short; the RMSE is over all rows.
+    The figure shows the first `LONGEST` seconds, with pauses cut short; the RMSE in its titles is over all rows.
     """
     colour, (clock, pauses) = colours(["measured", *predicted]), without_pauses(t)
     rows = np.flatnonzero(clock <= LONGEST)
@@ -59,7 +59,7 @@ def position_figure(
 ) -> Path:
     """Draw the open-loop error of predicted {label: (W, S, n)} against windows_q (W, S, n), rad, rows `dt` s apart.
 
-    Lines are medians over the W windows; bands hold 90 % of them.
+    Lines are medians over the W windows; bands contain 90 % of the windows.
     """
     colour, t = colours(predicted), dt * np.arange(1, windows_q.shape[1] + 1)
     title = f"open-loop error over {len(windows_q)} windows: median and 90 % band"
@@ -87,7 +87,7 @@ def friction_figure(
     data: tuple[np.ndarray, np.ndarray] | None = None,
     draws: np.ndarray | None = None,
 ) -> Path:
-    """Draw friction over speed up to dq_max (n,) rad/s, and breakaway torques as bars at rest.
+    """Draw friction over speed up to dq_max (n,) rad/s, and breakaway torques as bars at zero speed.
 
     Args:
         path: of the PNG. dynamics: {label: model}. dq_max: range of the speed axis.
@@ -127,7 +127,7 @@ def friction_figure(
 def _band(
     axis: Axes, speed: np.ndarray, torque: np.ndarray, limits: tuple[float, float], colour: str, label: str
 ) -> tuple[float, float]:
-    """Draw the 95 % band of torque (T, S) and return the y limits; a wide band is cut off, curves stay readable."""
+    """Draw the 95 % band of torque (T, S); return y limits that cut off a wide band, so that curves stay readable."""
     low, high = limits
     bottom, top = np.quantile(torque, [0.025, 0.975], axis=1)
     axis.fill_between(speed, bottom, top, label=f"95 % band, {label}", color=colour, alpha=0.25, linewidth=0)
@@ -171,6 +171,6 @@ def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
 
 
 def _running(seconds: np.ndarray) -> np.ndarray:
-    """Return seconds (K,) that continue where a resumed run restarted at zero."""
+    """Return seconds (K,) that increase throughout, although a resumed run restarted them at zero."""
     steps = np.diff(seconds, prepend=0.0)
     return np.cumsum(np.where(steps < 0, seconds, steps))

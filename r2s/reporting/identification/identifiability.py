@@ -1,4 +1,4 @@
-"""The limits of an identification: parameters and combinations that its data do not constrain."""
+"""Report the limits of an identification: parameters and combinations that its data do not constrain."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,7 +6,7 @@ from r2s.identification.link_inertia import LINK
 from r2s.identification.result import SHARPER, IdentificationResult
 from r2s.reporting.document import Item
 
-MOST_LINES = 10  # null directions listed
+MOST_LINES = 10  # most null directions that are listed
 
 
 def identifiability(found: IdentificationResult) -> list[Item]:
@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """Return the combinations that the prior decides; combinations of parameters kept nominal are only counted."""
+    """Return the combinations that the prior determines; those of parameters kept nominal are only counted."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}

@@ -48,16 +48,16 @@ TORQUE = {  # data.torque in words
     "measured": "link-side torque, with gravity",
     "motor": "motor torque, with gravity and all friction",
 }
-FIGURE_WINDOW_S = 0.5  # s, at least: open-loop windows of the position figure
+FIGURE_WINDOW_S = 0.5  # s, shortest open-loop window of the position figure, for long enough motion
 
 
 class Evidence(NamedTuple):
-    """What a page shows besides the result.
+    """Figures and tables of the page that are not part of the result.
 
     Attributes:
         pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, speeds of the validation motion.
-        whiteness: `whiteness_table` of its torque residual. base: `base_table`.
-        window_s: s, of replays. cutoff_hz: of the low-pass.
+        whiteness: `whiteness_table` of the torque residual of that motion. base: output of `base_table`.
+        window_s: length of a replay, s. cutoff_hz: of the low-pass of the torque fit.
     """
 
     pictures: Mapping[str, Path]
@@ -79,12 +79,12 @@ def identification_page(
     cutoff_hz: float,
     more: Mapping[str, Sequence[Item]] | None = None,
 ) -> None:
-    """Write figures, report.md, report.html, base_parameters.csv and recording.rrd, on the validation motion.
+    """Write figures, report.md, report.html, base_parameters.csv, torque.npz and recording.rrd, on validation motion.
 
     Args:
-        run: of the identification. nominal: model before. found: result. validation: held-out motion.
-        summary: summary.json. window_s: of replays. cutoff_hz: of the low-pass.
-        more: further sections {heading: items}, after the prediction errors.
+        run: of the identification. nominal: model before it. found: its result. validation: held-out motion.
+        summary: content of summary.json. window_s: length of a replay, s. cutoff_hz: of the torque fit's low-pass.
+        more: further sections {heading: items}, placed after the prediction errors.
     """
     robot, shown = found.space.robot, spread(validation, SCORED_S, SCORED_EACH_S)
     torque = TorqueResidual(found.space, shown, cutoff_hz=cutoff_hz)

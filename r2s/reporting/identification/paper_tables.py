@@ -27,7 +27,7 @@ BREAKAWAY = "Torque (command plus offset, Nm) at which a resting joint starts to
 
 
 def _listed(rows: Sequence[Value]) -> dict[str, list[str]]:
-    """Return the columns old, new and interval."""
+    """Return the columns "old", "new" and "95 % interval"."""
     return {
         "old": [number(v.old) for v in rows],
         "new": [number(v.old) if v.kept else v.found for v in rows],
@@ -36,7 +36,7 @@ def _listed(rows: Sequence[Value]) -> dict[str, list[str]]:
 
 
 def offset_table(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return Table I."""
+    """Return Table I: torque offsets."""
     if "offset" not in found.space.blocks:
         return ["Offsets were not identified; they keep their nominal values."]
     rows = values(found.space, found.found, "offset", found.unseen)
@@ -44,7 +44,7 @@ def offset_table(robot: Robot, found: IdentificationResult) -> list[Item]:
 
 
 def breakaway_table(robot: Robot, nominal: Dynamics, found: IdentificationResult, commanded: bool) -> list[Item]:
-    """Return Table II."""
+    """Return Table II: breakaway torques, as far as the data show them."""
     d = found.dynamics
     if d.family.held is not None:
         return _presliding(robot, found, d.family.held)
@@ -76,7 +76,7 @@ def breakaway_table(robot: Robot, nominal: Dynamics, found: IdentificationResult
 
 
 def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.ndarray], np.ndarray]) -> list[Item]:
-    """Return Table II of a presliding family: the largest torque that it holds at rest."""
+    """Return Table II of a presliding family: the largest torque against which it keeps a joint at rest."""
     space = found.space
     low, high = np.quantile(held(space.dynamics(found.found.samples).phi), [0.025, 0.975], axis=0)
     old, new = held(space.dynamics(space.start).phi), held(found.dynamics.phi)
@@ -89,7 +89,7 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
 
 
 def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
-    """Return the base parameters, a row per link; each stands under the standard parameter that it begins with."""
+    """Return the base parameters, a row per link; each is in the column of the first parameter that it combines."""
     columns: dict[str, list[str]] = {}
     rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
     for first, row in zip(base["parameter"], rows.tolist(), strict=True):
@@ -103,7 +103,7 @@ def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
 
 
 def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return Table III; with the full parametrisation also mass and centre of mass."""
+    """Return Table III: link tensors and, with the full parametrisation, mass and centre of mass."""
     space, d = found.space, found.dynamics
     full = bool(set(LINK) & set(space.blocks))
     if not full and "inertia_scale" not in space.blocks:
@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return a column of `get`; a cell is identifiable if all parameters of `blocks` that set it are."""
+        """Return a column of `get`; a cell is identifiable if all parameters of the link in `blocks` are."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]
@@ -129,7 +129,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     if full:
         columns = {"mass, kg": cells(lambda x: x.mass, LINK[:1])}
         for k, axis in enumerate("xyz"):
-            # row k of the upper triangular factor: the translation t_k and all after it
+            # by row k of the upper triangular factor, the centre depends on the translation t_k and later ones
             columns[f"centre {axis}, mm"] = cells(partial(_centre, k), LINK[7 + k :])
         words = (
             "Mass and centre of mass in the link's frame, old → new. A value is identifiable (no ?) if all its "
@@ -181,7 +181,7 @@ def friction_table(robot: Robot, nominal: Dynamics, found: IdentificationResult,
 
 
 def other_terms(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return the parameters of the whole arm, and armature, load, drag and gain."""
+    """Return up to two tables: parameters of the whole arm; armature, load, drag and gain per joint."""
     space = found.space
     items: list[Item] = []
     if arm := of_whole_arm(space, found.found, found.unseen):

@@ -1,4 +1,4 @@
-"""An identified payload for people: tables, and the torque of the loaded arm with and without it."""
+"""Report of an identified payload: tables, and the torque of the loaded arm, predicted with and without it."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ FINE = "{:.4g}"
 
 
 def payload_table(found: PayloadEstimate) -> pd.DataFrame:
-    """Return a row per number of the payload: value, 95 % interval, whether the recording determines it."""
+    """Return a row per parameter of the payload: value, 95 % interval, whether the recording determines it."""
     cells = {}
     names = {"mass": ["mass, kg"], "centre": [f"centre {k}, m" for k in "xyz"]}
     names["inertia"] = [f"inertia {k}, kg m²" for k in ELEMENTS]
@@ -28,7 +28,7 @@ def payload_table(found: PayloadEstimate) -> pd.DataFrame:
 
 
 def load_error_table(found: PayloadEstimate) -> pd.DataFrame:
-    """Return the torque RMSE of the loaded recording per joint, without and with the payload."""
+    """Return the torque RMSE per joint on the recording of the loaded arm, without and with the payload."""
     rows = {"without": found.rmse(found.without), "with": found.rmse(found.predicted)}
     cells = {f"{name} payload": [number(x) for x in values] for name, values in rows.items()}
     joints = [f"joint {j + 1}" for j in range(found.measured.shape[1])]
@@ -36,7 +36,7 @@ def load_error_table(found: PayloadEstimate) -> pd.DataFrame:
 
 
 def payload_figure(path: Path, found: PayloadEstimate) -> Path:
-    """Draw the torque of the loaded arm: recorded, and of the identified arm without and with the payload."""
+    """Draw the torque of the loaded arm: recorded, and predicted without and with the payload."""
     rows = found.seen.any(1)
     shown = [np.where(found.seen, x, np.nan)[rows] for x in (found.measured, found.without, found.predicted)]
     lines = {"without payload": shown[1], "with payload": shown[2]}

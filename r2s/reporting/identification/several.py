@@ -13,11 +13,11 @@ CONTRIBUTIONS = (
     "RMSE: torque of the fit to all training recordings, mean over joints; left out: of a fit to the others. The "
     "last column tells what a recording's information adds: how much wider intervals would be without it."
 )
-NARROWER = 1.02  # ratio of two widths from which an interval counts as narrower
+NARROWER = 1.02  # least ratio of two widths for which an interval counts as narrower
 
 
 def contribution_table(parts: Sequence[Contribution], names: Sequence[str]) -> pd.DataFrame:
-    """Return a row per recording: use, torque, seconds, RMSE, RMSE if left out, and what it adds to the widths."""
+    """Return a row per recording: use, torque, seconds, RMSE, RMSE if left out, interval widths without / with it."""
     rows = {}
     for p in parts:
         cells = {"": p.use, "torque": p.torque, "s": number(p.seconds), "RMSE, Nm": number(np.nanmean(p.rmse))}
@@ -36,7 +36,7 @@ def _narrower(p: Contribution, names: Sequence[str]) -> str:
 
 
 def contribution_entry(parts: Sequence[Contribution], names: Sequence[str]) -> dict[str, Any]:
-    """Return the entry of summary.json."""
+    """Return the entry of summary.json about the recordings."""
     out = {}
     for p in parts:
         own: dict[str, Any] = {
@@ -57,7 +57,7 @@ def _listed(x: np.ndarray) -> list[float | None]:
 
 
 def drift_items(table: pd.DataFrame, run: str) -> tuple[str, pd.DataFrame]:
-    """Return a sentence about `drift_table`, and the table for people."""
+    """Return a sentence about a `drift_table`, and the table as strings."""
     changed = table[table["changed"]]
     words = (
         f"Values of {run}, values now, and their difference with its 95 % interval, which counts the errors of both "
@@ -73,6 +73,6 @@ def drift_items(table: pd.DataFrame, run: str) -> tuple[str, pd.DataFrame]:
 
 
 def drift_entry(table: pd.DataFrame, run: str) -> dict[str, Any]:
-    """Return the entry of summary.json."""
+    """Return the entry of summary.json about the drift since `run`."""
     values = table.drop(columns="parameter").to_dict("records")
     return {"since": run, "parameters": dict(zip(table["parameter"], values, strict=True))}

@@ -34,7 +34,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
     if set(LINK) & set(space.blocks):
         tables["links, nominal → identified"] = _links(robot, found)
     dynamics = found.dynamics
-    if np.any(dynamics.breakaway) and not dynamics.family.has_memory:  # presliding families hold a joint themselves
+    if np.any(dynamics.breakaway) and not dynamics.family.has_memory:  # presliding families model rest themselves
         rule = "of the net torque at the joint" if dynamics.stiction_model == "net" else "of command and offset"
         tables[f"breakaway, Nm {rule}"] = _breakaway(robot, found)
     return tables | error_tables(robot, summary)
@@ -43,7 +43,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
 def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
     """Return the heading of a parameter's row and a cell per joint: value, ± half of its interval, nominal value.
 
-    The heading has the nominal value if all joints share it.
+    If all joints share the nominal value, only the heading has it.
     """
     unit = units()[block]
     if unit == "rad":
@@ -66,7 +66,7 @@ def _breakaway(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
 
 
 def _links(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
-    """Return a row per link: mass, shift of its centre, scale of the trace of its inertia."""
+    """Return a row per link: mass, shift of the centre of mass, trace of the inertia relative to nominal."""
     space = identified.space
     before, after, draws = (space.dynamics(x) for x in (space.start, identified.x, identified.found.samples))
 
@@ -115,7 +115,7 @@ def _pair(errors: Mapping, key: str) -> tuple[list[float], ...]:
 
 
 def _before_after(columns: Mapping[str, Sequence[Sequence[float]]], index: pd.Index) -> pd.DataFrame:
-    """Return nominal, identified and their ratio for train and validation."""
+    """Return the columns nominal, identified and ratio, for training and validation motion."""
     table = {}
     for side, (before, after) in columns.items():
         ratios = [a / b if b else np.nan for b, a in zip(before, after, strict=True)]

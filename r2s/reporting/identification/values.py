@@ -12,7 +12,7 @@ from r2s.physics.robot import Robot
 from r2s.reporting.document import KEPT
 from r2s.reporting.tables import number
 
-FIXED = "fixed"  # by identify.prior.PARAMETER.fixed=
+FIXED = "fixed"  # cell of a parameter fixed by identify.prior.PARAMETER.fixed=
 WIDE = f"?: the interval is wider than {2 / SHARPER:g} standard deviations of the prior"
 LEGEND = f"[ ]: 95 % interval; {WIDE}; {KEPT}: the data hardly constrain the value"
 SHORT = f"±: half of the 95 % interval; {WIDE}; kept: nominal, as the data hardly constrain it"
@@ -30,13 +30,13 @@ class Value(NamedTuple):
     fixed: bool = False
 
     def times(self, factor: float) -> "Value":
-        """Return the value in another unit."""
+        """Return the value in another unit: numbers multiplied by `factor`."""
         old, new, low, high = (factor * x for x in self[:4])
         return Value(old, new, low, high, self.identifiable, self.kept, self.fixed)
 
     @property
     def cell(self) -> str:
-        """Cell "old → new" over "[low, high]"."""
+        """Cell with two lines: "old → new" and "[low, high]"."""
         if self.kept or self.fixed:
             return f"{number(self.old)}\n{KEPT if self.kept else FIXED}"
         return f"{number(self.old)} → {self.found}\n{self.interval}"
@@ -48,7 +48,7 @@ class Value(NamedTuple):
 
     @property
     def short(self) -> str:
-        """Cell "new" over "± half of the interval"."""
+        """Cell with two lines: "new" and "± half of the interval"."""
         half = 0.5 * (self.high - self.low)
         if self.kept or self.fixed:
             return f"{number(self.old)}\n{'kept' if self.kept else FIXED}"
@@ -62,7 +62,7 @@ class Value(NamedTuple):
 
 
 def values(space: ParameterSpace, found: ParameterEstimate, block: str, kept: Sequence[str] = ()) -> list[Value]:
-    """Return the values of a block: one per joint or link, or one of the whole arm; `kept` are names kept nominal."""
+    """Return the values of a block, per joint or link or one of the whole arm; kept: names of those kept nominal."""
     marks = (np.isin(space.names, list(names)) for names in (kept, space.fixed))
     parts = (space.start, found.x, found.low, found.high, found.identifiable, *marks)
     return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]

@@ -1,4 +1,4 @@
-"""Tables of a verdict before a fit: the checks, and the widths to expect."""
+"""Tables of the verdict on a recording before the fit: checks, and expected widths of the intervals."""
 
 from typing import Protocol
 
@@ -17,7 +17,7 @@ LEGEND = f"?: wider than {2 / SHARPER:g} standard deviations of the prior; prior
 
 
 class Widths(Protocol):
-    """Expected widths: `ExpectedWidths` of a recording, `PlannedWidths` of a motion; arrays are (P,)."""
+    """Expected interval widths: `ExpectedWidths` of a recording or `PlannedWidths` of a motion; arrays are (P,)."""
 
     @property
     def space(self) -> ParameterSpace: ...  # noqa: D102
@@ -30,13 +30,13 @@ class Widths(Protocol):
 
 
 def verdict_table(verdict: Verdict) -> pd.DataFrame:
-    """Return a row per check: verdict, what was found, what to do."""
+    """Return a row per check: verdict, finding, advice."""
     rows = {x.check: {"": x.verdict, "found": x.found, "advice": x.advice} for x in verdict.lines}
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("check")
 
 
 def width_table(expected: Widths, n: int) -> pd.DataFrame:
-    """Return a row per parameter and a column per joint or link; the first column also has the whole arm's."""
+    """Return a row per parameter and a column per joint or link; the first also has parameters of the whole arm."""
     space, unit, rows = expected.space, units(), {}
     for block in space.blocks:
         parts = (space.block(x, block) for x in (expected.width, expected.share, expected.identifiable))
@@ -51,7 +51,7 @@ def width_table(expected: Widths, n: int) -> pd.DataFrame:
 
 
 def print_verdict(console: Console, robot: Robot, verdict: Verdict, title: str) -> None:
-    """Print both tables."""
+    """Print the checks and, if the verdict has them, the expected widths."""
     print_table(console, verdict_table(verdict), title, sentences=True)
     if verdict.expected is not None:
         print_table(console, width_table(verdict.expected, robot.n), WIDTHS, LEGEND)

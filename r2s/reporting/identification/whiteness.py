@@ -24,7 +24,7 @@ def whiteness_figure(
     """Draw the autocorrelation of torque residuals {label: (T, n) Nm} over t (T,) s.
 
     Args:
-        path: of the PNG. t, error: residuals. cutoff_hz: of the zero-phase low-pass. block_s: bootstrap blocks, s.
+        path: of the PNG. t, error: residuals. cutoff_hz: of the zero-phase low-pass. block_s: s, bootstrap block.
     """
     colour = colours(error)
     lags, white, band = _filtered_white(t, cutoff_hz)
@@ -58,7 +58,7 @@ def whiteness_table(t: np.ndarray, error: np.ndarray, cutoff_hz: float) -> pd.Da
 
 
 def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
-    """Return the autocorrelation (count, n) of x (T, n) at lags of 0, 1, ... rows, never across a pause of t (T,)."""
+    """Return the autocorrelation (count, n) of x (T, n) at lags of 0, 1, ... rows, without pairs across a pause."""
     x = x - x.mean(0)
     edges = [0, *without_pauses(t)[1], len(t)]
     total, pairs = np.zeros((count, x.shape[1])), np.zeros(count)
@@ -72,7 +72,7 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lags (L,) s up to `LAGS_S`, the autocorrelation (L,) of filtered white noise, half its 95 % interval.
+    """Return lags (L,) s up to `LAGS_S`, autocorrelation (L,) of filtered white noise, half of its 95 % band (L,).
 
     The filter is that of `Recording.smooth`. Sigma is Bartlett's for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
     """
@@ -81,7 +81,7 @@ def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.nda
     longest = int(np.diff(edges).max())
     lags = np.arange(max(min(round(LAGS_S / step) + 1, longest // 2), 2))
     _, h = freqz_sos(butter(4, cutoff_hz, fs=1 / SIM_DT, output="sos"), worN=np.arange(8192) / 8192 * np.pi)
-    power = np.abs(h) ** 4  # forwards and backwards, squared
+    power = np.abs(h) ** 4  # power gain of both passes
     white = np.fft.irfft(np.append(power, 0.0))
     white = np.interp(lags * step, SIM_DT * np.arange(len(white) // 2), white[: len(white) // 2] / white[0])
     pairs = np.maximum(np.diff(edges)[:, None] - lags, 0).sum(0)

@@ -1,4 +1,4 @@
-"""Runs each tracker in a thread of its own, so that no tracker can delay or end a run.
+"""Run each tracker in a thread of its own, so that no tracker can delay or end a run.
 
 A tracker that fails prints one warning and gets no more calls.
 """
@@ -15,7 +15,7 @@ from typing import Any
 from r2s.reporting.trackers.tracker import Tracked, Tracker, flat
 
 MOST_WAITING = 10_000  # rows that wait for a slow tracker: some megabytes
-LAST_S = 60.0  # s that the end of a run waits for its trackers
+LAST_S = 60.0  # s that a run waits for each tracker at its end
 FILES = ("recording.rrd", "report.html", "report.md", "parameters.yaml", "policy.onnx", "measures.json")
 
 
@@ -36,7 +36,7 @@ class AsyncTracker:
             self._give_up(f"{MOST_WAITING} rows are waiting")
 
     def join(self, seconds: float) -> None:
-        """Wait for the queued calls."""
+        """Wait for the queued calls, at most `seconds`, then give up."""
         self._thread.join(seconds)
         if self._thread.is_alive():
             self._give_up(f"not finished {seconds:.0f} s after the run")
@@ -57,7 +57,7 @@ class AsyncTracker:
 
 
 class Trackers:
-    """All trackers of a run, with the interface of r2s/runs.py."""
+    """All trackers of a run, with the methods that r2s/runs.py calls."""
 
     def __init__(self, trackers: Mapping[str, Tracker], run: Tracked):
         self._run, self._rows = run, Counter[str]()

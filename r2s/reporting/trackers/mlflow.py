@@ -41,7 +41,7 @@ class Mlflow(LoggerTracker):
     """A run of an MLflow experiment.
 
     Args:
-        uri: of the store, sqlite:///FILE or http://HOST:PORT. experiment: of the run.
+        uri: of the store, sqlite:///FILE or http://HOST:PORT. experiment: name of the experiment.
     """
 
     def __init__(self, uri: str, experiment: str = "r2s"):

@@ -10,7 +10,7 @@ from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Tensorboard(LoggerTracker):
-    """Scalars, settings and figures; other files are listed as text, because event files hold none."""
+    """A run as scalars, settings and figures; other files are only listed, because event files cannot store files."""
 
     def __init__(self) -> None:
         optional_import("tensorboard", "tracker=tensorboard", "trackers")
@@ -32,7 +32,7 @@ class Tensorboard(LoggerTracker):
             self._begins = False
             self._settings()
         super().log(table, numbers, step)
-        self._logger.flush()  # without it a killed run loses two minutes
+        self._logger.flush()  # otherwise a killed run loses two minutes of rows
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
         """Show the figures and list the files."""
@@ -48,7 +48,7 @@ class Tensorboard(LoggerTracker):
         self._logger.shutdown()
 
     def _settings(self) -> None:
-        """Write the settings with the measure that runs are compared by; add_hparams would begin another run."""
+        """Write the settings and the measure by which runs are compared; add_hparams would begin another run."""
         from torch.utils.tensorboard.summary import hparams
 
         metric = {f"summary/best/{self._run.measures.selection[0]}": 0}
@@ -56,7 +56,7 @@ class Tensorboard(LoggerTracker):
             self._logger.experiment.file_writer.add_summary(summary)
 
     def _hide_from(self, step: int) -> None:
-        """Hide the rows of the stopped run from this step on, which the resumed run writes again."""
+        """Hide the rows of the stopped run from this step on, because the resumed run writes them again."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         begin = Event(step=step, session_log=SessionLog(status=SessionLog.START))

@@ -1,4 +1,4 @@
-"""The tracker interface and the run that it shows. Your own tracker is such a class and a file of conf/tracker."""
+"""The tracker interface. A tracker of your own is a class with this interface and a file in conf/tracker."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,11 +17,11 @@ WRITING = Lock()  # trackers run in threads of their own and share FILE
 
 @dataclass(frozen=True)
 class Tracked:
-    """A run, for its trackers.
+    """A run that trackers show.
 
     Attributes:
         folder: runs/<stage>/<name>. stage: of the run. group: the sweep that it belongs to, or None.
-        config: composed config as dicts. meta: meta.json: git commit, versions, machine.
+        config: composed config as dicts. meta: content of meta.json: git commit, versions, machine.
         resumed: whether the run continues a stopped one.
     """
 
@@ -34,7 +34,7 @@ class Tracked:
 
     @property
     def name(self) -> str:
-        """<stage>/<name>, unique in a root."""
+        """<stage>/<name>, unique below the folder of all runs."""
         return f"{self.stage}/{self.folder.name}"
 
     @property
@@ -46,7 +46,7 @@ class Tracked:
 
     @property
     def measures(self) -> MeasureTable:
-        """The measures of the run's task; a training and a transfer write them before their first row."""
+        """The measures of the run's task; trainings and transfers write them to the folder before their first row."""
         return measures_of(self.folder)
 
     def kept(self, key: str) -> str | None:
@@ -62,9 +62,9 @@ class Tracked:
 
 
 class Tracker(Protocol):
-    """Show a run in another tool. Hydra makes it before the run folder exists; one thread makes all calls in order.
+    """Shows a run in another tool. Hydra creates it before the run folder. One thread makes all calls, in order.
 
-    An exception ends the tracker with one warning; the run continues.
+    After an exception the tracker gets no more calls; the run prints one warning and continues.
     """
 
     def start(self, run: Tracked) -> None:
@@ -77,7 +77,7 @@ class Tracker(Protocol):
         """Show the numbers of summary.json, {"best/success_1cm": 0.93, ...}."""
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
-        """Store figures (PNG) and other files, and end the run as done, stopped or failed."""
+        """Store figures (PNG) and other files, and end the run with this status: done, stopped or failed."""
 
 
 class LoggerTracker:

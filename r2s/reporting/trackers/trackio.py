@@ -14,7 +14,7 @@ class Trackio:
     """A run in a Trackio project.
 
     Args:
-        folder: of the databases, one per project; the environment variable TRACKIO_DIR overrides it.
+        folder: contains the databases, one per project; the environment variable TRACKIO_DIR overrides it.
         project: name of the project.
     """
 

@@ -15,7 +15,7 @@ class Wandb(LoggerTracker):
     """A run in a W&B project.
 
     Args:
-        project, entity: names in W&B; None is your own entity. offline: store the run on this computer only.
+        project, entity: names in W&B; entity None: your own. offline: store the run on this computer only.
     """
 
     def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):

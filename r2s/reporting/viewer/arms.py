@@ -1,4 +1,4 @@
-"""Arms of a recording: links, goals, the end effector's trail, error and torque plots."""
+"""Log arms in a rerun recording: links, goals, the end effector's trail, error and torque plots."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -18,11 +18,11 @@ FRAMES_HZ = 50.0
 TRAIL_EVERY = 3  # frames per point of a trail
 GOAL_RADIUS = 0.025  # m, the paper's success distance of 5 cm as a diameter
 GOAL = "#ff5252"
-WORST_M = 0.01  # m, error of a path from which its trail is red
+WORST_M = 0.01  # m, the trail on a path is red from this error on
 
 
 class _Arm(NamedTuple):
-    """An arm of the recording; `frames` are the rows of each episode that are logged."""
+    """An arm in the rerun recording; `frames` are the rows of each episode that are logged."""
 
     stream: rr.RecordingStream
     base: str
@@ -38,7 +38,7 @@ class _Arm(NamedTuple):
         return [start + e.t[f] - e.t[0] for start, e, f in parts]
 
     def send(self, name: str, style: rr.AsComponents, columns: Any, per_episode: bool) -> None:
-        """Send what changes at every logged row, or once per episode."""
+        """Log `columns`, which change at every logged row or, if `per_episode`, once per episode."""
         times = self.starts[: len(self.episodes)] if per_episode else np.concatenate(self.clocks())
         path = f"{self.base}/{name}"
         self.stream.log(path, style, static=True)
@@ -48,7 +48,7 @@ class _Arm(NamedTuple):
 def log_arms(
     stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Sequence[Episode]], error: Measure
 ) -> None:
-    """Log an arm per label side by side; `error` names and scales the distance plot."""
+    """Log an arm per label side by side; `error` sets the scale of the distance plot."""
     stream.log("arms", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     model, palette, starts = robot.model(gravity=False), colours(episodes), starts_of(episodes)
     for i, (label, sequence) in enumerate(episodes.items()):
@@ -168,7 +168,7 @@ def _link(base: str, model: mujoco.MjModel, body: int) -> str:
 
 
 def _height(model: mujoco.MjModel) -> float:
-    """Return the height of the arm's label above the base, m: clear of the arm."""
+    """Return a height above the base, m, at which the label is clear of the arm."""
     return 0.85 * float(np.linalg.norm(model.body_pos[1:], axis=1).sum())
 
 

@@ -1,4 +1,4 @@
-"""Content of a recording: episodes, torques, learning curves, figures."""
+"""Content of a rerun recording: episodes, torques, learning curves, figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from r2s.tasks.measures import Measure, MeasureTable
 if TYPE_CHECKING:
     from r2s.tasks.rollout import Episodes  # imports torch, which an identification does not need
 
-SHOWN = 4  # episodes of a recording or figure, as in the paper's
+SHOWN = 4  # episodes in a rerun recording or figure, as in the paper's figures
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Episode:
     """One episode of one arm; positions are in the arm's base frame.
 
     Attributes:
-        t: (T,) s. q: (T, n) rad. ee: (T, 3) m. goal: (3,) m, or (T, 3) of a path. tau: (T, n) Nm, commanded.
-        box: (T, 11) of `Task.boxes`, a box that the arm pushes; None: without.
+        t: (T,) s. q: (T, n) rad. ee: (T, 3) m. goal: (3,) m, or a path (T, 3) m. tau: (T, n) Nm, commanded.
+        box: (T, 11), the box that the arm pushes, see `Task.boxes`; None: no box.
     """
 
     t: np.ndarray
@@ -40,7 +40,7 @@ class Episode:
 
     @property
     def distance(self) -> np.ndarray:
-        """(T,) m from the end effector, or from the box, to the goal, or to the path's current point."""
+        """Distance (T,) m of the end effector, or of a pushed box, from the goal or the path's current point."""
         return np.linalg.norm((self.ee if self.box is None else self.box[:, :3]) - self.goal, axis=-1)
 
     @property
@@ -59,21 +59,21 @@ class Overlay:
 
     @classmethod
     def load(cls, run: Path) -> "Overlay":
-        """Return what stage=identify saved as torque.npz of its run folder."""
+        """Return the torque that stage=identify saved in its run folder as torque.npz."""
         with np.load(run / "torque.npz", allow_pickle=False) as saved:
             return cls(saved["t"], saved["measured"], {k: saved[k] for k in ("nominal", "identified")})
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a recording shows; the layout has tabs for the given parts only.
+    """Content of a rerun recording; its layout has tabs only for the parts that are given.
 
     Attributes:
         measures: of the task, for `episodes` and `curves`.
-        episodes: {label: episodes}, one arm per label; all k-th episodes start together.
-        overlays: {label: Overlay}, a tab of torque plots each.
+        episodes: {label: episodes}, one arm per label; the k-th episodes of all arms start together.
+        overlays: {label: Overlay}; each gets a tab of torque plots.
         curves: {run: evaluations.csv}, which share a tab.
-        figures: {name: PNG}, a tab each; "learning" joins the tab of the curves.
+        figures: {name: PNG}; each gets a tab, but "learning" is in the tab of the curves.
         torque: (n,) Nm, limits drawn beside the commanded torque.
     """
 
@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """Measures of the learning figure and of comparisons that some run has."""
+        """Measures of the learning figure and of comparisons that at least one run has."""
         table = self.measures
         if table is None:
             return []
@@ -95,7 +95,7 @@ class Content:
 
 
 def external_overlay(r: Recording) -> dict[str, Overlay]:
-    """Return {label: external torque, and 1 where the arm reported contact}; empty without an external torque."""
+    """Return {label: external torque, and 1 where the arm reported contact}; empty without external torque."""
     torque = r.signals.get("tau_ext_hat_filtered")
     if torque is None or not torque.any():
         return {}

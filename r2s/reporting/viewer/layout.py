@@ -1,4 +1,4 @@
-"""Layout and lines of a recording: a tab of arms, one of learning curves, one per torque overlay and per figure."""
+"""Layout and lines of a rerun recording: tabs of arms, of learning curves, of each torque overlay and figure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -14,7 +14,7 @@ from r2s.tasks.measures import Measure, MeasureTable
 PAUSE = 0.5  # s between two episodes
 SPACING = 0.95  # m between two arms: beyond a Panda's reach of 0.855 m
 LEARNING = "learning"
-OVERLAY_OPENS = 15.0  # s of an overlay in view at first: more is a solid band
+OVERLAY_OPENS = 15.0  # s of an overlay that are shown at first; more would look like a solid band
 LINE = 1.6  # points, width of a line
 
 
@@ -24,7 +24,7 @@ def entity(*parts: str) -> str:
 
 
 def rgb(colour: str) -> np.ndarray:
-    """Return (3,) from "#rrggbb"."""
+    """Return red, green and blue (3,), 0 to 255, of "#rrggbb"."""
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
 
 
@@ -43,14 +43,14 @@ def log_series(
 
 
 def starts_of(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
-    """(K + 1,) s on the timeline: starts of the k-th episodes, and the end of the last."""
+    """Return (K + 1,) s: the start of every k-th episode on the timeline, and the end of the last one."""
     count = max((len(sequence) for sequence in episodes.values()), default=0)
     longest = [max(s[k].duration for s in episodes.values() if k < len(s)) + PAUSE for k in range(count)]
     return np.concatenate([[0.0], np.cumsum(longest)])
 
 
 def blueprint(robot: Robot, content: Content) -> rrb.Blueprint:
-    """Return the tabs of a recording."""
+    """Return the layout of a rerun recording: its tabs and its time panel."""
     joints = [f"joint {j + 1}" for j in range(robot.n)]
     episodes, overlays, figures = content.episodes, content.overlays, content.figures
     tabs: list[rrb.View | rrb.Container] = []
@@ -84,14 +84,14 @@ def _picture(name: str, title: str) -> rrb.View:
 
 
 def _learning_tab(curves: Iterable[Measure], pictured: bool) -> rrb.Container:
-    """Return the figure, if any, before the plots, which are empty on the timeline `time`."""
+    """Return a tab with the figure, if any, and the plots; on the timeline `time` the plots are empty."""
     plots = _plots({m.heading: entity(LEARNING, m.title) for m in curves}, rrb.Corner2D.RightBottom)
     live = rrb.Grid(*plots, grid_columns=3, name="plots: select the timeline env_steps or wall_clock below")
     return rrb.Tabs(*[_picture(LEARNING, "figure")] * pictured, live, active_tab=0, name="learning")
 
 
 def _arms_tab(count: int, joints: Sequence[str], seconds: float, measures: MeasureTable) -> rrb.Container:
-    """Return the 3D view beside its plots; with four arms or more, above them."""
+    """Return a tab with the 3D view beside the plots or, with four arms or more, above them."""
     width = SPACING * count
     away = 0.3 + 0.4 * width if count > 3 else max(1.5, 0.4 + 0.85 * width)
     eye = rrb.EyeControls3D(position=[away, -0.2 * away, 0.5 + 0.3 * away], look_target=[0.15, 0, 0.48])
@@ -109,7 +109,7 @@ def _arms_tab(count: int, joints: Sequence[str], seconds: float, measures: Measu
 def _plots(
     origins: Mapping[str, str], corner: rrb.Corner2D = rrb.Corner2D.RightTop, until: float | None = None
 ) -> list[rrb.View]:
-    """Return a plot per {title: origin}, the first with the legend."""
+    """Return a plot per {title: origin}; the first has the legend."""
     corners = [corner, *[None] * len(origins)]
     return [_plot(*origin, legend, until=until) for origin, legend in zip(origins.items(), corners, strict=False)]
 
@@ -122,7 +122,7 @@ def _plot(
     y: tuple[float, float] | None = None,
     until: float | None = None,
 ) -> rrb.View:
-    """Return a plot that opens on the first `until` seconds, without it on the whole timeline."""
+    """Return a plot that opens on the first `until` seconds, or on the whole timeline if `until` is None."""
     edge = rrb.TimeRangeBoundary
     ends = (edge.infinite(), edge.infinite())
     if until is not None:

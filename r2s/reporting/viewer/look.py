@@ -1,4 +1,4 @@
-"""`r2s look`: one run's recording.rrd, or several runs in one recording."""
+"""`r2s look`: show the recording.rrd of one run, or several runs in one rerun recording."""
 
 import os
 import re
@@ -28,10 +28,10 @@ LOOPBACK = "127.0.0.1"
 def side_by_side(folder: Path, robot: Robot, runs: Mapping[str, Path]) -> list[Path]:
     """Write the episodes, torques and learning curves of {label: run folder} into one recording.rrd in `folder`.
 
-    Learning curves and episodes are shown by the measures of the first run that has any.
+    The measures of the first run with learning curves or episodes apply to all runs.
 
     Returns:
-        PNGs of the same.
+        Pictures (PNG) of the same data.
 
     Raises:
         UserError: no run has anything to show.
@@ -59,7 +59,7 @@ def side_by_side(folder: Path, robot: Robot, runs: Mapping[str, Path]) -> list[P
 
 
 def has_screen() -> bool:
-    """Return whether a window can be opened here."""
+    """Return whether this computer can open a window."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
