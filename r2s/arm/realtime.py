@@ -88,7 +88,7 @@ class Timing:
         policy: time from a state to the policy's command, once per control step. driver: time to compute one command.
         adapter: time of one update of the adapter, if there is one. period: time from one command to the next.
         robot: time from one state to the next by the arm's clock; above 1 ms if cycles were lost.
-        success: the arm's report of the share of its last 100 commands in time, from a motion's 100th cycle on.
+        success: reported share of the last 100 commands that arrived in time, from a motion's 100th cycle on.
     """
 
     policy: list[float] = field(default_factory=list)

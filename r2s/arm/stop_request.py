@@ -69,7 +69,7 @@ def parent_ended(parent: int) -> Callable[[], str | None]:
 
 
 def pipeline() -> int | None:
-    """Return the pid in PARENT, or None; child processes inherit the variable, but this pid is not their parent's."""
+    """Return the pid in PARENT, or None. Child processes inherit PARENT, but it is not the pid of their parent."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 

@@ -255,7 +255,7 @@ class Candidates:
     def _shrink(
         self, a: np.ndarray, moved: Callable[[np.ndarray], Samples], by: float, margin: float, least: float
     ) -> np.ndarray | None:
-        """Return a, reduced until `_safety` reaches `margin`; None if a joint would fall below `least`.
+        """Return shares a, reduced until `_safety` reaches `margin`; None if one falls below `least`.
 
         Each round reduces the joint with the largest effect at the least safe sample.
         """

@@ -260,7 +260,7 @@ class Space:
         return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
-        """Raise UserError at the first posture of q (T, n) that is too near; `when(k)` describes row k."""
+        """Raise UserError at the first row of q (T, n) with a gap below 0; `when(k)` describes row k."""
         gaps = self.gaps(q)
         bad = np.argwhere(~(gaps >= 0))
         if len(bad):

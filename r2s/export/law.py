@@ -1,6 +1,6 @@
 """Driver and safety filter in NumPy for the arm of a contract; the original is r2s/physics/safety_filter.py.
 
-This module needs nothing of r2s. `r2s export` joins it and others with runtime.py to r2s_runtime.py of a bundle.
+This module needs nothing of r2s. `r2s export` merges it, others and runtime.py into a bundle's r2s_runtime.py.
 """
 
 from collections.abc import Sequence

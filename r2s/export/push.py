@@ -24,7 +24,7 @@ class PushLimit:
     """The push limit of one arm. Call in every cycle `see`, then `stop` while the arm is being stopped, then `limit`.
 
     Args:
-        law: of a contract. model: of the arm; the caller moves it to the joint angles of every cycle.
+        law: of a contract. model: of the arm; the caller sets its joint angles in every cycle.
     """
 
     def __init__(self, law: dict[str, Any], model: Model):

@@ -87,7 +87,7 @@ class IdentificationResult:
 
     @property
     def saved(self) -> tuple[ParameterSpace, ParameterEstimate]:
-        """Space and estimate for parameters.yaml; breakaway torques from ramps are added as blocks of their own.
+        """Parameter space and estimate for parameters.yaml, including the breakaway torques from ramps, if any.
 
         Their interval combines Student's t (friction/repeatability.py) with the uncertainty of the offset. If no ramp
         released a joint, its breakaway torque lies between the largest torque without motion and the bound. It is

@@ -1,4 +1,4 @@
-"""Columns of a contact and of a guess, which contact.py and sliding.py share, and how a surface fills them."""
+"""Columns of the arrays `contact` and `guess` in contact.py and sliding.py; `contact` from a surface."""
 
 import numpy as np
 

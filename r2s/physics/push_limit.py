@@ -5,7 +5,7 @@ mass m = 1 / (J M^-1 J^T) in this direction (Khatib, IEEE J. Robotics and Automa
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
-with the push P of the command, the contact force F >= 0 and the push P_f of joint friction, at most `hidden` =
+P: push of the command; F >= 0: contact force; P_f: push of joint friction, |P_f| <= `hidden` =
 m |J M^-1| friction. Every millisecond the limit enforces
 
 1. P + hidden <= force_max,
@@ -231,7 +231,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit the torques `out` (n,) Nm by joint acceleration, with the contact force as a load, and by push.
+    """Limit the push of torques `out` (n,) Nm, and joint accelerations with the contact force as a load.
 
     Args as for `push_bound`, and share and limits as for `filter_torque`. Returns whether `out` changed.
     """

@@ -34,7 +34,7 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
     """Return the best value (K,) of trials that run one after another, after `at` (K,) s of compute.
 
-    A trial counts from its end; a nan (pruned, failed) only spends compute. sign: 1 if larger is better, else -1.
+    A value counts at its trial's end; nan (pruned, failed) only costs time. sign: 1 if larger is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))

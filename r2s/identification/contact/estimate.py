@@ -117,7 +117,7 @@ def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.
 
 
 def _check(problem: ContactProblem, u: np.ndarray) -> None:
-    """Raise UserError if joints hardly slide during contact, or the stiffness is at a bound."""
+    """Raise UserError if joints move too briefly in contact, or the stiffness is at a bound."""
     rows = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum()
     if (touched := problem.torque.row_s * rows) < LEAST_S:
         raise UserError(

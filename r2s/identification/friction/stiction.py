@@ -73,8 +73,8 @@ def scan_breakaway(
 ) -> np.ndarray:
     """Return the breakaway torques (n, 2) Nm that replay the recording best; other values are those of `dynamics`.
 
-    The error jumps when a joint is released one step sooner, hence the scan. One batch tries values for all torques,
-    each judged by the error of its joint: first over [0, largest], (n,) Nm, then ever finer about the best value. The
+    The error jumps when a joint is released one step sooner, hence the scan. Each pass varies every torque alone
+    and minimizes the error of its joint: first over [0, largest], (n,) Nm, then ever finer about the best value. The
     coarse scan runs twice, because wrong torques of other joints disturb the first pass.
     """
     space = parameter_space(

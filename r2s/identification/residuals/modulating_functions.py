@@ -66,7 +66,7 @@ class SlidingMotion:
         slid: float = 0.0,
         presliding_rad: np.ndarray | float = PRESLIDING,
     ) -> "SlidingMotion":
-        """Find windows, centred at moments at `rate_hz`, in which a joint is faster than `slowest` rad/s.
+        """Find windows, centred every 1 / `rate_hz` s, in which a joint is faster than `slowest` rad/s.
 
         For a friction law with memory (`slid` > 0), a window starts only after the joint has slid `slid` rad since
         its reversal, because bristles bend first, over `presliding_rad`, one distance or (n,). The velocity must also
