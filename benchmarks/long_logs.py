@@ -5,6 +5,7 @@ three joints, 1, 4, 15 and 60 minutes, and identifies each by the command line: 
 of the process. Writes benchmarks/results/long_logs.md and long_logs.png.
 """
 
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -39,8 +40,9 @@ CHUNK = 60_000  # rows written at once
 COARSE_S = 0.01  # s between the moments at which rigid-body torque is computed
 
 
-def write_log(robot, torque: str, minutes: float, path: Path) -> None:
+def write_log(arm: Path, torque: str, minutes: float, path: Path) -> None:
     """Write a recording of inverse dynamics along a sum of six sines per joint that does not repeat."""
+    robot = load_robot(str(arm), ddq_max=15.0)
     rng, rows = np.random.default_rng(0), round(60_000 * minutes)
     inertia = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
     w = 2 * np.pi * rng.uniform(0.03, 0.4, (6, 3))
@@ -103,10 +105,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         arm, log = Path(folder) / "arm.xml", Path(folder) / "log.npz"
         arm.write_text(ARM)
-        robot = load_robot(str(arm), ddq_max=15.0)
         for torque in kinds:
             for minutes in lengths:
-                write_log(robot, torque, minutes, log)
+                # in a process of its own: a child's largest memory begins with its parent's
+                writer = multiprocessing.get_context("spawn").Process(
+                    target=write_log, args=(arm, torque, minutes, log)
+                )
+                writer.start()
+                writer.join()
                 seconds, memory = identified(arm, torque, log)
                 rows.append({"torque": torque, "minutes": minutes, "s": round(seconds), "MB": round(memory)})
                 print(rows[-1], flush=True)
