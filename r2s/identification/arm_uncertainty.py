@@ -51,6 +51,8 @@ def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 
 def sliding_sign(torque: TorqueResidual) -> np.ndarray:
     """Return the sign of friction (F, n) at the instants of a residual's motion; it is smooth if joints may rest."""
+    if torque.space.nominal.family.has_memory:
+        return torque.motion.bristle
     dq = torque.motion.friction_dq
     return np.sign(dq) if isinstance(torque.motion, SlidingMotion) else np.tanh(dq / WIDTH_DQ)
 

@@ -121,7 +121,7 @@ class _Messages:
         ]
 
     def wrenches(self, wrench: np.ndarray, ns: np.ndarray) -> list[Message]:
-        """Return the wrench (T, 6) N and Nm on the arm, in axes of the base (libfranka, `O_F_ext_hat_K`)."""
+        """Return the wrench (T, 6) N and Nm that the arm exerts, in axes of the base: libfranka's `O_F_ext_hat_K`."""
         of, stamped = (self._types[f"geometry_msgs/msg/{kind}"] for kind in ("Wrench", "WrenchStamped"))
         return [
             (at, "/external_wrench", stamped(self._header(at), of(force=self._xyz(x[:3]), torque=self._xyz(x[3:]))))
