@@ -8,6 +8,7 @@ import pytest
 import torch
 from conftest import conf
 from test_cli import r2s, succeed
+from test_trust import composed
 
 from r2s.control.torque import torque
 from r2s.errors import UserError
@@ -15,8 +16,10 @@ from r2s.learning.evaluate import fixed_draws, fixed_episodes, make_evaluation
 from r2s.learning.model_based import hybrid_force
 from r2s.learning.randomization import ContactRandomization
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
+from r2s.physics.friction import COULOMB
 from r2s.physics.robot import load_robot
 from r2s.physics.tip import Tip, default_plane
+from r2s.stages.build import make_dynamics
 from r2s.tasks.press import PressTask
 from r2s.tasks.surface_task import FORCES, NORMAL, POINT
 from r2s.tasks.task import Episodes, State, observation_scale, observe
@@ -79,6 +82,24 @@ def test_the_reference_on_the_true_model_ends_within_a_newton(stiffness):
     assert row["force_rmse_first_N"] < 1.0
     assert row["force_rmse_last_N"] < 1.0
     assert row["contact"] > 0.98  # the first touch of the most rigid one may bounce
+
+
+def test_joints_at_rest_hold_the_force_of_a_contact():
+    """Eq. (6) is replaced where a task touches: with it a resting joint yields, and friction feedforward is force."""
+    phi = np.array([1.0, 0.0, 0.1]) * np.linspace(1.0, 0.4, N)[:, None]
+    edges = np.linspace(1.0, 0.4, N)[:, None] * np.array([-1.0, 1.0])
+    eq6 = replace(Dynamics.of(PANDA, phi, COULOMB), breakaway=edges)
+    errors = []
+    for model in (eq6, eq6.holding_contact()):
+        draw = ContactRandomization(PANDA, model, **DR_CONF | {"phi_relative": 0.0, "inertia_relative": 0.0})
+        task = PressTask(**TASK_CONF).with_model(PANDA, model)
+        evaluate = make_evaluation(PANDA, task, draw, episodes=4, nthread=1)
+        errors.append(task.measures(evaluate(hybrid_force(PANDA, task, model)))["force_rmse_last_N"])
+    assert errors[1] < 1.0 < errors[0]
+    for name, stiction in (("press", "net"), ("reach", "command")):
+        cfg = composed(f"task={name}", "friction.family=coulomb", "friction.stiction_model=command")
+        assert make_dynamics(cfg, PANDA).stiction_model == stiction
+    assert TRUE.holding_contact() is TRUE  # the paper's friction has no jump at rest
 
 
 def test_a_seed_gives_the_same_forces():

@@ -1,4 +1,4 @@
-"""Dynamics of an arm: friction, offsets, breakaway, links, rotors, delay and lag."""
+"""Dynamics parameters of an arm: friction, offsets, breakaway, links, rotors, delay and lag."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,39 +13,40 @@ from r2s.physics.robot import Robot, per_joint
 from r2s.physics.surface import Surface
 
 STICTION_MODELS = ("command", "net")
-PHI1 = 0.02  # of tau_max, `phi1` (twice the Coulomb torque) of a joint whose friction is not declared
-MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: beyond the friction parameters of any arm
+CREEP = 2e-3  # rad/s, dq_min of "net": above the speed that a stop leaves after 1 ms, below any motion
+PHI1 = 0.02  # share of tau_max: `phi1` (twice the Coulomb torque) of a joint without declared friction
+MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: largest allowed friction parameter, above that of any arm
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Dynamics that identification estimates and domain randomization draws; each field with any batch shape.
+    """Parameters that identification estimates and domain randomization draws; arrays may have batch axes.
 
     Attributes:
         phi: (..., n, K) parameters of `family`; Nm, s/rad, rad/s for eq. (5) of the paper.
         offset: (..., n) Nm, added to every command.
-        breakaway: (..., n, 2) Nm, negative and positive edge of stiction.
-        dq_min: rad/s, a slower joint can stick.
+        breakaway: (..., n, 2) Nm, negative and positive breakaway torque, the edges of stiction.
+        dq_min: rad/s, speed below which a joint can stick.
         mass: (..., n) kg, com: (..., n, 3) m, link frame.
         inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
         armature: (..., n) kg m^2, rotor inertia reflected to the joint; not visible to a link-side torque sensor.
-        load: (..., n) friction torque per gravity torque at the joint.
-        drag: (..., n, 2) Nm, coefficients of an offset in sin q and cos q of the joint, such as a cable's.
-        gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; a property of
-            the recording, not of the arm's motion.
-        signal_delay: (...) s, by which measured or motor torque is later than the angles, in the recording.
-        late_alike: whether measured torque and logged dq count as equally late, so that dq is used as logged; a
-            property of the recording.
+        load: (..., n) Nm/Nm, load-dependent friction per gravity torque at the joint.
+        drag: (..., n, 2) Nm, coefficients of sin q and cos q in an angle-dependent offset, such as a cable's torque.
+        gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; it
+            describes a recording, not the arm's motion.
+        signal_delay: (...) s, time by which a recording's torque (measured or motor) is later than its angles.
+        late_alike: whether a recording's measured torque and dq are treated as equally late, so that dq is used as
+            logged.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: the friction law.
-        stiction_model: the torque that the breakaway edges limit. "command" is eq. (6) of the paper: command and
+        stiction_model: the torque compared with the breakaway edges. "command", eq. (6) of the paper: command and
             offset have no effect within the edges. "net": a joint sticks while the sum of all torques on it, with the
             coupling to other joints, lies within the edges (r2s/physics/stick_slip.py).
         delay, lag: (...) s, pure delay and first-order lag of the actuation. `Simulator` applies them only if it runs
             the safety filter; otherwise `Motors` (r2s/physics/actuation.py) does.
         declared_payload: (..., 4) kg and kg m, mass and first moment, in the last link's frame, of the payload
             declared to gravity compensation (r2s/physics/payload.py); the real payload is part of the last link.
-        surface: what `Robot.tool` may touch (r2s/physics/contact.py), each field with any batch shape; None: nothing.
+        surface: the surface that `Robot.tool` may touch (r2s/physics/contact.py), maybe a batch; None: no surface.
     """
 
     phi: np.ndarray
@@ -76,7 +77,7 @@ class Dynamics:
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
-        """Return dynamics of nominal links and rotors with friction phi (..., n, K) of a family; all else is zero."""
+        """Return dynamics with nominal links and rotors and friction phi (..., n, K) of a family; the rest is 0."""
         n = robot.n
         return Dynamics(
             phi=phi,
@@ -93,6 +94,15 @@ class Dynamics:
             speed_noise=np.zeros(n),
             family=family,
         )
+
+    def holding_contact(self) -> "Dynamics":
+        """Return the dynamics with stiction_model="net" if friction has a jump at rest.
+
+        Eq. (6) compares the command alone with the breakaway edges, so a joint at rest yields to any contact force.
+        """
+        if self.family.sharp is None:
+            return self
+        return replace(self, stiction_model="net", dq_min=min(self.dq_min, CREEP))
 
     def friction(self, dq: np.ndarray, bristle: np.ndarray | None = None) -> np.ndarray:
         """Return the load-independent friction (..., n) Nm at dq (..., n) rad/s; `bristle`: see Family.torque."""
@@ -131,12 +141,12 @@ def nominal_dynamics(
     stiction_model: str = "command",
     inertia_scale: Sequence[float] | float = 1.0,
 ) -> Dynamics:
-    """Return the dynamics of `conf/friction` and `conf/inertia`; a value per joint, or one for all.
+    """Return the dynamics that `conf/friction` and `conf/inertia` describe; values: one per joint, or one for all.
 
-    A family other than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" starts with the sigmoid. With
-    phi1=None, the file's frictionloss and damping are Coulomb and viscous friction, "auto" starts with this law, and
-    a joint for which the file has neither gets a phi1 of PHI1 times its torque limit. A breakaway torque of None is
-    the file's frictionloss.
+    phi1, phi2 and phi3 describe a sigmoid; another family gets the sigmoid's friction at 1 rad/s, and "auto" starts
+    with the sigmoid. With phi1=None, frictionloss and damping of the robot's file are Coulomb and viscous friction,
+    and "auto" starts with this law; a joint without both gets a phi1 of PHI1 times its torque limit. A breakaway
+    torque of None is replaced by the file's frictionloss.
 
     Raises:
         UserError: a list of the wrong length, or a value out of its physical range.

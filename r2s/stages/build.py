@@ -14,17 +14,17 @@ from r2s.errors import FAILED, Stopped, UserError, check_number, choices, instea
 from r2s.stages.parts import called, check_types, part, plain, target
 from r2s.stages.run_config import CONF, modules
 
-DRIVE_KEYS = ("soft_start_s", "live")  # keys of conf/arm that the policy runner reads, not the arm
+DRIVE_KEYS = ("soft_start_s", "live")  # keys of conf/arm for the policy runner; the arm's class does not take them
 STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "estimate", "excite", "results")
 COMMON = (
     *("stage", "root", "name", "skip_completed", "resume", "experiment", "grid", "seed", "threads", "tracker"),
     "trust",
 )
-GROUP = "R2S_GROUP"  # environment variable: name of the group of a sweep's jobs in trackers
+GROUP = "R2S_GROUP"  # environment variable: name under which trackers group the jobs of a sweep
 
 
 def unread(name: str, cfg: Any) -> str | None:
-    """Return why the stage of `cfg` does not read the key or group `name`, or None if it reads it."""
+    """Return the reason why the stage of `cfg` does not read the option `name`; None if the stage reads it."""
     from importlib import import_module
 
     stage = import_module(f"r2s.stages.{cfg.stage}")
@@ -40,7 +40,7 @@ def unread(name: str, cfg: Any) -> str | None:
 
 
 def make_robot(cfg):
-    """Return the arm of conf/robot."""
+    """Return the robot that conf/robot describes."""
     from r2s.physics.robot import OF_TASKS
 
     for key in OF_TASKS:
@@ -55,18 +55,23 @@ def make_robot(cfg):
 
 
 def make_dynamics(cfg, robot):
-    """Return the dynamics of conf/friction and conf/inertia, or the identified ones of `calibration=`."""
+    """Return the dynamics of conf/friction and conf/inertia, or the identified ones of `calibration=`.
+
+    Under a task that touches a surface, joints at rest hold contact forces, see `Dynamics.holding_contact`.
+    """
     from r2s.identification.parameter_file import load_parameters
 
     if cfg.calibration:
         typed = str(cfg.friction.get("family") or "").split(".")[0]
         space, x = load_parameters(cfg.calibration, robot, (*modules(cfg.get("trust")), typed))
-        return space.dynamics(x)
-    return dynamics_of(robot, plain(cfg.friction), plain(cfg.inertia))
+        dynamics = space.dynamics(x)
+    else:
+        dynamics = dynamics_of(robot, plain(cfg.friction), plain(cfg.inertia))
+    return dynamics.holding_contact() if getattr(target(cfg.task, "task"), "touches", False) else dynamics
 
 
 def dynamics_of(robot, friction, inertia):
-    """Return the dynamics from the settings of a file of conf/friction and a file of conf/inertia."""
+    """Return the dynamics from the contents of a file in conf/friction and a file in conf/inertia."""
     from r2s.physics.dynamics import nominal_dynamics
 
     for group, settings in (("friction", friction), ("inertia", inertia)):
@@ -79,9 +84,9 @@ def dynamics_of(robot, friction, inertia):
 
 
 def make_task(cfg, robot, dynamics, safety=None):
-    """Return the task of conf/task with the model of the arm, the controller of conf/control and the safety limits.
+    """Return the task of conf/task with the arm's model, the controller of conf/control and the safety limits.
 
-    safety: settings of a later run, such as a transfer, which replace those of the config; None: no later run.
+    safety: safety settings of a transfer, which replace those in the training's config `cfg`; None: use `cfg` only.
     """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
@@ -101,7 +106,7 @@ def make_task(cfg, robot, dynamics, safety=None):
 
 
 def make_draw(cfg, robot, center):
-    """Return the domain randomization of conf/dr about `center`: a function (rng, m) -> Dynamics of m arms."""
+    """Return the domain randomization of conf/dr: a function (rng, m) -> Dynamics that draws m arms near `center`."""
     return part(cfg.dr, "dr", robot, center)
 
 
@@ -114,7 +119,7 @@ def _arm_target(cfg) -> Callable[..., Any]:
 
 
 def _arm_settings(cfg, robot, task=None):
-    """Return the settings of conf/arm; unset reflex thresholds become those that the task's contacts need."""
+    """Return the settings of conf/arm; unset reflex thresholds get the values that the task's contacts need."""
     settings = plain(cfg.arm)
     if "collision_force" in settings and None in (settings["collision_torque"], settings["collision_force"]):
         from r2s.arm.clients.collision_thresholds import thresholds_of
@@ -132,8 +137,8 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
     Unless the arm is a twin, a signal such as Ctrl-C ends its motion.
 
     Args:
-        noise: number of the sensor-noise stream of a twin. task, adapter: of the policy's motion; None: recordings.
-        more: further arguments of the arm.
+        noise: number of a twin's sensor-noise stream. task, adapter: what the policy runs with; None for recordings.
+        more: further arguments of the arm's class.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.stop_request import handled_signals, pipeline
@@ -175,7 +180,7 @@ def is_simulated(cfg):
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is a twin in this process without operator, so that copies can run in parallel."""
+    """Return whether conf/arm is a twin without operator, in this process; such twins can run in parallel."""
     return is_simulated(cfg) and "operator" not in cfg.arm
 
 
@@ -184,7 +189,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
     """Yield a `PolicyRunner` for the arm of conf/arm, or with arm.live a `RealtimeRunner`; stop the arm afterwards.
 
     Args:
-        dynamics: of one arm, on which the policy was trained. noise: see `opened_arm`. adapter: None without one.
+        dynamics: center of the training's randomization. noise: see `opened_arm`. adapter: an adapter, or None.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.policy_runner import PolicyRunner
@@ -198,7 +203,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
             finally:
                 arm.stop()
         return
-    _arm_target(cfg)  # raise its errors here, not in the process of the arm
+    _arm_target(cfg)  # raise errors here, not in the process of the arm
     make = partial(part, _arm_settings(cfg, robot, task), "arm", robot, beside=list(DRIVE_KEYS))
     with ExitStack() as stack:
         try:
@@ -214,9 +219,9 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
 
 @contextmanager
 def opened_source(cfg, robot, noise):
-    """Yield the arm to record: that of conf/arm, or with data=simulated a simulated arm with known parameters.
+    """Yield the arm to record: the arm of conf/arm, or with data=simulated a simulated arm with known parameters.
 
-    noise: 0, 1, 2, ... for the recordings of one run, so that each has other sensor noise.
+    noise: 0, 1, 2, ... for the recordings of one run, so that their sensor noise differs.
     """
     if cfg.data.kind != "simulated":
         with opened_arm(cfg, robot, noise) as arm:
@@ -237,14 +242,14 @@ def within_speed_share(cfg, robot):
 
 
 def check_source(cfg, robot):
-    """Raise UserError if a simulated arm for a recording cannot be made; a physical arm is not connected."""
+    """Raise UserError if a simulated arm for a recording cannot be made; do not connect to a physical arm."""
     if cfg.data.kind == "simulated" or is_simulated(cfg):
         with opened_source(cfg, robot, 0):
             pass
 
 
 def make_truth(cfg, robot):
-    """Return the true dynamics of a simulated arm: data.truth names a file of conf/friction and of conf/inertia.
+    """Return the true dynamics of a simulated arm: data.truth names a file in conf/friction and one in conf/inertia.
 
     Raises:
         UserError: one of the files is missing.
@@ -261,7 +266,7 @@ def make_truth(cfg, robot):
 
 
 def is_learner(cfg):
-    """Return whether conf/algo is a learner; otherwise it is a controller that needs no training."""
+    """Return whether conf/algo describes a learner; if not, it describes a controller that needs no training."""
     from r2s.learning.learner import Learner
 
     kind = target(cfg.algo, "algo")
@@ -283,7 +288,7 @@ def make_controller(cfg, robot, task, dynamics):
 def open_run(cfg, overrides, inputs=(), parents=()):
     """Return the open run folder of this job, with its trackers started; a resumed run keeps its tracker group.
 
-    inputs: files that the job reads, and parents: run folders that it uses, in addition to those of the config.
+    inputs: files that the job reads. parents: run folders that it uses. List only what the config does not name.
     """
     from omegaconf import OmegaConf
 
@@ -324,7 +329,7 @@ def all_threads(cfg):
 
 
 def set_threads(cfg, threads=None):
-    """Set torch's seed and number of threads, all by default. The physics has its own threads."""
+    """Set torch's seed and number of threads (default: all); the physics uses other threads."""
     import torch
 
     torch.set_num_threads(threads or all_threads(cfg))

@@ -1,4 +1,4 @@
-"""Choice of the stiction model of joints at rest, and of breakaway torques if no ramps were recorded.
+"""Choose the stiction model of joints at rest and, if no ramps were recorded, the breakaway torques.
 
 r2s scans over both, because the replay error has no useful gradient with respect to them.
 """
@@ -12,15 +12,14 @@ from r2s.identification.parameters import parameter_space
 from r2s.identification.problem import Report
 from r2s.identification.residuals.replay_residual import ReplayResidual
 from r2s.identification.residuals.windows import cut_windows, replay, windows_or_none
-from r2s.physics.dynamics import STICTION_MODELS, Dynamics
+from r2s.physics.dynamics import CREEP, STICTION_MODELS, Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-CREEP = 2e-3  # rad/s, below which a joint may stick: above the remaining speed of a stop after 1 ms, below any motion
-HORIZON, WINDOWS = 0.5, 60  # length, s, and number of the replays that choose a model: long enough for stops
-SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # of `scan_breakaway`: windows, passes, and coarse passes among them
-LEAST = 5e-4  # of tau_max, least friction that scales the scan range
-POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points of a coarse pass; on each side in a fine one; its refinement
+HORIZON, WINDOWS = 0.5, 60  # length (s, enough for stops) and number of the replays that choose a model
+SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # in `scan_breakaway`: windows, passes, and how many passes are coarse
+LEAST = 5e-4  # of tau_max, least friction to which the scan range is proportional
+POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points of a coarse pass; per side of a fine one; its step's shrinkage
 
 
 def choose_stiction(
@@ -36,8 +35,8 @@ def choose_stiction(
 ) -> dict[str, np.ndarray | float]:
     """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm} that replay stops best.
 
-    largest: upper limit of the scan for breakaway torques, relative to the identified friction; None: they come from
-    ramps. If no trajectory is as long as a window, the present model is returned.
+    largest: upper limit of the scan for breakaway torques, relative to the identified friction; None: no scan,
+    because they come from ramps. If no trajectory is as long as a window, the present model is returned.
     """
     windows = windows_or_none(recording, HORIZON, WINDOWS)
     scanned = largest is None or windows_or_none(recording, window_s, 1) is not None
@@ -73,9 +72,9 @@ def scan_breakaway(
 ) -> np.ndarray:
     """Return the breakaway torques (n, 2) Nm that replay the recording best; other values are those of `dynamics`.
 
-    The error jumps when a joint is released one step sooner, hence the scan. Each pass varies every torque alone
-    and minimizes the error of its joint: first over [0, largest], (n,) Nm, then ever finer about the best value. The
-    coarse scan runs twice, because wrong torques of other joints disturb the first pass.
+    A scan is needed, as the error jumps when a joint is released one step sooner. Each pass varies one torque at a
+    time and minimizes the error of its joint: in coarse passes over [0, largest], (n,) Nm, then about the best value
+    with ever finer steps. Two passes are coarse, because wrong torques of other joints disturb the first pass.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
