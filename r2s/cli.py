@@ -1,6 +1,6 @@
-"""The command line: `python run.py ...`, or `r2s ...` if installed. `main` composes the config and calls one stage.
+"""Run the command line `python run.py ...`, or `r2s ...` if installed: compose the config and call one stage.
 
-A user's mistake prints one line on stderr and ends with exit status 2.
+After a user's mistake, r2s prints one line on stderr and ends with exit status 2.
 """
 
 import os
@@ -25,7 +25,7 @@ PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 MOST_SEED = 2**32 - 1  # largest seed that some generators of NumPy accept
 ABSENT = "not there"
-# keys that skip_completed does not compare: where a run is, how it is shown, on how many cores it runs
+# keys that skip_completed does not compare: place of a run, its display, number of cores
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
 
 
@@ -72,7 +72,7 @@ def run_hydra(typed):
             os.environ[FAILED] = str(errors)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints exceptions of launchers and exits
             os.environ.setdefault(GROUP, default_name(typed.overrides))
-        else:  # a command that a sweep's job runs has its own exit status
+        else:  # not a sweep: the job itself ends with its exit status
             os.environ.pop(FAILED, None)
         try:
             job()
@@ -121,7 +121,7 @@ def check_paths(cfg):
 
 
 def resumed(cfg, overrides):
-    """Return config and overrides of the run folder `resume=`, with which its run continues."""
+    """Return the config and overrides with which the run in the folder `resume=` continues."""
     from r2s.runs import is_done
 
     folder = Path(cfg.resume)
@@ -130,7 +130,7 @@ def resumed(cfg, overrides):
     if extra := [o for o in overrides if not o.startswith(("resume=", "trust=", "device="))]:
         raise UserError(f"resume: a run continues with its own config; leave out {' '.join(extra)}")
     before = run_config(folder, cfg.trust)
-    if before.stage == "tune":  # its trainings use the overrides in the folder again
+    if before.stage == "tune":  # trainings of the search use the overrides in the folder again
         os.environ[TRUST] = ",".join(modules(cfg.trust))
     if before.stage not in RESUMABLE:
         raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: {choices(RESUMABLE)}")
@@ -143,7 +143,7 @@ def resumed(cfg, overrides):
 
 
 def is_completed(cfg):
-    """Return whether the job's run folder is finished; if it exists unfinished, set `resume` to continue it."""
+    """Return whether the job's run is finished; if its folder exists unfinished, set `resume` to continue the run."""
     from r2s.runs import is_done
     from r2s.stages.build import unread
 
@@ -166,7 +166,7 @@ def is_completed(cfg):
 
 
 def differing(saved, cfg, most=3, counts=lambda key: True):
-    """Return lines that say how a config differs from the saved one, for at most `most` of the keys that count."""
+    """Return lines on differences from the saved config, for the first `most` keys for which `counts` is true."""
     from omegaconf import OmegaConf
 
     from r2s.reporting.trackers.tracker import flat
@@ -193,7 +193,7 @@ def typed_overrides(folder):
 
 @contextmanager
 def errors_in_one_line():
-    """End the job with one line of text after a user's mistake, a full disk, a stopped arm or Ctrl-C."""
+    """End the job with one line if the block fails by a user's mistake, a full disk, a stopped arm or Ctrl-C."""
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     try:

@@ -1,7 +1,7 @@
-"""Commands without a run folder of their own.
+"""Run the commands of r2s that make no run folder.
 
 `r2s list`, `look` and `export` read run folders. `convert` writes a recording for ROS 2 or LeRobot. `check` judges a
-recording, or connects to an arm. `engines` lists the physics engines.
+recording or connects to an arm. `engines` lists the physics engines.
 """
 
 import os
@@ -61,7 +61,7 @@ def run_command(words: Sequence[str]) -> None:
     )
     converting.add_argument("--trust", help=TRUSTED)
     commands.add_parser("engines", help="the physics engines: version, or how to install it")
-    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first, as KEY=VALUE may repeat
+    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # in front: KEY=VALUE may repeat
     others = [w for w in words[1:] if not w.startswith(("to=", "trust="))]
     typed, unknown = parser.parse_known_args([words[0], *options, *others])
     if unknown:
@@ -136,7 +136,7 @@ def export(typed: Namespace) -> None:
 
 
 def check(typed: Namespace) -> None:
-    """Judge recordings or an arm: print the findings, and raise UserError if anything is refused."""
+    """Judge recordings or an arm: print the findings; raise UserError if a check refuses them."""
     from r2s.stages.check_data import check_data
 
     if not any(word.split("=")[0].split(".")[0] == "data" for word in typed.override):
@@ -147,10 +147,10 @@ def check(typed: Namespace) -> None:
 
 
 def composed(command: str, words: Sequence[str], groups: Sequence[str]) -> Any:
-    """Return the config of stage=identify with the overrides `words`, which may set keys of `groups` only.
+    """Return the config of stage=identify with the overrides `words`, which may set only keys in `groups`.
 
     Raises:
-        UserError: an override is of another group, or its option does not exist.
+        UserError: an override sets a key outside `groups`, or names an option that does not exist.
     """
     from hydra import compose, initialize_config_dir
 
@@ -165,7 +165,7 @@ def composed(command: str, words: Sequence[str], groups: Sequence[str]) -> Any:
 
 
 def check_arm(typed: Namespace) -> None:
-    """Connect to an arm, print the findings, and raise UserError if anything is refused; the arm does not move."""
+    """Connect to an arm, which does not move, and print the findings; raise UserError if a check refuses the arm."""
     from omegaconf import OmegaConf
     from pandas import DataFrame
 
@@ -184,7 +184,7 @@ def check_arm(typed: Namespace) -> None:
         raise UserError("arm.address must be given: arm.address=...")
     with opened_arm(cfg, make_robot(cfg), moves=False) as arm:
         found = [*arm.findings, *computer_findings("address" in cfg.arm and cfg.arm.realtime)]
-        if cfg.arm.live and typed.seconds > 0:  # an arm in lock-step has no clock of its own
+        if cfg.arm.live and typed.seconds > 0:  # only a live arm has a clock to measure
             try:
                 found += network_findings(*arm.watch(typed.seconds))
             except ArmStopped as lost:

@@ -1,10 +1,10 @@
-"""numba's `njit` and `cfunc` with a compilation cache that follows changes across modules.
+"""Provide numba's `njit` and `cfunc` with a compilation cache that notices changes in other modules.
 
-numba caches a compiled function beside its source and recompiles it when that file changes. But the cached code also
-contains the functions that it calls, and those may lie in other files: after a change in physics/safety_filter.py,
-numba would run arm/driver.py with the old filter. So here a function is recompiled when a compiled module of its room
-or of `physics` changes, or a module from which these import constants. Compiled code must not call functions of any
-other room.
+numba caches a compiled function and recompiles the function when its source file changes. But the cached code also
+contains all called functions, which may be in other files: after a change in physics/safety_filter.py, numba would
+run arm/driver.py with the old filter. So here a function is recompiled also when a compiled module of its room or of
+`physics` changes, or a module from which one of these imports constants. Compiled code must not call functions of
+any other room.
 """
 
 import hashlib
@@ -21,14 +21,14 @@ from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, Use
 
 __all__ = ["cfunc", "njit"]
 PACKAGE = Path(__file__).parent
-RELAYED = "R2S_RELAYED"  # environment variable, set if another process shows the output of this one
+RELAYED = "R2S_RELAYED"  # environment variable, set if another process prints this process's output
 LONG_S = 2.0  # s, duration of a compilation after which the user gets a message
 
 
 @cache
 def _sources(room: Path) -> bytes:
     """Return a hash of all modules on which the compiled code of a function in the folder `room` may depend."""
-    if PACKAGE in room.parents:  # a sub-room counts as part of its room
+    if PACKAGE in room.parents:  # a folder inside a room is part of this room
         names = room.relative_to(PACKAGE).parts[0], "physics"
         paths = {path for name in names for path in (PACKAGE / name).rglob("*.py")}
     else:
@@ -47,7 +47,7 @@ def _imports(path: Path) -> list[list[str]]:
 
 
 class _Sources:
-    """Mixin for numba's cache locators: it adds the hash of `_sources` to the source stamp."""
+    """Mixin for numba's cache locators that adds the hash of `_sources` to the source stamp."""
 
     _py_file: str
 
@@ -60,7 +60,7 @@ class Provided(_Sources, UserProvidedCacheLocator):
 
 
 class Beside(_Sources, InTreeCacheLocator):
-    """Cache in `__pycache__` beside the source."""
+    """Cache in `__pycache__` in the folder of the source."""
 
 
 class UserWide(_Sources, UserWideCacheLocator):
@@ -72,7 +72,7 @@ config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # 
 
 
 class _Announce(event.Listener):
-    """Listener that prints once per process that a long compilation is running; the first takes minutes."""
+    """Listener that prints a message, once per process, if a compilation takes long; the first takes minutes."""
 
     def __init__(self):
         self._printed = False

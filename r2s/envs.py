@@ -1,4 +1,4 @@
-"""Environments for other libraries: `gymnasium.make("r2s/PandaReach-v0", calibration=RUN)` and `torchrl_env`.
+"""Make environments for Gymnasium (`gymnasium.make("r2s/PandaReach-v0", calibration=RUN)`) and TorchRL.
 
 If Gymnasium is installed, importing this module registers r2s/PandaReach-v0, and likewise PandaTrack, PandaPress,
 PandaWipe and PandaPush. `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports it automatically.
@@ -17,7 +17,7 @@ from r2s.stages.parts import part
 
 TASKS = ("reach", "track", "press", "wipe", "push")
 SETTINGS = ("task", "robot", "friction", "inertia", "calibration", "dr", "reward", "control", "threads")
-READ = (*SETTINGS, "safety")  # first keys that `overrides` may have
+READ = (*SETTINGS, "safety")  # top-level keys that `overrides` may set
 
 
 def gym_env(*, overrides: Sequence[str] = (), **settings: Any) -> Any:
@@ -32,7 +32,7 @@ def gym_env(*, overrides: Sequence[str] = (), **settings: Any) -> Any:
 def gym_vector_env(
     num_envs: int = 1, *, autoreset_mode: Any = "NextStep", overrides: Sequence[str] = (), **settings: Any
 ) -> Any:
-    """Return a Gymnasium vector environment of `num_envs` arms, `ArmVectorEnv`; see there and `parts`."""
+    """Return a Gymnasium vector environment, `ArmVectorEnv`, of `num_envs` arms; see `parts` for the arguments."""
     optional_import("gymnasium", "r2s.envs.gym_vector_env", "gym")
     from r2s.learning.gym_env import ArmVectorEnv
 
@@ -42,7 +42,7 @@ def gym_vector_env(
 
 
 def torchrl_env(num_envs: int = 32, *, seed: int = 0, overrides: Sequence[str] = (), **settings: Any) -> Any:
-    """Return a TorchRL environment of `num_envs` arms with staggered episodes, `TaskEnv`; see there and `parts`."""
+    """Return a TorchRL environment, `TaskEnv`, of `num_envs` arms with staggered episodes; see `parts`."""
     from r2s.learning.env import TaskEnv
 
     robot, task, draw, reward, threads = parts(settings, overrides)
@@ -51,7 +51,7 @@ def torchrl_env(num_envs: int = 32, *, seed: int = 0, overrides: Sequence[str] =
 
 
 def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any, Any, Any, int]:
-    """Return robot, task, domain randomization, reward and number of threads that a training with these options has.
+    """Return robot, task, domain randomization, reward and number of threads of a training with these options.
 
     Args:
         settings: {option: value} of SETTINGS, such as {"task": "reach", "calibration": RUN, "dr": "identified"}.
@@ -61,7 +61,7 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
         TypeError: a name is not in SETTINGS. UserError: a value or an override is wrong.
     """
     for name in settings:
-        if name not in SETTINGS:  # TypeError, because sb3 then tries again without render_mode
+        if name not in SETTINGS:  # TypeError: only then does sb3 try again without render_mode
             raise TypeError(f"unexpected keyword argument '{name}'; {instead_of(name, SETTINGS)}")
     words = [_word(k, v) for k, v in settings.items() if v is not None]
     if isinstance(overrides, str):
@@ -79,7 +79,7 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
 
 
 def _word(name: str, value: Any) -> str:
-    """Return an option as typed on the command line; a path is quoted, because it may have any character."""
+    """Return an option as typed on the command line; quote a path, because a path may have any character."""
     from hydra.core.override_parser.types import Quote, QuotedString
 
     is_path = name == "calibration"
@@ -98,7 +98,7 @@ def _composed(words: list[str]) -> Any:
 
 @contextmanager
 def _aside() -> Iterator[None]:
-    """Hide the Hydra state of the calling program, which may be a Hydra job itself, and restore it at the end."""
+    """Hide the Hydra state of the calling program, which may be a Hydra job, and restore the state at the end."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
     from hydra.core.utils import JobRuntime

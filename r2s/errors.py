@@ -1,4 +1,4 @@
-"""Exceptions that end a run with one line of text: exit status 2 for a user's mistake, 3 for a stopped arm."""
+"""Define exceptions that end a run with one line of text (exit status 2: a user's mistake, 3: a stopped arm)."""
 
 import importlib
 import math
@@ -12,11 +12,11 @@ FAILED = "R2S_FAILED"  # environment variable that a sweep sets: file for the er
 
 
 class UserError(ValueError):
-    """A wrong input. Its line names the option or file, the expected value, the value found and the nearest match."""
+    """Error in the user's input. The message names option or file, expected value, actual value and nearest match."""
 
 
 class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
-    """The arm stopped and the operator did not resume; the run keeps its results and ends with status stopped."""
+    """The arm stopped and the operator did not resume. The run ends with status stopped; its results remain."""
 
 
 def nearest(name: object, allowed: Iterable[str]) -> str:
@@ -26,7 +26,7 @@ def nearest(name: object, allowed: Iterable[str]) -> str:
 
 
 def nearest_file(path: Path, pattern: str = "*") -> str:
-    """Return `nearest` of a path's name among the files beside it that match a pattern."""
+    """Return `nearest` for the name of a path, among the files in its folder that match a pattern."""
     return nearest(path.name, (p.name for p in path.parent.glob(pattern)))
 
 
@@ -57,11 +57,11 @@ def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
 
 
 def import_failure(error: ImportError, package: str, install: str) -> str:
-    """Return why an import failed: the package, another one that it needs, or a shared library is missing.
+    """Return why an import failed: the package, another package that it needs, or a shared library is missing.
 
     Args:
-        error: of the import. A missing package raises ModuleNotFoundError; an extension without a shared library,
-            such as libGL, raises ImportError with the extension's name.
+        error: error of the import: ModuleNotFoundError if a package is missing; ImportError with the extension's name
+            if an extension misses a shared library such as libGL.
         install: argument of `pip install` that installs the packages.
     """
     if not isinstance(error, ModuleNotFoundError):
@@ -75,9 +75,9 @@ def check_number(name: str, value: object, interval: str, whole: bool = False) -
     """Check that a setting is a number in an interval.
 
     Args:
-        name, value: of the setting.
-        interval: the allowed interval, such as "(0, 1]".
-        whole: require an integer.
+        name, value: name and value of the setting.
+        interval: allowed interval, such as "(0, 1]".
+        whole: whether the value must be an integer.
 
     Raises:
         UserError: the value is no number, or outside the interval.

@@ -1,4 +1,4 @@
-"""Atomic writes, JSON files, and paths of files inside the package."""
+"""Write files atomically, write JSON, and find files inside the package."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from typing import Any
 
 from r2s.errors import UserError, nearest_file
 
-# Exceptions that NumPy, pandas, h5py and zipfile raise for a truncated or altered file, or one of another kind.
+# Exceptions that NumPy, pandas, h5py and zipfile raise if a file is truncated, altered or of another format.
 DAMAGED = (
     KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
     SyntaxError, TokenError,  # NumPy parses an array's header as a Python literal

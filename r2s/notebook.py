@@ -17,7 +17,7 @@ def r2s(*words: str) -> Path:
     """Run `r2s WORDS`, print the command's output, and return its run folder.
 
     Raises:
-        UserError: the command fails; the message is its last line on stderr.
+        UserError: the command fails; the message is the command's last line on stderr.
     """
     command = [sys.executable, "-m", "r2s", *words]
     env = os.environ | {
@@ -58,7 +58,7 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
 
 
 def _small(path: Path, width: int) -> bytes:
-    """Return a figure as a PNG of this width with 64 colors, because the notebook file stores it."""
+    """Return a figure as a small PNG (this width, 64 colors), because the notebook file will contain it."""
     from PIL import Image
 
     with Image.open(path) as picture:

@@ -11,10 +11,10 @@ from r2s.stages.build import CONF, STAGES, unread
 from r2s.stages.run_config import PROGRAM
 
 COMMANDS = ("look", "list", "export", "check", "convert", "engines")
-OPTIONAL = ("tracker", "experiment")  # config groups of which no option has to be selected
+OPTIONAL = ("tracker", "experiment")  # config groups that may remain without a selected option
 EXTENSIBLE = ("tune.space",)  # keys under which + may add new keys
 STATED = re.compile(r"identify\.prior\.(?!(?:commanded|measured|motor)\b)[A-Za-z_]\w*(?:\.\w+)?=")
-NO_OPTION = "base"  # file of a group that its options share; it is no option itself
+NO_OPTION = "base"  # file that a group's options share; `base` cannot be selected
 SEARCHPATH = "hydra.searchpath"
 # old names of keys and values, with the new ones
 RENAMED = {
@@ -45,7 +45,7 @@ SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweep
 
 
 def extended(words: Sequence[str]) -> list[str]:
-    """Return the overrides with ++ before stated parameter values, because no file of conf/ has their keys."""
+    """Return the overrides, with ++ before stated parameter values, whose keys are in no file of conf/."""
     return [f"++{w}" if STATED.match(w) else w for w in words]
 
 
@@ -53,10 +53,10 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
     """Check the overrides of a job, or of all jobs of a sweep.
 
     Args:
-        words: overrides KEY=VALUE and GROUP=OPTION. config_dir: of --config-dir. multirun: whether -m was given.
+        words: overrides KEY=VALUE and GROUP=OPTION. config_dir: folder of --config-dir. multirun: whether -m is set.
 
     Raises:
-        UserError: an unknown option, an option that no job reads, a grid without -m, or a missing folder.
+        UserError: an option is unknown or no job reads it, a grid has no -m, or a folder is missing.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -93,11 +93,11 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
 def _check_configs(
     configs: Sequence[Any], jobs: Sequence[list[str]], names: Sequence[str], groups: Mapping[str, Any]
 ) -> None:
-    """Check stage, root and booleans of the configs of `jobs`, and that some job reads each option of `names`."""
+    """Check stage, root and booleans of the jobs' configs; check that each option of `names` is read by some job."""
     from hydra import compose
     from omegaconf import OmegaConf
 
-    for cfg in configs:  # Hydra uses root before the job can check it
+    for cfg in configs:  # Hydra uses `root` before the job can check this option
         if cfg.get("stage") not in STAGES:
             raise UserError(f"stage: expected one of {choices(STAGES)}, got {cfg.get('stage')}")
         root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
@@ -118,7 +118,7 @@ def _check_configs(
 def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> None:
     """Raise UserError if Hydra refuses one of its own options, or r2s does not support it.
 
-    own: overrides that precede them. If Hydra refuses `own`, the check of the other overrides reports it.
+    own: overrides that come first. If Hydra refuses one of these, do nothing: the check of all overrides reports it.
     """
     from hydra import compose
     from hydra.errors import HydraException
@@ -154,8 +154,8 @@ def _jobs(
     """Return the typed keys and groups, and a list of jobs in which every value of each sweep occurs at least once.
 
     Raises:
-        UserError: a sweep without -m, or a wrong value of a group.
-        UnknownOption, HydraException: another mistake, for which `_first_mistake` makes the message.
+        UserError: a sweep has no -m, or the value of a group is wrong.
+        UnknownOption, HydraException: another mistake; `_first_mistake` makes the message for the user.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
@@ -177,7 +177,7 @@ def _jobs(
 
 
 def _check_switches(cfg: Any, names: Sequence[str], defaults: Any) -> None:
-    """Raise UserError if an option in `names` is a boolean in `defaults`, but not in `cfg`."""
+    """Raise UserError if an option in `names` is a boolean in `defaults`, but not a boolean in `cfg`."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -191,7 +191,7 @@ def _check_switches(cfg: Any, names: Sequence[str], defaults: Any) -> None:
 
 
 def check_option(group: str, value: Any, options: Sequence[str]) -> None:
-    """Raise UserError if the option of a group is no string; Hydra would end with a traceback later."""
+    """Raise UserError if the value of a group is not a string, for which Hydra would later print a traceback."""
     words = value if isinstance(value, list) else [value]
     if not all(isinstance(w, str) for w in words) or not (words or group in OPTIONAL):
         raise UserError(f"{group}: expected one of {choices(options)}, got {value}")
@@ -214,7 +214,7 @@ def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[
             name = word.lstrip("+~").split("=", 1)[0]
             return UserError(renamed(word) or f"unknown option '{name}'{nearest(name, known)}")
         except (HydraException, OmegaConfBaseException) as error:
-            return _mistake(job[-1], error, groups, known)  # in a sweep, the value that Hydra refuses
+            return _mistake(job[-1], error, groups, known)  # in a sweep, job[-1] has the refused value
         if names[-1] in groups:
             known = [*_keys(cfg), *groups]
     raise AssertionError("Hydra accepts each override, but not all of them")

@@ -1,4 +1,4 @@
-"""Progress display of long computations: completed share, elapsed time and remaining time."""
+"""Show the progress of long computations: completed share, elapsed time and remaining time."""
 
 import atexit
 import time
@@ -14,7 +14,7 @@ from rich.table import Column
 class Progress:
     """A progress bar on a terminal; without a terminal, a line of text every `every_s` seconds.
 
-    in_cycle: whether a control cycle makes the calls. It must not wait for a terminal, so a thread writes.
+    in_cycle: whether a control cycle calls the object. A thread then writes, as a cycle must not wait for a terminal.
     """
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
@@ -60,7 +60,7 @@ class Progress:
         now = time.perf_counter()
         if share < 0.5 * self._share or share < 1.0 <= self._share:  # the next part begins, such as another search
             self._first = -1.0
-            if self._bar:  # a bar that was full counts as finished and would show no time
+            if self._bar:  # a full bar is treated as finished and would not show the time
                 began = self._bar.tasks[0].start_time
                 self._bar.reset(self._task)
                 self._bar.tasks[0].start_time = began

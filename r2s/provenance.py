@@ -1,4 +1,4 @@
-"""Provenance of a result: git commit, package versions, computer and digests of files."""
+"""Record the provenance of a result: git commit, package versions, computer and digests of files."""
 
 import hashlib
 import os
@@ -36,7 +36,7 @@ def git() -> dict[str, Any]:
 
 
 def packages() -> dict[str, str | None]:
-    """Return the versions of PACKAGES and of Python; None for a package that is not installed."""
+    """Return the versions of Python and PACKAGES; the version of a package that is not installed is None."""
 
     def version_of(package: str) -> str | None:
         try:

@@ -1,7 +1,7 @@
-"""Run folders: runs/<stage>/<name>/ with config, provenance, growing tables and the summary.
+"""Make, resume and read run folders, runs/<stage>/<name>/: config, provenance, growing tables and the summary.
 
-meta.json has the status `running` from the start, and a killed run keeps it. A folder appears under its name with all
-its first files. Only one process can write in it: the lock on overrides.yaml ends with the process, however it ends.
+meta.json has the status `running` from the start; a killed run still has it. A folder gets its final name only when
+its first files are complete. A lock on overrides.yaml lets only one process write; when this ends, so does the lock.
 """
 
 import csv
@@ -26,20 +26,20 @@ from r2s.errors import Stopped, UserError
 from r2s.files import DAMAGED, atomic_write, write_json
 from r2s.provenance import git, machine, packages, sha256
 
-# keys that meta.json has for each part of a resumed run; every resume begins a part
+# keys of meta.json for each part of a run; every resume begins a new part
 PART = ("start", "wall_clock_s", "status", "process", "threads", "device", "git", "packages", "machine")
-NOTE_S = 30.0  # s, between updates of the wall clock in meta.json, so that a killed part has its duration
+NOTE_S = 30.0  # s, time between updates of the wall clock in meta.json, so that it is known after a kill
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a run folder records about its job.
+    """Description of a job, which its run folder records.
 
     Attributes:
-        stage, name: of the folder runs/<stage>/<name>; name None: `default_name`. A number is added to a used name.
-        config: composed config as YAML text. overrides: as the user typed them.
-        seed: of the run. threads: requested number, 0: all cores. device: of the learner.
-        inputs: files that the run reads; their SHA-256 is recorded. parents: run folders whose results it uses.
+        stage, name: the folder is runs/<stage>/<name>, with a number if it exists. name None: `default_name`.
+        config: composed config as YAML text. overrides: overrides as the user typed them.
+        seed: seed of the run. threads: requested number, 0: all cores. device: device of the learner.
+        inputs: files that the run reads; the folder records their SHA-256. parents: run folders that the run uses.
     """
 
     stage: str
@@ -57,15 +57,15 @@ class Run:
     """A run folder, open while its stage runs: `with Run(...) as run`.
 
     Attributes:
-        folder: path of the folder. tracker: r2s.reporting.trackers.async_tracker.Trackers, which neither raises nor
-            blocks, or None.
+        folder: path of the folder. tracker: r2s.reporting.trackers.async_tracker.Trackers, whose calls neither raise
+            nor block, or None.
 
     Args:
-        root: folder of all runs. job: see `Job`. exact_name: whether a used name is an error.
-        resume: run folder to continue instead of a new one; its inputs must be unchanged.
+        root: folder of all runs. job: see `Job`. exact_name: whether to raise an error if the name exists.
+        resume: run folder to continue, instead of making a new one; inputs of the run must be unchanged.
 
     Raises:
-        UserError: the folder cannot be made, another process is using it, or it cannot be resumed.
+        UserError: the folder cannot be made or resumed, or another process is using it.
     """
 
     def __init__(self, root: Path, job: Job, *, resume: str | Path | None = None, exact_name: bool = False):
@@ -144,7 +144,7 @@ class Run:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
         if isinstance(error, KeyboardInterrupt):
             self._meta["error"] = "interrupted"
-            error.args = (str(self.folder),)  # r2s/cli.py prints it
+            error.args = (str(self.folder),)  # r2s/cli.py prints the folder
         try:
             for _, file in self._tables.values():
                 file.close()
@@ -163,9 +163,9 @@ class Run:
         return self._meta
 
     def memo(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays that `make` computes, or read them from checkpoints/<name>.npz if that file exists.
+        """Return the arrays that `make` computes; if checkpoints/<name>.npz exists, read the arrays from it instead.
 
-        So a resumed run continues after its last complete step.
+        So a resumed run continues after the last complete step.
 
         Raises:
             UserError: the file is damaged.
@@ -185,9 +185,9 @@ class Run:
         return self.folder / "figures" / f"{name}.png"
 
     def log(self, table: str, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to <table>.csv, and return the row rounded as in the file; the first row sets the columns.
+        """Append a row to <table>.csv and return the row, rounded as in the file. The first row defines the columns.
 
-        Base decisions on the rounded row: a resumed run, which reads the file (`rewind`), then decides the same.
+        Use the rounded row for decisions: then a resumed run, which reads the file (`rewind`), decides the same.
         """
         rounded = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in row.items()}
         if table not in self._tables:
@@ -204,14 +204,14 @@ class Run:
         return rounded
 
     def track(self, table: str, row: Mapping[str, Any]) -> None:
-        """Send a row to the tracker only; use it for a table that is not written by `log`."""
+        """Send a row only to the tracker, for a table that `log` does not write."""
         if self.tracker:
             self.tracker.log(table, row)
 
     def rewind(self, table: str, column: str, most: float) -> list[dict[str, float]]:
-        """Truncate <table>.csv to the rows with `column` <= most, continue after them, and return them.
+        """Truncate <table>.csv to the rows with `column` <= most, and return these; `log` then appends to the file.
 
-        An incomplete last row is dropped. The remaining rows stay as written.
+        An incomplete last row is removed. The other rows remain as written.
         """
         path = self.folder / f"{table}.csv"
         if not path.is_file():
@@ -226,7 +226,7 @@ class Run:
         try:
             rows = [[float(v) if v else math.nan for v in row] for row in csv.reader(lines[1:])]
             kept = [dict(zip(head, row, strict=True)) for row in rows if row[head.index(column)] <= most]
-            # a finished run ends with two evaluations at the same step: drop the last, which will be repeated
+            # a finished run ends with two evaluations at the same step: drop the last one, which will be repeated
             last = next((k for k, row in enumerate(kept) if row[column] == most), len(kept))
             del kept[last + 1 :]
         except ValueError as error:
@@ -244,7 +244,7 @@ class Run:
             self.tracker.summary(document)
 
     def _write_meta(self) -> None:
-        """Write meta.json; for a resumed run it lists all parts, and its wall clock is their sum."""
+        """Write meta.json, which lists all parts of a resumed run and the sum of their wall clocks."""
         self._noted = time.monotonic()
         own = round(self._noted - self._began, 3)
         self._meta["wall_clock_s"] = round(own + sum(p["wall_clock_s"] for p in self._earlier), 3)
@@ -269,7 +269,7 @@ def load_arrays(path: Path) -> dict[str, Any]:
 
 
 def read_summary(folder: str | Path, option: str) -> dict[str, Any]:
-    """Return the summary.json of a run folder; raise UserError, which names `option`, if there is none."""
+    """Return the content of summary.json of a run folder; if the file is missing, raise UserError naming `option`."""
     path = Path(folder) / "summary.json"
     if not path.is_file():
         raise UserError(f"{option}: {folder} is no finished run folder (it has no summary.json)")
@@ -277,7 +277,7 @@ def read_summary(folder: str | Path, option: str) -> dict[str, Any]:
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
-    """Return the meta.json of a run folder.
+    """Return the content of meta.json of a run folder.
 
     Raises:
         UserError: the file cannot be read, or has no status or inputs.
@@ -289,7 +289,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
 
 
 def parts_of(meta: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the parts of a run with their time, duration, code and machine; a run never resumed has one part.
+    """Return the parts of a run, each with start, duration, code and machine; a run without resume has one part.
 
     Raises:
         UserError: meta.json is damaged.
@@ -320,7 +320,7 @@ def is_done(folder: Path) -> bool:
 
 
 def is_locked(folder: Path) -> bool:
-    """Return whether a process holds the lock of a run folder, because it is writing there."""
+    """Return whether a process has locked a run folder, because the process is writing there."""
     try:
         with open(folder / "overrides.yaml", "r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -358,9 +358,9 @@ def _lock(folder: Path) -> int:
 
 
 def status_of(meta: Mapping[str, Any]) -> str:
-    """Return done, stopped, failed, running, or killed (meta.json says running, but the process is gone).
+    """Return done, stopped, failed, running, or killed (meta.json says running, but the process has ended).
 
-    A process on another computer cannot be checked; the status is then that of meta.json.
+    If the process is on another computer, it cannot be checked; return the status in meta.json.
     """
     process = meta.get("process", {})
     if meta["status"] != "running" or process.get("host") != platform.node():
@@ -382,13 +382,13 @@ def default_name(overrides: Iterable[str]) -> str:
 
 
 def _take_name(folder: Path, parent: Path, name: str, exact_name: bool) -> Path:
-    """Rename a folder to the first free name of name, name_2, ...; with exact_name, to name or not at all."""
+    """Rename a folder to the first free name of name, name_2, ...; with exact_name, allow only `name` itself."""
     if not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name.startswith("."):
         raise UserError(f"name: {name!r} cannot be a folder's name")
     for k in range(1, 2 if exact_name else 1000):
         final = parent / (name if k == 1 else f"{name}_{k}")
         try:
-            os.rename(folder, final)  # replaces an empty folder too; of two processes the second one fails
+            os.rename(folder, final)  # replaces an empty folder, too; if two processes rename, the second fails
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                 raise

@@ -1,1 +1,1 @@
-"""Adaptation of a working arm: estimates of payload, friction and offsets, and torque corrections from them."""
+"""Adaptation of a working arm: estimates of payload, friction, offsets and wrench, and torque corrections."""

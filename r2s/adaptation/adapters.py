@@ -1,6 +1,6 @@
 """Adapters of conf/adapt, made from the result of an identification.
 
-To add one, write a function of `AdapterContext` and its settings, or a class, and name it in a yaml of conf/adapt.
+To add an adapter, write a function or class of an `AdapterContext` and settings, and name it in conf/adapt/*.yaml.
 """
 
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ from r2s.recordings.recording import Recording
 
 @dataclass(frozen=True)
 class AdapterContext:
-    """What adapters of one arm need: the result of its identification.
+    """The input of adapters for one arm: the result of its identification.
 
     Attributes:
         robot, dynamics: the identified arm.
-        posterior: space and posterior draws of its parameters; None if not available.
-        unloaded: two recordings of commanded torque without a payload, None if not available.
+        posterior: parameter space, and draws from the posterior; None if not available.
+        unloaded: two recordings with commanded torque and no payload; None if not available.
     """
 
     robot: Robot
@@ -45,12 +45,12 @@ class AdapterContext:
 
     @cached_property
     def corrected(self) -> tuple[ArmModel, Noise]:
-        """The arm with a correction fitted to `unloaded`, and the remaining noise."""
+        """The arm with a correction fitted to `unloaded`, and the remaining uncertainty."""
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 
     def gated(self, adapter: Holdable) -> Adapter:
-        """Return the adapter; if the robot has a tool, in a `ContactGate` that holds it in contact."""
+        """Return the adapter; if the robot has a tool, inside a `ContactGate` that freezes the adapter in contact."""
         if self.robot.tool is None:
             return adapter
         wrench = WrenchObserver(self.robot, self.dynamics)
@@ -60,10 +60,10 @@ class AdapterContext:
 
 
 def observer(context: AdapterContext, filter_s: float) -> Adapter:
-    """Return a disturbance observer, `adapt=observer`; raises UserError if filter_s is not above 0."""
+    """Return a disturbance observer, `adapt=observer`; raise UserError if filter_s is not above 0."""
     return context.gated(Observer(context.arm, filter_s))
 
 
 def rls(context: AdapterContext) -> Adapter:
-    """Return the feedforward of a recursive payload, friction and offset estimate, `adapt=rls`."""
+    """Return the feedforward from a recursive estimate of payload, friction and offsets, `adapt=rls`."""
     return context.gated(Feedforward(*context.corrected))

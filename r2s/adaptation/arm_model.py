@@ -1,7 +1,7 @@
 """The identified arm as arrays for compiled functions: links, friction, latency.
 
-A table per joint represents any friction family over speed: a part with the sign of the sliding direction, in one row
-per direction, and a part that depends on speed alone.
+A table per joint lists the friction of any friction family over speed, in three rows: for each sliding direction, the
+part with the sign of this direction; and the part that depends on speed alone.
 """
 
 from typing import NamedTuple
@@ -24,26 +24,26 @@ FORWARD, BACKWARD, SPEED_ONLY = range(3)  # rows of a table
 class ArmModel(NamedTuple):
     """The arm of n joints without a payload, as float arrays.
 
-    No identification fits `angle_friction` and `compliance`; see model_correction.py.
+    Identifications do not fit `angle_friction` and `compliance`; model_correction.py does.
     """
 
     links: np.ndarray  # (n, LINK)
     compensated: np.ndarray  # (n, 4) kg and kg m, mass and first moment that gravity compensation uses
-    payload_frame: np.ndarray  # (12,), position and axes in the last link
+    payload_frame: np.ndarray  # (12,), position and axes of the payload frame in the last link
     gravity: np.ndarray  # (3,) m/s^2
     armature: np.ndarray  # (n,) kg m^2
     offset: np.ndarray  # (n,) Nm; for this and the next two see `Dynamics`
     load: np.ndarray  # (n,)
     drag: np.ndarray  # (n, 2)
-    angle_friction: np.ndarray  # (n, 2) Nm, friction with sin q and cos q
-    compliance: np.ndarray  # (n,) rad/Nm, of the gears
-    table: np.ndarray  # (n, 3, 2 POINTS - 1) Nm
-    max_speed: np.ndarray  # (n,) rad/s, at the end of the table
+    angle_friction: np.ndarray  # (n, 2) Nm, friction proportional to sin q, to cos q
+    compliance: np.ndarray  # (n,) rad/Nm, compliance of the gears
+    table: np.ndarray  # (n, 3, 2 POINTS - 1) Nm, friction; rows: FORWARD, BACKWARD, SPEED_ONLY
+    max_speed: np.ndarray  # (n,) rad/s, speed at the ends of the table
     presliding: np.ndarray  # (n,) rad
     level: np.ndarray  # (n,) Nm, sliding friction
     breakaway: np.ndarray  # (n,) Nm, largest torque that stiction balances
     latency: np.ndarray  # (2,) cycles, delay and lag
-    payload_max: np.ndarray  # (2,) kg, m, as in `Robot`
+    payload_max: np.ndarray  # (2,) kg, m, see `Robot`
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:

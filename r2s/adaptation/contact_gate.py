@@ -1,4 +1,4 @@
-"""A gate that holds an adapter in contact, because it would mistake the contact for a model error and push.
+"""A gate that freezes an adapter in contact; the adapter would take the contact for a model error and push.
 
 In contact the added torque stays at its value before the contact began, and the adapter's estimate is frozen.
 """
@@ -10,7 +10,7 @@ import numpy as np
 from r2s.adaptation.adapter import Adapter
 from r2s.adaptation.wrench import WrenchObserver
 
-REWIND = 100  # cycles, age of the torque that is held: longer than a detection takes (benchmarks/wrench.py)
+REWIND = 100  # cycles, age of the torque added in contact: longer than a detection takes (benchmarks/wrench.py)
 
 
 class Holdable(Adapter, Protocol):
@@ -20,10 +20,10 @@ class Holdable(Adapter, Protocol):
 
 
 class ContactGate:
-    """An `Adapter` that holds another adapter in contact.
+    """An `Adapter` that freezes another adapter in contact.
 
     Args:
-        adapter: the adapter to hold. wrench: detects contact.
+        adapter: the adapter to freeze. wrench: observer that detects contacts.
     """
 
     def __init__(self, adapter: Holdable, wrench: WrenchObserver):
@@ -39,7 +39,7 @@ class ContactGate:
         self._cycle = 0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Process a cycle and return (n,) Nm to add; see `Adapter`."""
+        """Process one cycle and return the torque (n,) Nm to add; see `Adapter`."""
         self.adapter.held = self.wrench(q, dq, tau)
         torque = self.adapter(q, dq, tau)
         oldest = self._past[self._cycle % REWIND]

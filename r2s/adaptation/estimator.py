@@ -1,4 +1,4 @@
-"""Payload, friction and offset estimate of a working arm, with 95 % intervals.
+"""Estimates of payload, friction and offsets on a working arm, with 95 % intervals.
 
     estimator = Estimator(arm, noise)
     for each millisecond: estimator(state.q, state.dq, command)
@@ -27,21 +27,21 @@ from r2s.physics.robot import SIM_DT
 class Estimate:
     """The estimate at one moment; `_half` marks half widths of 95 % intervals."""
 
-    cycle: int  # since the start
+    cycle: int  # cycles since the start
     t: float  # s since the start, pauses included
     mass: float  # kg
     mass_half: float
     centre: np.ndarray  # (3,) m in the payload frame; nan if the mass is not significant
     centre_half: np.ndarray
     tensor: np.ndarray  # (3, 3) kg m^2 about the centre, of a physical body
-    friction: np.ndarray  # (n,), relative to the model
+    friction: np.ndarray  # (n,), ratio to the model's friction
     friction_half: np.ndarray
-    offset: np.ndarray  # (n,) Nm, beyond the model
+    offset: np.ndarray  # (n,) Nm, difference from the model's offset
     offset_half: np.ndarray
     rests: bool  # no joint slides
     odds: float  # log odds of a payload change
     changed: bool  # a payload change was detected at this moment
-    beyond: bool = False  # the mass exceeds the arm's largest payload; only that much is compensated
+    beyond: bool = False  # the mass exceeds the largest payload, to which compensation is limited
 
 
 class Estimator:
@@ -52,7 +52,7 @@ class Estimator:
         held: whether the estimate is frozen, because the arm touches something.
 
     Args:
-        arm: model of the arm. noise: its uncertainty.
+        arm: model of the arm. noise: uncertainty of the model.
     """
 
     def __init__(self, arm: ArmModel, noise: Noise):
@@ -69,7 +69,7 @@ class Estimator:
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Begin a motion from rest, `pause_s` after the last one; keep the estimate, less certain after the pause."""
+        """Begin a motion from rest, `pause_s` after the last; the estimate remains, less certain after the pause."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None
@@ -171,9 +171,9 @@ class Estimator:
 
 
 def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass kg, centre (3,) m and tensor (3, 3) kg m^2 about it of the physical body nearest to x (10,).
+    """Return the physical body nearest to x (10,): mass kg, centre (3,) m, tensor (3, 3) kg m^2 about the centre.
 
-    Mass and first moments stay as they are, because data determine them well. The second moment about the centre is
+    Mass and first moments stay as they are, because data determine both well. The second moment about the centre is
     replaced by the nearest non-negative one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
     """
     m = float(x[0])

@@ -1,6 +1,6 @@
 """Feedforward of the estimated payload, friction and offsets.
 
-It uses the mass and centre of the payload, within the limits of `plausible_payload`. For joint j, the estimate x
+It uses the payload's mass and centre, within the limits of `plausible_payload`. For joint j, the estimate x
 means a torque c = h x, Nm. h contains the payload's ten columns (gravity, Coriolis, acceleration), the model's
 friction for the relative friction error, and 1 for the offset. The variance of c is s^2 = h P h^T. The feedforward is
 w c. Let c be an unbiased estimate of c*. Then E (w c - c*)^2 is least at w = c*^2 / (c*^2 + s^2), and c^2 - s^2 is an
@@ -29,10 +29,10 @@ from r2s.physics.robot import SIM_DT
 
 
 class Feedforward:
-    """The `Adapter` that adds the torque of `Estimator`, shrunk by its uncertainty.
+    """The `Adapter` that adds the estimated torque, weighted by the certainty of the estimate.
 
     Args:
-        arm: the model with its correction. noise: its uncertainty.
+        arm: the corrected model. noise: uncertainty of the corrected model.
     """
 
     def __init__(self, arm: ArmModel, noise: Noise):
@@ -40,11 +40,11 @@ class Feedforward:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest, with the identified model alone."""
+        """Begin a motion from rest with the identified model, without earlier estimates."""
         n = self._n
         self.estimator = Estimator(self._arm, self._noise)
         self._payload, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))
-        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # of the estimate; its part still to be added
+        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # estimated torque; part of it still to be added
 
     @property
     def held(self) -> bool:
@@ -56,7 +56,7 @@ class Feedforward:
         self.estimator.held = held
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Process a cycle and return (n,) Nm to add; see `Adapter`."""
+        """Process one cycle and return the torque (n,) Nm to add; see `Adapter`."""
         new = self.estimator(q, dq, tau)
         filter, state, residual = self.estimator.internals
         if new:
@@ -75,7 +75,7 @@ def plausible_payload(x, most, out):
     """Write the ten parameters of the payload nearest to the mass and centre of x (10,) within the arm's limits.
 
     most: (2,) kg, m, largest mass, and largest distance of its centre from the payload frame. The tensor is that of
-    a ball of water, because data hardly determine it, and a wrong one feeds back the acceleration.
+    a ball of water, because data hardly determine it, and a wrong tensor feeds back the acceleration.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0

@@ -9,7 +9,7 @@ State of n joints, N = 10 + 4 n:
 
 Measurements are momentum residuals, one joint after the other. They have outliers: a breakaway or a vibrating gear
 causes large residuals for a span or two. Huber's function (Robust Statistics, 1981) reduces the weight of innovations
-beyond HUBER standard deviations; a payload change persists, so it still counts.
+beyond HUBER standard deviations; a payload change persists, so the filter still follows it.
 """
 
 from typing import NamedTuple
@@ -39,20 +39,20 @@ class Noise(NamedTuple):
     white: np.ndarray  # (n,) Nm, white noise of a residual
     momentum_share: np.ndarray  # (n,), relative error of the momentum rate
     model: np.ndarray  # (n,) Nm, model error
-    correlation_s: float  # s, of the model error
+    correlation_s: float  # s, correlation time of the model error
     reversal: np.ndarray  # (n,), added model error after a change of friction, relative to that change
     level: np.ndarray  # (n,) Nm, as in `ArmModel`
     breakaway: np.ndarray  # (n,) Nm, as in `ArmModel`
     inertia: np.ndarray  # (n, n) kg m^2, inertia missing in the model, mostly of rotors
     latency: np.ndarray  # (n, n) s, latency missing in the model
     payload_friction: float  # model error relative to the payload's torque: load-dependent friction, noisy speeds
-    friction_drift: float  # 1/sqrt(s)
-    offset_drift: np.ndarray  # (n,) Nm/sqrt(s)
-    rest_drift: float  # kg^2/s, variance of the payload's mass at rest, where its change is invisible
+    friction_drift: float  # 1/sqrt(s), random walk of relative friction
+    offset_drift: np.ndarray  # (n,) Nm/sqrt(s), random walk of the offsets
+    rest_drift: float  # kg^2/s, growth of the mass variance at rest, where payload changes are invisible
     payload_drift: float  # 1/sqrt(s), relative to the payload's prior
     adaptation: float  # growth of white noise under surprising innovations, per span; 0: none
     prior: np.ndarray  # (N,) standard deviations of the initial state
-    mean: np.ndarray  # (N,), of the initial state
+    mean: np.ndarray  # (N,), mean of the initial state
 
 
 class Filter(NamedTuple):
@@ -63,13 +63,13 @@ class Filter(NamedTuple):
     signature: np.ndarray  # (ONSETS, N, 4), response of x to a jump
     information: np.ndarray  # (ONSETS, 4, 4), information matrix of the jump
     vector: np.ndarray  # (ONSETS, 4), information times the estimated jump
-    counts: np.ndarray  # (5,), spans; spans at rest in a row; USED, NEXT, SINCE_JUMP
+    counts: np.ndarray  # (5,), SPANS: all spans; AT_REST: successive spans at rest; USED, NEXT, SINCE_JUMP
     log_odds: np.ndarray  # (2,), MEAN: log odds over all onsets; ONSET: index of the likeliest one
     innovations: np.ndarray  # (2, n) Nm and Nm^2, innovations and their variances
     # (n,), white variance relative to `Noise`, at least 1; it grows under persistent innovations, such as a gear's
     # vibration under a load that no recording has
     noise_scale: np.ndarray
-    work: np.ndarray  # (2, N): P h^T; variance of a payload's friction per joint
+    work: np.ndarray  # (2, N), scratch: P h^T; variance of the friction from the payload, per joint
 
     @staticmethod
     def fresh(noise: Noise) -> "Filter":
@@ -115,7 +115,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Widen the covariance for `seconds` without measurements, at most to the prior; the payload may have changed."""
+    """Widen the covariance for a pause of `seconds`, at most to the prior; the payload may have changed in it."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:
@@ -151,7 +151,7 @@ def _predict_joint(filter, noise, residual, j):
         P[error, error] += model**2 * (1.0 - fade * fade)
     P[error, error] += noise.reversal[j] ** 2 * noise.level[j] * residual.friction_path[j]
     most = model**2 + (2.0 * noise.reversal[j] * noise.level[j]) ** 2
-    if P[error, error] > most:  # at most that of an unknown model error: shrink the correlations as well
+    if P[error, error] > most:  # limit to an unknown error's variance; shrink correlations as well
         for i in range(N):
             if i != error:
                 P[error, i] *= np.sqrt(most / P[error, error])

@@ -1,12 +1,12 @@
-"""Correction of the identified model by its recordings without a payload.
+"""Correction of the identified model, fitted to recordings without a payload.
 
-An identification omits terms that improve the fit to its recording little. But small torques matter to a payload
+An identification omits terms that improve the fit to the recording little. But small torques matter to a payload
 estimate: 0.1 Nm at 0.5 m are 20 g. So the correction has all terms named below for every joint, a mass and first
 moments for every link, and a compliance for every gear. Each parameter has a zero-mean prior of typical width: ridge
 regression, the posterior mean of a linear model (Bishop 2006, 3.3). Measurements are momentum residuals
 (momentum_residual.py), which need no accelerations.
 
-Behind a compliant gear, the link's angle is the motor's minus torque / K. A residual that equates the two has an
+Behind a compliant gear, the link's angle is the motor angle minus torque / K. A residual that equates both has an
 error of M d2(torque)/dt2 / K: 0.7 Nm at 15 kNm/rad on a Panda whose torque varies by 4 Nm at 7 Hz.
 """
 
@@ -21,7 +21,7 @@ from r2s.physics.newton_euler import COM, MASS
 from r2s.physics.rigid_body import regressor
 from r2s.physics.robot import Robot
 
-ROUNDS = 3  # fits, each followed by an estimate of the error's size
+ROUNDS = 3  # fits, each followed by an estimate of the residuals' RMS
 # terms of a joint, s the sign of its speed v: share of its friction, offset, s |gravity|, s, s sqrt v,
 # s / (1 + v / STRIBECK_SPEED), v, s sin q, s cos q, sin q, cos q
 SHARE, OFFSET, LOAD, LAW, ANGLE, CABLE, TERMS = 0, 1, 2, 3, 7, 9, 11
@@ -73,7 +73,7 @@ def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumRe
 
 
 def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
-    """Return the corrected arm, except inertia and latency, whose correction is in `Noise`."""
+    """Return the arm with the correction, except those of inertia and latency, which `Noise` contains."""
     links, table = arm.links.copy(), arm.table.copy()
     before, has_mass = arm.links[:, MASS, None], arm.links[:, MASS] > 0.0
     mass = np.maximum(before + correction.links[:, :1], 0.5 * before)[has_mass]
@@ -109,7 +109,7 @@ def corrected_residuals(
 def _columns(
     robot: Robot, arm: ArmModel, residuals: list[MomentumResidual]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the columns of links and gears (T, n, 5 n) and of joints (T, n, K), y (T, n) Nm, and sliding (T, n)."""
+    """Return regressors of links and gears (T, n, 5 n) and joints (T, n, K), y (T, n) Nm, and sliding (T, n) bool."""
     names = ("q", "dq", "friction", "y", "sliding", "acceleration", "torque_rate")
     q, v, friction, y, sliding, ddq, torque_rate = (np.array([getattr(r, name) for r in residuals]) for name in names)
     samples, n = q.shape

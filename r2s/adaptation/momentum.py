@@ -22,9 +22,9 @@ class MomentumTerms(NamedTuple):
     p: np.ndarray  # (n,) Nm s
     coriolis: np.ndarray  # (n,) Nm, C^T dq
     uncompensated: np.ndarray  # (n,) Nm, gravity torque of the links that gravity compensation does not cancel
-    compensated: np.ndarray  # (n,) Nm, gravity torque that it cancels
+    compensated: np.ndarray  # (n,) Nm, gravity torque that gravity compensation cancels
     payload_p: np.ndarray  # (n, 10), the payload's columns of p
-    payload_torque: np.ndarray  # (n, 10), its columns of coriolis - uncompensated
+    payload_torque: np.ndarray  # (n, 10), the payload's columns of coriolis - uncompensated
 
     @staticmethod
     def empty(n: int) -> "MomentumTerms":
@@ -39,11 +39,11 @@ def _cross(ax, ay, az, bx, by, bz):
 
 @njit(cache=True, error_model="numpy")
 def momentum(arm, q, dq, terms, work):
-    """Write the `MomentumTerms` of an `ArmModel` at q, dq (n,) rad, rad/s; work: (n, MOMENTUM_WORK), scratch."""
+    """Write the `MomentumTerms` of an `ArmModel` at q, dq (n,) rad, rad/s; work: (n, MOMENTUM_WORK)."""
     n = len(q)
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     px, py, pz = 0.0, 0.0, 0.0
-    wx, wy, wz, vx, vy, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # of the link; its velocity at the base origin
+    wx, wy, wz, vx, vy, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # twist of the link about the base origin
     gx, gy, gz = arm.gravity[0], arm.gravity[1], arm.gravity[2]
     links, cancelled, pull, weight = arm.links, arm.compensated, terms.uncompensated, terms.compensated
     for i in range(n):
@@ -108,7 +108,7 @@ def _payload_columns(arm, R, p, w, v, terms, work):
     R = product(R, frame, 3)
     gx, gy, gz = arm.gravity[0], arm.gravity[1], arm.gravity[2]
     ax, ay, az = _cross(wx, wy, wz, px, py, pz)
-    ux, uy, uz = vx + ax, vy + ay, vz + az  # of the payload frame
+    ux, uy, uz = vx + ax, vy + ay, vz + az  # velocity of the payload frame
     ox = R[0] * wx + R[3] * wy + R[6] * wz
     oy = R[1] * wx + R[4] * wy + R[7] * wz
     oz = R[2] * wx + R[5] * wy + R[8] * wz

@@ -1,11 +1,11 @@
 """Momentum residual over a few milliseconds: torque that commands, friction and links do not explain; compiled.
 
 The change of momentum equals the integral of all torques, so nothing is differentiated. A residual compares two means
-one span of T s apart: y = (m now - m before) / T, Nm, with m the mean of integrated model torque
-minus momentum. It is linear in the unknown parameters: y = H x + noise.
+one span of T s apart: y = (m now - m before) / T, Nm. m is the mean of integrated model torque minus momentum.
+The residual is linear in the unknown parameters: y = H x + noise.
 
 Each mean has triangular weights over two spans, so y weighs torque by a quadratic spline over three spans. Elastic
-gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm; sampled once per span, this would alias
+gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm; sampled once per span, they would alias
 to torques of a few hertz. A triangle passes 2.4 % of a 60 Hz vibration, the spline 0.4 %.
 """
 
@@ -21,18 +21,18 @@ from r2s.physics.actuation import SLOTS, motor_torque
 from r2s.physics.newton_euler import WORK, equations
 from r2s.physics.robot import SIM_DT
 
-CYCLE, COMMAND, ENDED = range(3)  # counts: cycles of this span, all commands, ended spans (3 at most)
-BEFORE, INTEGRAL = range(2)  # rows: value in the previous cycle; integral over the span
+CYCLE, COMMAND, ENDED = range(3)  # indices of `counts`: cycles of this span, all commands, ended spans (at most 3)
+BEFORE, INTEGRAL = range(2)  # rows of `model`, `friction`, `payload`: value a cycle ago; integral over the span
 # rows of `sums`: residual Nm s, friction Nm s, momentum Nm s, q, dq, motor torque Nm
 RESIDUAL, FRICTION, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
-# triangles: one that ends with this span, one that begins with it; the last span's beginning and ended ones
+# triangle weights: ending with this span, beginning with it; begun with the last span, ended with the last span
 FALLING, RISING, LAST_RISING, LAST_WHOLE = range(4)
 RISING_SUM = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of a rising side; the falling side has SPAN - 1 to 0
-STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in the first spans
+STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in spans 1 and 2
 
 
 class ResidualState(NamedTuple):
-    """Memory of n joints from cycle to cycle."""
+    """State of the computation for n joints, from cycle to cycle."""
 
     counts: np.ndarray  # (3,): CYCLE, COMMAND, ENDED
     commands: np.ndarray  # (SLOTS, n) Nm, delay line
@@ -45,8 +45,8 @@ class ResidualState(NamedTuple):
     sums: np.ndarray  # (4, SUMS, n), triangle sums
     payload_sums: np.ndarray  # (4, n, 10)
     motor_spans: np.ndarray  # (2, n) Nm, mean motor torque of the last two spans, latest first
-    slid: np.ndarray  # (2, n), 1 if the joint slid throughout the last span, and the one before it
-    terms: MomentumTerms  # of this cycle
+    slid: np.ndarray  # (2, n), 1 if the joint slid throughout: the last span, the span before it
+    terms: MomentumTerms  # terms of this cycle
     work: np.ndarray
 
     @staticmethod
@@ -61,11 +61,11 @@ class ResidualState(NamedTuple):
 class MomentumResidual(NamedTuple):
     """Residual of one span of n joints, written by `update_residual`; means are over the span."""
 
-    y: np.ndarray  # (n,) Nm
+    y: np.ndarray  # (n,) Nm, the residual
     payload: np.ndarray  # (n, 10), the payload's columns of y
     friction: np.ndarray  # (n,) Nm, mean
     friction_path: np.ndarray  # (n,) Nm, total variation of friction
-    sliding: np.ndarray  # (n,), 1 if the joint slid all the time
+    sliding: np.ndarray  # (n,), 1 if the joint slid throughout the three spans
     rate: np.ndarray  # (n,) Nm, mean rate of the momentum
     acceleration: np.ndarray  # (n,) rad/s^2, mean
     torque_rate: np.ndarray  # (n,) Nm/s, mean rate of the motor torque

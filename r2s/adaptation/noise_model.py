@@ -79,7 +79,7 @@ def fit_noise(
     The noise comes from `other`, which should be another motion, after a correction fitted to `train` alone. Per
     joint, the model error comes from covariances at lags of 60 to 300 ms; white noise and its growth with the
     momentum rate come from the remaining variance. Then each joint's noise is scaled until the filter's innovations
-    have their predicted variance, and then all noise together until the odds of a payload change stay below the
+    have their predicted variance, and then the noise of all joints until the odds of a payload change stay below the
     number of spans. The initial friction and offsets, and the correction itself, come from both motions.
     """
     first = fit_model_correction(robot, arm, train)
@@ -138,7 +138,7 @@ def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: f
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
-    """Return the noise with all values of each joint multiplied by scale (n,)."""
+    """Return the noise with the white noise and errors of each joint multiplied by scale (n,)."""
     parts = {name: getattr(noise, name) * scale for name in ("white", "momentum_share", "model", "reversal")}
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["momentum_share"]))
 
@@ -158,7 +158,7 @@ def _without_payload(noise: Noise) -> Noise:
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Run a filter; return it, its normalised innovations (M, n), nan where a joint rests, and log odds (M,)."""
+    """Run a filter; return the filter, normalised innovations (M, n) (nan at rest), and log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)

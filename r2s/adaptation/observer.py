@@ -1,12 +1,12 @@
 """Disturbance observer: the momentum residual, added to the policy's torque through a first-order low-pass.
 
-With p = M(q) dq and dp/dt = tau + C^T dq - g - friction - d, generalised momentum gives the disturbance torque d
-without accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006).
+With p = M(q) dq and dp/dt = tau + C^T dq - g - friction - d, generalised momentum p yields the disturbance torque
+d without accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006).
 Here d is the mean over three spans (momentum_residual.py), and the estimate d^ follows filter_s dd^/dt = d - d^.
 Commands pass the identified delay and lag first.
 
-While a joint does not slide all the time, stiction may balance any torque within breakaway. d then lies between two
-bounds, and d^ changes as little as these allow: stiction holds the arm, as in the policy's training.
+If a joint does not slide throughout the spans, stiction may balance any torque within breakaway. Then d lies between
+two bounds, and d^ changes only as much as these require: stiction supports the arm, as in the policy's training.
 """
 
 import numpy as np
@@ -41,10 +41,10 @@ class Observer:
         """Begin a motion from rest with a disturbance of zero."""
         n = len(self._arm.level)
         self._state, self._residual = ResidualState.fresh(n), MomentumResidual.empty(n)
-        self._disturbance = np.zeros((2, n))  # of the last span, and low-passed
+        self._disturbance = np.zeros((2, n))  # disturbance of the last span, and its low-pass
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Process a cycle and return (n,) Nm to add; see `Adapter`."""
+        """Process one cycle and return the torque (n,) Nm to add; see `Adapter`."""
         share = 0.0 if self.held else self._share
         _observe(self._arm, self._state, self._residual, q, dq, tau, share, self._disturbance)
         return self._disturbance[1]
@@ -52,7 +52,7 @@ class Observer:
 
 @njit(cache=True, error_model="numpy")
 def _observe(arm, state, residual, q, dq, tau, share, disturbance):
-    """Process a cycle; write `disturbance` (2, n) Nm: of the last span, and low-passed with the gain `share`."""
+    """Process one cycle; write `disturbance` (2, n) Nm: in the last span, and low-passed with the gain `share`."""
     measured, filtered = disturbance[0], disturbance[1]
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):

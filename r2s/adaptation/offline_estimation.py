@@ -1,4 +1,4 @@
-"""The recursive estimate on a recording: causal, cycle by cycle, as on a working arm."""
+"""The recursive estimate from a recording: causal, cycle by cycle, as on a working arm."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,13 +27,13 @@ def fit_correction(
     posterior: tuple[ParameterSpace, np.ndarray] | None = None,
     unloaded: tuple[Recording, Recording] | None = None,
 ) -> tuple[ModelCorrection, Noise]:
-    """Return the model correction from recordings without a payload, and the remaining noise.
+    """Return the model correction from recordings without a payload, and the remaining uncertainty.
 
     Args:
         robot, dynamics: the identified arm.
-        posterior: space and draws of its identification, for the uncertainty of friction and offsets.
+        posterior: parameter space and posterior draws, for the uncertainty of friction and offsets.
         unloaded: two recordings of commanded torque without a payload, such as those of the identification. Without
-            them the correction is zero, and the model error a tenth of the friction.
+            recordings the correction is zero, and the model error a tenth of the friction.
     """
     arm = make_arm_model(robot, replace(dynamics, declared_payload=np.zeros(4)))  # as during the identification
     prior = prior_of(*posterior) if posterior is not None else None

@@ -1,7 +1,7 @@
 """Test for sudden payload changes (jumps), and their correction in the Kalman filter; compiled.
 
-A generalised likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). For each of the last ONSETS spans it
-stores the filter's signature of a payload jump that began there, and computes the odds of this jump under a prior.
+A generalised likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). For each of the last ONSETS spans, the
+test stores the filter's response (signature) to a jump that began there, and computes the jump's odds under a prior.
 Without a jump the mean odds have expectation 1, so odds above x have probability 1 / x at most (Markov's inequality):
 a threshold equal to the number of tests in ten hours allows one false alarm in that time. Model errors have heavier
 tails than the filter's noise, so a threshold for ten hours aims at one alarm per hour.
@@ -15,14 +15,14 @@ from r2s.adaptation.tuning import NEW_PAYLOAD, ONSETS
 from r2s.compiled import njit
 
 JUMP = 4  # parameters of a jump: mass and first moments
-# `Filter.counts`: onsets in use, index of the next onset, spans that the last jump still affects
+# indices of `Filter.counts`: onsets in use, index of the next onset, spans that the last jump still affects
 USED, NEXT, SINCE_JUMP = range(2, 5)
-MEAN, ONSET = range(2)  # `Filter.log_odds`
+MEAN, ONSET = range(2)  # indices of `Filter.log_odds`
 
 
 @njit(cache=True)
 def begin_onset(filter):
-    """Replace the oldest onset by one that begins with this span."""
+    """Replace the oldest onset by an onset at this span."""
     at = filter.counts[NEXT]
     filter.signature[at] = 0.0
     filter.information[at] = 0.0
@@ -33,7 +33,7 @@ def begin_onset(filter):
 
 @njit(cache=True, error_model="numpy")
 def update_onsets(filter, residual, j, v, S):
-    """Add joint j's innovation v with variance S to all onsets; filter.work[0] (N,) is P h^T."""
+    """Update all onsets with joint j's innovation v of variance S; filter.work[0] (N,) is P h^T."""
     g, h, payload, N, n = np.empty(JUMP), filter.work[0], residual.payload, len(filter.x), len(residual.y)
     friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
     for k in range(filter.counts[USED]):
@@ -74,7 +74,7 @@ def detect(filter, noise):
 
 @njit(cache=True, error_model="numpy")
 def _solve(C, d, prior, A, b):
-    """Return one onset's log odds; write the Cholesky factor of C + P0^-1, diagonal inverted, to A, the jump to b."""
+    """Return one onset's log odds; write the Cholesky factor of C + P0^-1 (diagonal inverted) to A, the jump to b."""
     log = 0.0
     for i in range(JUMP):
         for k in range(i + 1):
@@ -106,7 +106,7 @@ def apply_jump(filter, noise):
     B = -filter.signature[k]
     for c in range(JUMP):
         B[c, c] += 1.0
-    inverse = np.zeros((JUMP, JUMP))  # of the Cholesky factor
+    inverse = np.zeros((JUMP, JUMP))  # inverse Cholesky factor
     for c in range(JUMP):
         inverse[c, c] = A[c, c]
         for i in range(c + 1, JUMP):

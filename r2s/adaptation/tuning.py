@@ -1,4 +1,4 @@
-"""Tuning constants of the room adaptation, each with its unit and source.
+"""Tuning constants of the package adaptation, each with unit and source.
 
 A constant without a named source is an order of magnitude. benchmarks/payload.py tested all of them together on
 development twins (seeds 0 to 9); NAME=VALUE on its command line tests another value.
@@ -28,7 +28,7 @@ FRICTION_LAW_SHARE, ANGLE_FRICTION_SHARE = 0.2, 0.03  # shares of the friction l
 FRICTION_SHARE = OFFSET_NM = 0.3  # share of friction; Nm
 ROTOR_INERTIA, LATENCY_S = 0.1, 0.002  # kg m^2; s
 GEAR_COMPLIANCE = 1e-4  # rad/Nm: gears of 10 kNm/rad
-STRIBECK_SPEED = 0.03  # rad/s, of the friction term that decreases with speed
+STRIBECK_SPEED = 0.03  # rad/s, scale of the friction term that decreases with speed
 LEAST_SPANS = 50  # sliding spans that a fit needs
 CORRELATED_SPANS = 15  # spans that share one error: 0.3 s, see CORRELATION_S
 
@@ -39,8 +39,8 @@ PAYLOAD_MASS, PAYLOAD_CENTRE, PAYLOAD_TENSOR = 0.5 / np.sqrt(3), 0.5 / np.sqrt(5
 WARMED = 0.07  # share of friction that may have changed by temperature since the identification
 FRICTION_DRIFT = 0.007  # 1/sqrt(s): 7 % in 100 s
 OFFSET_DRIFTED, OFFSET_DRIFT = 0.02, 0.003  # share of the friction level; the same per sqrt(s)
-# 1/s, share of the squared largest payload, 0.02 kg^2/s for a Panda's 3 kg: after 1 s, the mass interval spans what
-# stiction hides, b / (r g), 0.1 to 0.25 kg
+# 1/s, share of the squared largest payload, 0.02 kg^2/s for a Panda's 3 kg: after 1 s, the mass interval spans the
+# masses that stiction hides, breakaway torque / (lever arm g), 0.1 to 0.25 kg
 REST_DRIFT = 0.02 / 3.0**2
 PAYLOAD_DRIFT = 0.003  # 1/sqrt(s), share of the payload's prior
 NOISE_ADAPTATION = 0.04  # per span: persistent innovations become noise within 0.5 s
@@ -49,7 +49,7 @@ PAYLOAD_FRICTION = 0.015  # Nm per Nm of payload torque: load-dependent friction
 # without recordings: shares of the friction level (WHITE, MODEL), momentum rate (MOMENTUM), friction step (REVERSAL)
 WHITE_SHARE, MOMENTUM_SHARE, MODEL_SHARE, REVERSAL_SHARE = 0.2, 0.1, 0.1, 0.1
 LAGS = range(3, 16)  # spans, lags at which residuals no longer share the noise of measured speeds
-FINEST_SHARE = 0.03  # of the friction level: smallest model error that a fit may yield
+FINEST_SHARE = 0.03  # share of the friction level: smallest model error that a fit may yield
 SECOND_HALF = 0.7  # scale of a noise fitted from half of the motion; benchmarks/payload.py part=events,quiet
 LEAST_SCALE, MOST_SCALE, SCALINGS = 0.5, 1.5, 8  # scaling of the noise: bounds of one step, most steps
 OUTLIER = 3.0  # standard deviations at which innovations are clipped, because the filter weighs larger ones less
@@ -57,7 +57,7 @@ OUTLIER = 3.0  # standard deviations at which innovations are clipped, because t
 # Kalman filter (kalman.py)
 MOMENTUM_CORRELATION = 5.0  # correlation time of the momentum-rate error, in CORRELATION_S
 STICTION_S = 0.25  # s, over which the torque that stiction balances stays constant
-REST_SPANS = 5  # spans without sliding after which an arm counts as at rest
+REST_SPANS = 5  # spans without sliding after which an arm is at rest
 HUBER = 1.5  # standard deviations of an innovation; benchmarks/payload.py part=events,quiet
 MOST_SURPRISE = 9.0  # squared standard deviations: a larger innovation is a jump, not noise
 
@@ -65,7 +65,7 @@ MOST_SURPRISE = 9.0  # squared standard deviations: a larger innovation is a jum
 ONSETS = 10  # spans at which a jump may have begun: 0.2 s
 THRESHOLD = np.log(36000.0 / T)  # log odds: one false alarm in ten hours (Markov's inequality)
 NEW_PAYLOAD = 0.2  # share of the prior: standard deviation of a payload directly after a jump
-SETTLING_SPANS = round(0.5 / T)  # spans of motion after a rest in which the payload is compared with that before
+SETTLING_SPANS = round(0.5 / T)  # spans of motion after a rest, in which its payload is compared with that before
 # squared distance of two estimates: one false alarm in an hour of tests, doubled because model errors persist
 REPLACED = 2.0 * chi2.isf(T / 3600.0, 4)
 
@@ -81,16 +81,16 @@ ACCELERATION_S = 1 / RATE  # s, low-pass of accelerations: a loop of this rate t
 SPEED_NOISE, ANGLE_NOISE = 3e-3, 2e-5  # rad/s, rad: sensors of a Panda, for all arms
 ANGLE_RATE = 60.0  # 1/s, crossover: slower motion from angles, faster motion from measured speeds
 SLOW_RATE, FAST_RATE = 40.0, 200.0  # 1/s, low-passes of the speed: to detect rest, for friction
-LAG = SLOW_RATE / (FAST_RATE - SLOW_RATE)  # times their difference: lag of the fast one at constant acceleration
+LAG = SLOW_RATE / (FAST_RATE - SLOW_RATE)  # lag of the fast low-pass at constant acceleration / (fast - slow speed)
 # shares of the speed noise: a joint moves if its slow speed is above the first (four standard deviations); it rests
 # if its fast speed is below the third, and its slow speed below the second or STILL cycles have passed
 MOVES, RESTS, STILL_SPEED, STILL = 0.4, 0.2, 1.2, 25
-REVERSES = 1.2  # of the speed noise: a larger fast speed determines the side of friction
-SIDE_NOISE = 1.0  # of the speed noise: standard deviation of the speed that determines the side of friction
-CREPT, CREEP_RATE = 1.5, 50.0  # of the angle noise: displacement of a creeping joint; 1/s, of its low-pass
-BRISTLES = 0.06  # of the squared distance of the breakaway edges: friction variance in the middle of presliding
-MOMENTUM_NOISE = 1.33  # of the speed noise: white noise of momenta from filtered speeds
-# 1/s, high-pass of momenta; 1/s, low-pass of its square; factor from this to momentum noise on vibrating gears
+REVERSES = 1.2  # times the speed noise: a larger fast speed determines the side of friction
+SIDE_NOISE = 1.0  # times the speed noise: standard deviation of the speed that determines the side of friction
+CREPT, CREEP_RATE = 1.5, 50.0  # times the angle noise: displacement of a creeping joint; 1/s, its low-pass
+BRISTLES = 0.06  # share of the squared distance of the breakaway edges: friction variance in the middle of presliding
+MOMENTUM_NOISE = 1.33  # times the speed noise: white noise of the filtered speeds in momenta
+# 1/s, high-pass of momenta; 1/s, low-pass of its square; factor from the result to momentum noise (vibrating gears)
 SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
 FRICTION_NOISE_S = 0.02  # s, correlation time of the friction model's error
 # friction error: share of the friction level, plus share of the least tau_max, 3 mNm for a Panda's wrist of 12 Nm
@@ -98,25 +98,25 @@ WRENCH_FRICTION, LEAST_FRICTION = 0.03, 3e-3 / 12.0
 INERTIA_SHARE = 0.05  # inertia error, as a share of a joint's net torque
 STIFFNESS = 4e4  # N/m, assumed stiffness of the surroundings: force per motion of the tip
 FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s, s: largest force rate from STIFFNESS, its correlation time
-TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s, after innovations above TOUCH variances; gain per cycle
+TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s, if innovations exceed TOUCH variances; gain of their low-pass
 HAND_RATE = 0.3  # N/sqrt(s), random walk of the force, also on an arm at rest
 EDGE_SHARE = 0.7  # per cycle: share by which a resting joint's friction is moved back to its edge
 CREEP_SHARE = 0.3  # share of the force variance that a creeping tip would cause in a stiff environment
-MOMENT_ARM = 0.1  # m, of a force on an arm without a tool: scale of its moment
-FREE_FORCE = 0.1  # N, standard deviation at the beginning of a motion
+MOMENT_ARM = 0.1  # m, lever arm of forces on an arm without a tool, which scales the moment
+FREE_FORCE = 0.1  # N, standard deviation of the force at the beginning of a motion
 # N per kg of the largest payload, per axis, 0.25 N for a Panda's 3 kg: error beyond the filter's covariance
 FORCE_FLOOR = 0.25 / 3.0
-CONFIRMED, RELEASED = 15, 50  # cycles above and below the thresholds after which a contact begins, ends
+CONFIRMED, RELEASED = 15, 50  # cycles above, below the thresholds after which a contact begins, ends
 RELEASE = 0.25  # threshold of release, share of the contact threshold
 BLOCK_S, TAIL = 0.5, 0.2  # s per maximum; share of the largest maxima from which the tail is fitted
 ALARMS_PER_HOUR = 1.0
 # m, path of the tip after which a force that points down is a weight; share of the force that may be horizontal; path
 # subtracted per path with another force
 WEIGHT_PATH, WEIGHT_SHARE, WEIGHT_LOSS = 0.05, 0.3, 5.0
-UNCALIBRATED = 2.0  # times the threshold for Gaussian noise, without recordings of free motion
+UNCALIBRATED = 2.0  # contact threshold / threshold for Gaussian noise, without recordings of free motion
 
 # wrench with a surface (wrench_fusion.py)
 DIFFERENCE_RATE, TEST_RATE, DEPTH_RATE = 50.0, 10.0, 100.0  # 1/s, low-passes: force difference, its test, depth rate
 REFUSED = 3.0  # standard deviations of the tested difference: an error of momentum lasts for seconds
-SURFACE_DRAWS = 16  # most draws of the posterior
-SURFACE_SHARE, SURFACE_FLOOR = 0.02, 0.15  # of the force; N: error of the law on left-out presses
+SURFACE_DRAWS = 16  # largest number of posterior draws
+SURFACE_SHARE, SURFACE_FLOOR = 0.02, 0.15  # share of the force; N: error of the law on left-out presses

@@ -4,11 +4,11 @@
     for each millisecond: observer(state.q, state.dq, command)
     observer.force, observer.force_half, observer.in_contact
 
-The force acts at the tip of `robot.tool`; without a tool it acts at the end effector, with a moment. wrench_filter.py
+The force acts at the tip of `robot.tool`; without a tool, force and moment act at the end effector. wrench_filter.py
 describes the estimate. A contact is a force whose square, in units of its covariance, exceeds a threshold for 15 ms
 while a joint moves: a chi-square test of the hypothesis that no force acts. The threshold aims at one false alarm per
 hour. It is at least the threshold for independent normal errors in each cycle. If errors in motion without contact
-are larger, their tail determines it: the maxima over half seconds have an exponential tail (extreme values of a
+are larger, their tail sets the threshold: maxima over half seconds have an exponential tail (extreme values of a
 chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3), which is
 extrapolated to an hour.
 """
@@ -37,14 +37,14 @@ BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; few
 
 
 class WrenchObserver:
-    """Estimate of the wrench on one arm, cycle by cycle.
+    """Observer that estimates the wrench on one arm, cycle by cycle.
 
     Attributes:
-        threshold: squared force, in variances, above which the arm is in contact.
+        threshold: squared force, in units of its covariance, above which the arm is in contact.
         tool: the robot's tool, or None.
 
     Args:
-        robot, dynamics: the identified arm. threshold: see above; None: twice that for Gaussian noise.
+        robot, dynamics: the identified arm. threshold: see above; None: twice GAUSSIAN.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, threshold: float | None = None):
@@ -95,7 +95,7 @@ class WrenchObserver:
 
     @property
     def hangs(self) -> bool:
-        """Whether the force is the weight of a payload: it has pointed down over 5 cm of motion."""
+        """Whether the force is a payload's weight, because the force has pointed down over 5 cm of motion."""
         return bool(self._state.contact[HANGING] > tuning.WEIGHT_PATH)
 
     @property
@@ -130,12 +130,12 @@ class WrenchObserver:
 
     @property
     def square(self) -> float:
-        """The squared force, in variances, which the test compares with `threshold`."""
+        """The squared force, in units of its covariance, which is compared with `threshold`."""
         return float(self._state.contact[SQUARE])
 
     @property
     def rests(self) -> np.ndarray:
-        """(n,) whether each joint rests; friction of a resting joint may hide a force."""
+        """(n,), whether each joint rests; the friction of a resting joint may hide a force."""
         return self._state.joints[REST] > 0.0
 
 
@@ -161,8 +161,8 @@ def observe_recording(
     """Return a row per millisecond: wrench with half widths of 95 % intervals, contact, and position of the tip.
 
     Args:
-        estimator: estimates the payload, whose effect is subtracted; with a tool, it is frozen in contact.
-        report: receives each estimate at once.
+        estimator: estimates the payload, whose effect is subtracted. With a tool, contact freezes this estimate.
+        report: called with each estimate at once.
     """
     recording = at_rate(robot, recording)
     touch = 1 + 2 * len(observer.wrench)  # column of `in_contact`
@@ -185,7 +185,7 @@ def observe_recording(
             rows[k] = np.concatenate([[recording.t[k]], values, [touches, observer.square], observer.tip])
             if touches and not (k > stretch.start and rows[k - 1, touch]):
                 begun = k
-            if observer.hangs:  # it was a weight: no contact since `begun`
+            if observer.hangs:  # a payload's weight: no contact since `begun`
                 rows[begun:k, touch] = 0.0
     names = [f"force_{c}_N" for c in "xyz"] + [f"moment_{c}_Nm" for c in "xyz"]
     columns = [c for name in names[: len(observer.wrench)] for c in (name, f"{name}_half")]
@@ -205,7 +205,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why recordings without contact yield no `contact_threshold`: too slow or too short. None if they do."""
+    """Return why `contact_threshold` refuses recordings without contact (rate, length); None if it accepts them."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]

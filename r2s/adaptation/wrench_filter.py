@@ -5,14 +5,14 @@ the error b of its friction f = f_model + b, Nm; the generalised momentum p, Nm 
 (momentum.py). dp/dt = u - f + J^T wrench, with u all known torques (De Luca and Mattone, ICRA 2003; as a disturbance
 in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 
-The uncertainty of f depends on the joint (wrench_friction.py):
-- It slides: b is the error of the identified friction, small and of short memory. Near a reversal b is larger,
+The uncertainty of f depends on whether the joint slides (wrench_friction.py):
+- It slides: b is the error of the identified friction, small with short correlation. Near a reversal b is larger,
   because the noisy speed leaves the direction of friction uncertain. Such a joint measures the wrench.
 - It rests: friction balances the other torques and stays within the breakaway edges. Such a joint only limits how far
   the wrench can have changed.
 The wrench changes with the motion of the tip, as in a stiff environment. With all joints at rest the tip is fixed:
-only a hand may change the force, and friction hides changes within the breakaway edges. Once a torque's variance
-exceeds that of a uniform distribution between the edges, it is reset to this distribution.
+only a hand may change the force, and friction hides changes within the breakaway edges. Once the variance
+of a resting joint's friction exceeds that of a uniform distribution between the edges, it is reset to the latter.
 """
 
 import numpy as np
@@ -220,7 +220,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Keep the friction of each resting joint within its edges, and its variance within that of `_hidden`."""
+    """Limit the friction of each resting joint to the breakaway edges, and its variance to `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)
@@ -233,13 +233,13 @@ def _keep_within_edges(noise, state):
             if variance > hidden:
                 middle = 0.5 * (noise.edges[j, 0] + noise.edges[j, 1])
                 _update(state, gain, middle - friction, hidden * variance / (variance - hidden))
-            if beyond != 0.0:  # P stays: the same edge adds no information in every cycle
+            if beyond != 0.0:  # P is unchanged: in later cycles, the same edge adds no information
                 state.x[:] += tuning.EDGE_SHARE * beyond / max(variance, 1e-9) * (P @ gain)
 
 
 @njit(cache=True, error_model="numpy")
 def _update(state, gain, innovation, variance):
-    """Correct the state by a measurement whose derivative by the state is `gain` (N,)."""
+    """Correct the state by a measurement whose derivative with respect to the state is `gain` (N,)."""
     x, P, column = state.x, state.P, state.column
     N = len(x)
     total = variance

@@ -1,8 +1,8 @@
 """Friction in the wrench filter: which joints rest, and in which direction (side) the others slide; compiled.
 
-The speed of a joint at rest stays 0, so its friction balances all other torques. With A = M_rs M_ss^-1 of the
-joints at rest (r) and the sliding ones (s), the momentum of a joint at rest follows from theirs, dp_r/dt = A (dp_s/dt
-- M'_ss dq_s) + M'_rs dq_s, and f_r = u_r + J_r^T wrench - dp_r/dt.
+The speed of a joint at rest stays 0, so its friction balances all other torques. With A = M_rs M_ss^-1 of joints at
+rest (r) and sliding joints (s), the momentum at rest follows from the momentum of the sliding joints: dp_r/dt = A
+(dp_s/dt - M'_ss dq_s) + M'_rs dq_s, and f_r = u_r + J_r^T wrench - dp_r/dt.
 """
 
 import numpy as np
@@ -111,7 +111,7 @@ def known_torque(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
-    """Decide whether joint j rests; a joint that has crept since it came to rest slides for this cycle."""
+    """Decide whether joint j rests; a resting joint that has crept slides in this cycle only."""
     joints[CREEP, j] = 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])
@@ -137,11 +137,11 @@ def _unlagged(joints, j):
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, of friction whose side is inferred from a noisy speed: 4 f^2 p (1 - p)."""
+    """Return the variance, Nm^2, of friction whose side is wrong with probability p: 4 f^2 p (1 - p)."""
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # logistic for the normal distribution
-    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # presliding, whose law is known roughly
+    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # for presliding, whose law is known only roughly
     return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent)
 
 

@@ -1,11 +1,11 @@
 """External force from momentum and from an identified surface together.
 
 Encoders measure the penetration depth of the tip, from which the law of the surface (r2s/physics/surface.py) yields
-the normal force F_s. Its variance s^2 is the sum for the surface's posterior, encoder noise, and errors of the law.
-The force F from momentum has other errors, so one update of a Kalman filter combines both: F' = F + P n (F_s - n . F)
-/ (n . P n + s^2). The difference passes a low-pass first, because angles have noise.
+the normal force F_s. Its variance s^2 comes from the surface's posterior, encoder noise and law errors. The force
+F from momentum, of covariance P, has other errors, so one Kalman update combines both: F' = F + P n (F_s - n . F) /
+(n . P n + s^2). The difference F_s - n . F passes a low-pass first, because angles have noise.
 
-A surface that was never identified, has moved or is another one yields a wrong F_s. So the difference is tested: its
+If the tip touches another surface, or the surface has moved, F_s is wrong. So the difference is tested: its
 low-passed mean, in standard deviations, may not exceed REFUSED (innovation test: Bar-Shalom, Li and Kirubarajan,
 Estimation with Applications to Tracking, 2001, 5.4). A refused surface is ignored for the rest of the motion, because
 a small force would agree with any surface.
@@ -29,10 +29,10 @@ LAW_K, LAW_EXPONENT, LAW_DAMPING, LAW_POINT, LAW_NORMAL, LAW = 0, 1, 2, 3, 6, 9 
 
 
 class SurfaceLaw(NamedTuple):
-    """A surface as numbers for compiled code."""
+    """The law of a surface as numbers for compiled code."""
 
     law: np.ndarray  # (1 + S, LAW): the estimate, then S draws of its posterior
-    radius: float  # m, of the tip
+    radius: float  # m, radius of the tip
     angle: float  # rad, noise of measured angles
 
 
@@ -47,7 +47,7 @@ class FusedWrench(WrenchObserver):
     """A `WrenchObserver` that also uses the law of a surface; momentum alone decides whether there is contact.
 
     Args:
-        surface, draws: identified surface, and posterior draws (r2s/identification/contact/contact_file.py).
+        surface, draws: identified surface, and draws from its posterior (r2s/identification/contact/contact_file.py).
 
     Raises:
         UserError: the robot has no tool.
@@ -116,12 +116,12 @@ def surface_force(law, k, tip, rate):
 
 @njit(cache=True, error_model="numpy")
 def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the variance, N^2, of the surface's force: from posterior, encoders, and errors of the law."""
+    """Return the variance, N^2, of the surface's force, from posterior, encoder noise, and errors of the law."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count
     normal, slope = law.law[0, LAW_NORMAL : LAW_NORMAL + 3], force * law.law[0, LAW_EXPONENT] / depth
-    smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # share of a white noise's variance after the low-pass
+    smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # share of white noise's variance that passes the low-pass
     for j in range(jacobian.shape[1]):
         lever = normal[0] * jacobian[0, j] + normal[1] * jacobian[1, j] + normal[2] * jacobian[2, j]
         square += smooth * (slope * lever * law.angle) ** 2
@@ -130,7 +130,7 @@ def surface_variance(law, force, depth, tip, rate, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance):
-    """Write the fused force (3,) N and its covariance (3, 3) N^2; `memory` (6,) is that of `FusedWrench`."""
+    """Write the fused force (3,) N and its covariance (3, 3) N^2; `memory` (6,): state of `FusedWrench`."""
     fused[:] = force[:3]
     fused_covariance[:] = covariance[:3, :3]
     normal = law.law[0, LAW_NORMAL : LAW_NORMAL + 3]

@@ -1,4 +1,4 @@
-"""State of the wrench filter, which it keeps from cycle to cycle, and the uncertainty of its model."""
+"""State of the wrench filter from cycle to cycle, and the uncertainties that the filter uses."""
 
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from r2s.physics.kinematics import POSE
 from r2s.physics.newton_euler import WORK
 
 COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
-# `WrenchState.contact`: low-passed squared innovations per joint, in variances; squared force in variances, 0 unless
-# a joint moves; 1 in contact; cycles of the square above the threshold, and below the release threshold; path of the
-# tip, m, along which the force pointed down
+# indices of `WrenchState.contact`: low-passed mean of the joints' squared innovations, in variances; squared force in
+# variances, 0 if no joint moves; 1 in contact; cycles of the squared force above the contact threshold, below the
+# release threshold; path of the tip, m, along which the force pointed down
 SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING = range(6)
 # rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; slow cycles; angle where it came to rest,
 # motion since, creep of this cycle, rad; friction model now, a cycle ago, Nm; known torque without motor or friction,
@@ -30,29 +30,29 @@ class WrenchNoise(NamedTuple):
     presliding: np.ndarray  # (n,) rad, 0: a joint sticks until it breaks away
     inertia: float  # inertia error as a share of a joint's net torque
     speed: float  # rad/s, white noise of measured speeds
-    angle: float  # rad, of measured angles
-    floor: float  # N, per axis: force error that its covariance does not include
+    angle: float  # rad, noise of measured angles
+    floor: float  # N, per axis: force error beyond the filter's covariance
 
 
 class WrenchState(NamedTuple):
     """State of the wrench filter, from cycle to cycle."""
 
-    x: np.ndarray  # (N,)
-    P: np.ndarray  # (N, N)
-    joints: np.ndarray  # (ROWS, n)
-    counts: np.ndarray  # (2,)
+    x: np.ndarray  # (N,), mean
+    P: np.ndarray  # (N, N), covariance
+    joints: np.ndarray  # (ROWS, n), see ANGLE to SHAKE
+    counts: np.ndarray  # (2,), COMMAND, CYCLE
     contact: np.ndarray  # (6,), see SURPRISE to HANGING
     payload: np.ndarray  # (10,), payload beyond the model, in the payload frame (momentum.py)
     commands: np.ndarray  # (SLOTS, n) Nm
     place: np.ndarray  # (3,) m, tip in the base frame
-    jacobian: np.ndarray  # (6, n): of the tip's position, and of the rotation
+    jacobian: np.ndarray  # (6, n), Jacobian of the tip's position (3 rows) and rotation (3 rows)
     frames: np.ndarray  # (n, POSE)
     terms: MomentumTerms
     work: np.ndarray
     column: np.ndarray  # (N,)
-    mass: np.ndarray  # (n, n) kg m^2
+    mass: np.ndarray  # (n, n) kg m^2, mass matrix
     coupling: np.ndarray  # (n, n): momentum rate of a joint at rest (row) per net torque of a sliding one (column)
-    mass_rate: np.ndarray  # (n, n) kg m^2/s
+    mass_rate: np.ndarray  # (n, n) kg m^2/s, rate of the mass matrix
 
     @staticmethod
     def fresh(n: int, components: int) -> "WrenchState":

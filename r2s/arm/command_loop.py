@@ -2,8 +2,8 @@
 
 Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives the
 driver's torques and nothing else; tests/test_command_loop.py checks that no other code commands an arm. Every cycle
-checks for a stop request (r2s/arm/stop_request.py). After the driver has brought the arm to rest, the loop also stops
-the arm, and then raises the reason.
+checks for a stop request (r2s/arm/stop_request.py). After the driver has brought the arm to rest, the loop stops the
+arm and raises ArmStopped with the reason.
 """
 
 import time
@@ -24,7 +24,7 @@ from r2s.physics.robot import SIM_DT
 REST_S = 0.5  # s, longest duration
 REST_RATE = 15.0  # 1/s, decay rate of the joint speeds under damping
 REST_SHARE = 0.2  # of tau_max, limit of the damping torque
-STILL = 0.02  # rad/s, speed below which a joint counts as at rest
+STILL = 0.02  # rad/s, a slower joint is treated as at rest
 SLIDING = 0.05  # rad/s, replaces STILL after SLIDES_S: damping cannot stop a joint that friction does not hold
 SLIDES_S = 0.04  # s
 
@@ -40,8 +40,8 @@ class CommandLoop:
     Args:
         arm: the arm. driver: limits the torques of all motions of this loop.
         log: receives (state, torque) of every cycle before the torque is sent.
-        adapter: called once per cycle; its torque is added in the next cycle. If it raises, the driver stops the arm
-            as after a missing command, and then the exception propagates.
+        adapter: called once per cycle; its torque is added in the next cycle. If the adapter raises, the driver
+            stops the arm as if commands were missing, and then the exception propagates.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class CommandLoop:
         return self.state
 
     def begin(self) -> None:
-        """Begin a motion at the arm's current posture; raise StopRequested after a request to stop."""
+        """Begin a motion at the arm's current posture; raise StopRequested if a stop was requested."""
         self._check_request()
         self._reset()
         self.state = self.arm.read()
@@ -86,10 +86,10 @@ class CommandLoop:
         """Run one cycle and return the state of the next one.
 
         Args:
-            command: (c,) for the control law; None: no new one. hold: (n,) Nm, part of the target that a stop keeps.
+            command: (c,), input of the control law; None: no new command. hold: (n,) Nm, see `DriverBatch.__call__`.
 
         Raises:
-            StopRequested: after a request to stop, when the driver has brought the arm to rest.
+            StopRequested: a stop was requested, and the driver has brought the arm to rest.
             ArmStopped: the arm stopped itself, or the driver brought it to rest; the motion has ended.
         """
         if self.driver.stopping is None and (reason := requested()) is not None:
@@ -106,7 +106,7 @@ class CommandLoop:
         return self.state
 
     def _step(self, command: np.ndarray | None, hold: np.ndarray | None) -> None:
-        """Run one cycle; unlike `_cycle`, do not raise when the driver has brought the arm to rest."""
+        """Run one cycle as `_cycle` does, but do not raise ArmStopped when the driver has brought the arm to rest."""
         if self._ended:
             raise ArmStopped("the motion is over")
         began = time.perf_counter()
@@ -125,10 +125,10 @@ class CommandLoop:
         self.state = self.arm.read()
 
     def rest(self, hold: np.ndarray | None = None) -> None:
-        """Damp the arm's motion and bring its command to `hold` (n,) Nm, for at most 0.5 s.
+        """Damp the motion until the arm rests under a command of `hold` (n,) Nm, for at most 0.5 s.
 
-        As in a stop by the driver, `resist` changes `hold` if joints keep sliding, unless the arm reports a contact.
-        Without `hold`, as after a contact, the command goes to zero.
+        If joints slide on without a contact, `resist` changes this torque, as in a stop by the driver.
+        Without `hold`, the command goes to zero; callers omit it after a contact.
         """
         inertia, robot = 1 / np.diag(self._inverse(self.state.q[None])[0]), self.arm.robot
         limit, step, most = REST_SHARE * robot.tau_max, robot.step_max, ADDED * robot.tau_max
@@ -142,7 +142,7 @@ class CommandLoop:
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:
-        """Complete a stop that the driver has begun by the end of a motion, and raise its reason; else do nothing.
+        """If the driver is stopping the arm when a motion ends, complete this stop and raise its reason.
 
         Raises:
             StopRequested, ArmStopped: as `__call__`.
@@ -151,9 +151,9 @@ class CommandLoop:
             self._cycle(None)
 
     def halt(self, reason: str) -> None:
-        """Bring the arm to rest and its command to zero, as after a contact, then raise ArmStopped with `reason`.
+        """Damp the arm, bring its command to zero as after a contact, and raise ArmStopped with `reason`.
 
-        Do nothing if the driver is already stopping the arm, because then the stop makes the arm leave its path.
+        Do nothing if the driver is already stopping the arm: the arm then leaves its path because of this stop.
         """
         if self.driver.stopping is not None:
             return
@@ -161,7 +161,7 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return why the driver was stopping it, or why the arm stopped itself meanwhile, else None.
+        """Stop the arm; return the reason if the driver was stopping it or it stopped itself meanwhile, else None.
 
         With a push limit the driver first handles a contact force, as in any stop (r2s/physics/contact_stop.py).
         """
@@ -175,7 +175,7 @@ class CommandLoop:
         return reason
 
     def _leave(self) -> str | None:
-        """Let the driver stop an arm whose motion is over; return why the arm stopped itself meanwhile, or None."""
+        """Let the driver stop the arm after a motion; return the reason if the arm stopped itself, else None."""
         self.driver.stop("the motion is over")
         try:
             while not self.driver.done:
@@ -186,7 +186,7 @@ class CommandLoop:
 
     def _check_request(self) -> None:
         if (reason := requested()) is not None:
-            self.state = self.arm.read()  # a runner observes it even if no motion begins
+            self.state = self.arm.read()  # a runner uses this state even if no motion begins
             serve()
             raise StopRequested(reason)
 

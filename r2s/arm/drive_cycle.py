@@ -29,7 +29,7 @@ from r2s.physics.safety_filter import (
     limit_rate,
 )
 
-STILL = 0.02  # rad/s, speed below which a joint counts as at rest
+STILL = 0.02  # rad/s, a slower joint is treated as at rest
 # rad/s, natural frequency of the spring that `resist` adds to a joint that keeps sliding during a stop. Our choice:
 # half of RATE of the safety filter, because the filter damps this spring.
 SPRING = 15.0
@@ -40,16 +40,16 @@ TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` wou
 
 
 class Memory(NamedTuple):
-    """State of the driver for m arms; `drive_cycle` updates it.
+    """The state of the driver of m arms, which `drive_cycle` updates.
 
     Attributes:
         command: (m, c), the last finite command. law: (m, k), memory of the control law.
         target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `Actuation`.
         sent: (m, n) Nm, the last torque command.
-        held: (m, n) Nm, last torque of the adapter plus `Given.hold`; a stop keeps it unless there is a contact.
-        share: (m,), factor on the allowed speeds: 1, but during a stop it falls to what the stop needs.
-        cycle, silent, damped: (m,), cycles since the motion began, the last finite command came, the stop began.
-        why: (m,), stop code, RUNS: no stop. limited: (m,), cycles in which the safety filter changed the torque.
+        held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop continues to apply it, except in contact.
+        share: (m,), factor on the allowed speeds: 1; during a stop it falls to the speed that the stop still needs.
+        cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, and the stop's start.
+        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the filter changed the torque.
         rests: (m,), whether the arm is at rest. commanded: (m,), whether a command has arrived.
         least: (m, K) m, least allowed distance of each pair of the fence.
         push: (m, COLUMNS of push_limit.py), parameters and state of the push limit; (m, 0): no push limit.
@@ -84,10 +84,10 @@ class Memory(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Inputs of one cycle.
+    """Inputs of the driver in one cycle, for m arms.
 
     command: (m, c), valid if `new`. added: (m, n) Nm, torque of the adapters, valid if `adds`. hold: (m, n) Nm, part
-    of the target that a stop keeps. contact: (m,), whether each arm reports a contact.
+    of the target that a stop continues to apply. contact: (m,), whether each arm reports a contact.
     """
 
     command: np.ndarray
@@ -99,9 +99,9 @@ class Given(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Limits of target torque (`torque`) and adapter torque (`added`), (n,) Nm, and settings of the driver.
+    """Settings of the driver; `torque` and `added`, (n,) Nm, limit the target torque and the adapter torque.
 
-    It stops an arm beyond q_low, q_high, dq_max (n,) rad, rad/s, or without a finite command for `deadline` s.
+    An arm is stopped beyond q_low, q_high, dq_max (n,) rad, rad/s, or `deadline` s after the last finite command.
     spring: (n,) Nm/rad, see `resist`. factor: gain of the low-pass. fade: cycles of the soft start.
     """
 
@@ -128,7 +128,7 @@ class Model(NamedTuple):
 
 @njit(cache=True)
 def _watch(i, q, dq, given, bounds, memory):
-    """Store a finite command of arm i, and set `why` if the arm has to stop; return whether its state is finite."""
+    """Store arm i's command if finite; set `why` if the arm must stop; return whether the arm's state is finite."""
     seen = np.isfinite(q).all() and np.isfinite(dq).all()
     helped = given.adds and np.isfinite(given.added[i]).all()
     if given.new and np.isfinite(given.command[i]).all() and helped == given.adds:
@@ -149,9 +149,9 @@ def _watch(i, q, dq, given, bounds, memory):
 
 @njit(cache=True)
 def resist(dq, spring, most, held):
-    """Change the held compensation (n,) Nm so that it opposes joints that still slide at dq (n,) rad/s.
+    """Change the compensation `held` (n,) Nm so that it opposes joints that still slide, at dq (n,) rad/s.
 
-    Joints keep sliding under an undeclared load, or if the compensation still contains friction of the motion.
+    Joints slide on under an undeclared load, or if the compensation still contains the motion's friction torque.
 
     Args:
         spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound on the compensation.
@@ -165,7 +165,7 @@ def resist(dq, spring, most, held):
 
 @njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
-    """Add the adapter's torque to the target (n,) Nm of arm i, or during a stop the held torque."""
+    """Add the adapter's torque to the target (n,) Nm of arm i; during a stop, add the held torque instead."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:
@@ -194,7 +194,7 @@ def _kinematics(model, q):
 
 @njit(cache=True)
 def _brake(i, seen, arm, bounds, model, memory):
-    """Set target torque and allowed speeds of arm i in a stop; braking begins at once, from the present speed.
+    """Set arm i's target torque during a stop, and lower its allowed speeds, beginning at the present speed.
 
     Only a stop with code SILENT, LAW_NOT_FINITE or REQUESTED handles a contact force (`stop_torque`).
     """
@@ -216,8 +216,8 @@ def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
-        q, dq: (m, n) rad, rad/s. applied: (m, n) Nm, last torque. given: `Given`. control: law number and parameters.
-        bounds: `Bounds`. model: `Model`. memory: `Memory`, updated.
+        q, dq: (m, n) rad, rad/s. applied: (m, n) Nm, torque of the last cycle. given, bounds, model: see the classes.
+        control: number and parameters of the control law. memory: `Memory`, updated.
     """
     out, (m, n) = np.empty_like(memory.sent), q.shape
     number, parameters = control
@@ -278,7 +278,7 @@ drive_cycle = njit(cache=True)(_drive_cycle)
 
 @cache
 def compiled_cycle(laws: tuple[Callable, ...]) -> Callable:
-    """Return `drive_cycle` for these control laws; laws that are not built in require compilation in each process."""
+    """Return `drive_cycle` with these control laws; if one is not built in, each process compiles the cycle anew."""
     if laws == BUILT_IN:
         return drive_cycle
     return njit(FunctionType(_drive_cycle.__code__, {**globals(), "control_law": chain(laws)}))

@@ -4,7 +4,7 @@ Each cycle has these steps: check that the command is finite and fresh (watchdog
 (r2s/physics/control_laws.py) -> soft start and low-pass -> add an adapter's torque (r2s/adaptation/adapter.py) ->
 safety filter (r2s/physics/safety_filter.py), the same as in training -> rate limit relative to the torque that the
 arm applied in the last cycle. The driver reads no clock and calls no arm: its only inputs are states and commands, so
-the tests can pass it a million hostile ones.
+tests can run it on a million hostile inputs.
 
 `DriverBatch` drives many arms in lock-step, `Driver` one.
 """
@@ -55,15 +55,15 @@ class DriverBatch:
     """The driver of m arms: the last stage that every torque command passes.
 
     Attributes:
-        stopping: for each of the m arms, why the driver brings it to rest; None: it does not.
+        stopping: for each of the m arms, the reason why the driver is bringing it to rest, or None.
 
     Args:
         robot: limits and nominal links. torque: (n,) Nm, largest target torque of each joint.
         m: number of arms. cutoff_hz: cutoff of the low-pass. period_s: s between two commands of the policy.
         soft_start_s: s over which the target torque fades in at the start of a motion; 0: no fade.
-        friction: (n,) Nm, level of each joint's friction. rotors: (n,) kg m^2, see `Dynamics.armature`; None: the
-            robot's. control: control law; None: commands are torques (n,) Nm.
-        fence: pairs of bodies; the driver stops an arm before a pair touches; None: no fence.
+        friction: (n,) Nm, level of each joint's friction. rotors: (n,) kg m^2, see `Dynamics.armature`; None: as in
+            `robot`. control: control law that maps commands to torques; None: commands are torques (n,) Nm.
+        fence: pairs of bodies; the driver stops an arm before the bodies of a pair touch; None: no fence.
         speed_share: factor on all allowed speeds, in (0, 1].
         push_limit: limits the contact force and the approach speed of the robot's tool; None: no limit.
     """
@@ -129,7 +129,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, the compensation that a stop keeps, plus the torque of the contact force in a 'hold' stop."""
+        """(m, n) Nm, compensation that continues in a stop, plus the contact force's torque in a 'hold' stop."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -142,7 +142,7 @@ class DriverBatch:
 
     @property
     def limited(self) -> np.ndarray:
-        """(m,), number of cycles of the motion in which the safety filter changed the command."""
+        """(m,), number of cycles since the motion began in which the safety filter changed the command."""
         return self._memory.limited
 
     @property
@@ -164,14 +164,14 @@ class DriverBatch:
         """Return the torque commands (m, n) Nm of this cycle.
 
         Args:
-            q, dq: (m, n) rad, rad/s, of this cycle; the torque of an arm where they are not finite falls to zero.
+            q, dq: (m, n) rad, rad/s, in this cycle. If an arm's values are not finite, its torque falls to zero.
             tau_J_d: (m, n) Nm, the torque that the arms applied in the last cycle.
             command: (m, c), new commands for the control law; None: no new commands in this cycle.
-            added: (m, n) Nm, torque of the adapters in this cycle, clipped to ADDED * tau_max; None: no adapter. For
-                an arm where it is not finite, nothing is added and the command of this cycle is ignored.
+            added: (m, n) Nm, torque of the adapters in this cycle, clipped to ADDED * tau_max; None: no adapter. If
+                an arm's values are not finite, they are not added, and the arm's command of this cycle is ignored.
             hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. A stop
-                keeps the last `hold` + `added`, clipped to ADDED * tau_max.
-            contact: (m,), whether each arm reports a contact; a stop then keeps no compensation. None: no contact.
+                continues to apply the last sum of `hold` and `added`, clipped to ADDED * tau_max.
+            contact: (m,), whether each arm reports a contact; a stop then applies no compensation. None: no contact.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)
@@ -187,7 +187,7 @@ class DriverBatch:
         return out
 
     def stop(self, reason: str) -> None:
-        """Begin to bring all arms to rest in the next cycle; an arm that is already stopping keeps its reason."""
+        """Begin to bring all arms to rest in the next cycle; the reason of an already stopping arm stays."""
         self._memory.why[self._memory.why == RUNS] = REQUESTED
         self.stopping = [reason if own is None else own for own in self.stopping]
 
@@ -223,7 +223,7 @@ class Driver:
 
     @property
     def stopping(self) -> str | None:
-        """Why the driver brings the arm to rest; None: it does not."""
+        """The reason why the driver is bringing the arm to rest, or None."""
         return self._drivers.stopping[0]
 
     @property
@@ -233,7 +233,7 @@ class Driver:
 
     @property
     def held(self) -> np.ndarray:
-        """(n,) Nm, see `DriverBatch.held`; in contact it is zero, except for the contact force of a 'hold' stop."""
+        """(n,) Nm, see `DriverBatch.held`; in contact only the contact force's torque of a 'hold' stop."""
         return self._drivers.held[0]
 
     @property
@@ -243,7 +243,7 @@ class Driver:
 
     @property
     def limited(self) -> int:
-        """Number of cycles of the motion in which the safety filter changed the command."""
+        """Number of cycles since the motion began in which the safety filter changed the command."""
         return int(self._drivers.limited[0])
 
     @property
@@ -265,7 +265,7 @@ class Driver:
         """Return the torque command (n,) Nm of this cycle.
 
         Args:
-            state: the arm's state in this cycle. command: (c,) for the control law; None: no new command.
+            state: the arm's state in this cycle. command: (c,), input of the control law; None: no new command.
             added: (n,) Nm, torque of the adapter; None: no adapter. hold: (n,) Nm, see `DriverBatch.__call__`.
         """
         given, more, kept = (None if x is None else x[None] for x in (command, added, hold))

@@ -1,8 +1,8 @@
 """The interface of an arm, real or simulated: move to a posture, read, send one torque per 1 kHz cycle, stop.
 
-The convention is libfranka's: commands exclude gravity, and the arm adds its own gravity compensation. A panda_py
-`control(callback)` loop and pylibfranka's readOnce/writeOnce both fit: `read` returns the state of the current cycle,
-`command` ends the cycle and waits for the next.
+The convention is libfranka's: commands exclude gravity, and the arm adds its own gravity compensation. `read`
+returns the state of the current cycle; `command` ends the cycle and waits for the next. This fits both panda_py's
+`control(callback)` loop and pylibfranka's readOnce/writeOnce.
 """
 
 from collections.abc import Callable
@@ -20,18 +20,18 @@ class ArmStopped(RuntimeError):  # noqa: N818 (a stop is not a bug)
     """The motion ended for the reason in the message; the next `move_to` begins a new one.
 
     Attributes:
-        recording: the rows recorded before the stop, or None if there are too few to keep.
+        recording: what was recorded before the stop; None if nothing, or too little, was recorded.
     """
 
     recording: Recording | None = None
 
 
 class NotCleared(ArmStopped):
-    """The arm stopped before, and no operator allowed further motion; the run ends here."""
+    """After an earlier stop, no operator allowed the arm to move again; the run ends here."""
 
 
 class StopRequested(ArmStopped):
-    """A signal, or the end of the process that sends the commands, ended the motion; the run ends here."""
+    """The motion ended on a signal, or because the process that sends the commands ended; the run ends here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,19 +39,19 @@ class ArmState:
     """One 1 kHz sample of an arm with n joints.
 
     Attributes:
-        t: s, since the motion began.
+        t: s, time since the motion began.
         q, dq: (n,) rad, rad/s, as measured by the arm.
-        tau_J: (n,) Nm, link-side torque sensor: includes gravity, excludes most motor friction.
+        tau_J: (n,) Nm, measured link-side torque; it includes gravity, but little of the motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
-        tau_ext_hat_filtered: (n,) Nm, torque that the joints exert on the surroundings: tau_J minus the arm model's
-            gravity, declared load and dynamics. None, here and below: this arm does not report the value.
+        tau_ext_hat_filtered: (n,) Nm, torque that the joints exert on the surroundings: tau_J minus the torque
+            of the arm's own model (gravity, load, dynamics). None here or below: the arm does not report this value.
         O_F_ext_hat_K: (6,) N, Nm, wrench that the end effector exerts on the surroundings, in the base frame.
         joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,) for joints, (6,) for the end
             effector; above 0 where the external torque or force exceeds the contact or collision threshold.
-        control_command_success_rate: share of the last 100 commands that arrived; 0 while no motion runs.
+        control_command_success_rate: share of the last 100 commands that reached the arm; 0 while no motion runs.
         O_T_EE: (16,), pose matrix of the end effector in the base frame, column by column.
         m_ee, m_load: kg, masses of end effector and load that the arm's gravity compensation assumes.
-        box: (6,), centre, m, and first axis of a box in the base frame, as a camera measures them.
+        box: (6,), a box in the base frame, as a camera measures it: centre, m, and direction of its first axis.
     """
 
     t: float
@@ -79,7 +79,7 @@ class ArmState:
 
     @property
     def signals(self) -> np.ndarray:
-        """(sum of `signal_sizes`,), the values of all `SIGNALS` in one array; nan: not reported."""
+        """(sum of `signal_sizes`,), the values of all `SIGNALS` in one array; nan where the arm reports no value."""
         sizes = signal_sizes(len(self.q)).items()
         values = ((getattr(self, name), size) for name, size in sizes)
         return np.concatenate([np.full(size, np.nan) if x is None else np.reshape(x, size) for x, size in values])
@@ -92,7 +92,7 @@ def signal_sizes(n: int) -> dict[str, int]:
 
 
 def named_signals(values: np.ndarray, n: int) -> dict[str, Any]:
-    """Return `ArmState.signals` (..., k) by name: (..., size), or (...) for size 1; all-nan signals are left out."""
+    """Split `ArmState.signals` (..., k) by name, into (..., size), or (...) for size 1; omit all-nan signals."""
     sizes = signal_sizes(n)
     parts = zip(sizes, np.split(values, np.cumsum([*sizes.values()])[:-1], axis=-1), strict=True)
     return {name: x[..., 0] if x.shape[-1] == 1 else x for name, x in parts if not np.isnan(x).all()}
@@ -108,7 +108,7 @@ class Arm(Protocol):
         ...
 
     def read(self) -> ArmState:
-        """Return the state of the current cycle; it changes only with `command`."""
+        """Return the state of the current cycle; only `command` advances to the next cycle."""
         ...
 
     def command(self, tau: np.ndarray) -> None:
@@ -116,7 +116,7 @@ class Arm(Protocol):
 
         Raises:
             ArmStopped: tau is not finite, exceeds tau_max, or differs from tau_J_d by more than dtau_max * 1 ms; a
-                joint left its position or velocity limits; or the arm stopped before.
+                joint left its position or velocity limits; or the arm had already stopped.
 
         """
         ...
@@ -131,10 +131,10 @@ class Operated(Protocol):
     """An `Arm` with an operator, who must agree before the arm moves again after any stop.
 
     Attributes:
-        operator: called with the reason of the stop, returns whether the operator agrees; None: no operator, which
-            counts as a refusal.
-        blocked: reason of a pending stop, for which `move_to` first asks the operator; None: no stop is pending. Code
-            that stops the arm's motion writes its reason here.
+        operator: function that asks the operator, given the reason of the stop, and returns whether the arm may move.
+            None: there is no operator, so the arm may not.
+        blocked: reason of a stop about which `move_to` must first ask the operator; None: there is none. Code that
+            stops the arm's motion writes its reason here.
     """
 
     operator: Callable[[str], bool] | None
@@ -146,19 +146,19 @@ class Holds(Protocol):
     """An `Arm` whose `stop` damps the motion.
 
     Attributes:
-        hold: (n,) Nm, compensation, such as a payload's, that the next `stop` applies while it damps the motion.
+        hold: (n,) Nm, torque that the next `stop` adds to its damping, for example to carry a payload.
     """
 
     hold: np.ndarray
 
 
 def speed_share(arm: Arm) -> float:
-    """Return the arm's factor on all allowed speeds, which its operator sets; 1 if the arm has no such setting."""
+    """Return the factor by which the arm's settings scale all allowed speeds; 1 if the arm has no such setting."""
     return float(getattr(arm, "speed_share", 1.0))
 
 
 class Reflexes:
-    """Checks of commands and states, like those by which a real arm stops itself; error messages name the joint."""
+    """Checks commands and states, as a real arm does in order to stop itself; error messages name the joint."""
 
     def __init__(self, robot: Robot, dt: float = SIM_DT):
         self.robot = robot

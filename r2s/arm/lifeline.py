@@ -1,7 +1,7 @@
 """Detect at once that another process has died.
 
 When the owner of a robust mutex dies, the kernel marks the mutex (robust_list of futex(2)) before it unmaps the
-owner's memory. Its children get a new parent only afterwards, tens of ms later if the owner has imported PyTorch.
+owner's memory. The owner's child processes get a new parent only after that, tens of ms later if it imported PyTorch.
 """
 
 import ctypes
@@ -11,20 +11,20 @@ from multiprocessing.sharedctypes import RawArray
 
 OWNER_DIED, OWNER = 0x40000000, 0x3FFFFFFF  # FUTEX_OWNER_DIED and FUTEX_TID_MASK of linux/futex.h
 SHARED = ROBUST = 1  # PTHREAD_PROCESS_SHARED, PTHREAD_MUTEX_ROBUST
-_kept: list[RawArray] = []  # type: ignore[valid-type]  # the C library may still refer to a mutex that was held
+_kept: list[RawArray] = []  # type: ignore[valid-type]  # once locked: the C library may still refer to them
 
 
 class Lifeline:
-    """A mutex in memory that two processes share; one holds it, the other sees whether it died.
+    """A mutex in shared memory: one process locks it, and the other can see whether that process has died.
 
-    Where the C library has no robust mutex of this kind, `lost` never reports anything.
+    Where the C library has no robust mutex with this layout, `lost` always returns None.
     """
 
     def __init__(self):
         self._raw = RawArray("i", 32)  # a mutex has 40 bytes, its first word is the futex
 
     def hold(self) -> None:
-        """Hold the mutex until this thread ends, or `release`."""
+        """Lock the mutex until this thread ends or `release` is called."""
         if not sys.platform.startswith("linux"):
             return
         libc, settings = ctypes.CDLL(None), (ctypes.c_long * 8)()
@@ -38,10 +38,10 @@ class Lifeline:
             self.release()
 
     def release(self) -> None:
-        """Release the mutex without causing `lost` to report a death."""
+        """Unlock the mutex, so that `lost` does not report the later end of this thread."""
         if sys.platform.startswith("linux"):
             ctypes.CDLL(None).pthread_mutex_unlock(self._raw)
 
     def lost(self) -> str | None:
-        """Return a message if the thread that held the mutex has died, else None; a source for `watched`."""
+        """Return a message if the thread that locked the mutex has died, else None; a source for `watched`."""
         return "the process of the policy has ended" if self._raw[0] & OWNER_DIED else None

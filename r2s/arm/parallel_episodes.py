@@ -1,4 +1,4 @@
-"""Episodes on a twin, distributed over cores: each chunk of goals runs on a new twin with the same seed.
+"""Run episodes on a twin in parallel: each chunk of goals runs on a new twin with the same seed.
 
 The chunks, and therefore the results, do not depend on the number of cores. Each chunk has its own stream of sensor
 noise. A twin whose friction warms up begins each chunk cold.
@@ -33,12 +33,12 @@ def run_parallel_episodes(
 ) -> tuple[Episodes, list[Stop], Timing]:
     """Return the episodes, their early stops, and measured durations.
 
-    On Linux the processes are forked, so call this before any thread starts; elsewhere it uses one process.
+    On Linux the processes are forked, so call this before any thread starts; elsewhere this process runs all chunks.
 
     Args:
-        open_twin: opens the twin of a chunk, by the chunk's number.
+        open_twin: function that opens a twin for a chunk, given the chunk's number.
         policy, task: see `rollout`.
-        starts, goals: (E, n) rad, (E, ...).
+        starts: (E, n) rad, first postures of the episodes. goals: (E, ...), see `Task`.
         workers: largest number of processes.
         progress: called with (goals done, total).
     """
@@ -68,7 +68,7 @@ def run_parallel_episodes(
     return replace(each[0], **together), [stop for _, stops, _ in parts for stop in stops], timing
 
 
-_job: Any = None  # of a forked process
+_job: Any = None  # arguments that a forked process got from `_initialize`
 
 
 def _initialize(job: Any) -> None:

@@ -1,4 +1,4 @@
-"""A policy on an arm that waits for its commands: observe, query the policy at its rate, command the arm at 1 kHz.
+"""Run a policy on an arm that waits for commands: observe, query the policy at its rate, command the arm at 1 kHz.
 
 The arm's time stands still while the policy computes. This suits twins and the emulator in lock-step, and makes runs
 repeatable bit for bit. r2s/arm/realtime_process.py runs an arm whose clock does not wait, in a process of its own.
@@ -25,8 +25,8 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import State, Task
 
 LOGGED_S = 1.0  # s before a stop that are logged, at 1 kHz
-SMOOTHING_CYCLES = 20  # on each side of a cycle; encoder noise then causes a speed error of 2e-4 rad/s
-ATTEMPTS = 3  # to bring an `Operated` arm to its start; after a stop the operator must agree to the next one
+SMOOTHING_CYCLES = 20  # cycles on each side of a cycle; the speed error from encoder noise is then 2e-4 rad/s
+ATTEMPTS = 3  # most attempts to bring an `Operated` arm to its start; the operator must agree to each new one
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Stop:
     """Why an episode ended early.
 
     Attributes:
-        episode: its number, from 0. when: time in the episode, or the way to its start. reason: of arm or driver.
+        episode: number, from 0. when: time in the episode, or "on the way to its start". reason: why it ended.
         log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, command Nm.
     """
 
@@ -55,7 +55,7 @@ def episode_driver(
     rotors: np.ndarray | None = None,
     speed_share: float = 1.0,
 ) -> Driver:
-    """Return the driver of an episode of `task`; friction (n,) Nm, rotors and speed_share as in `DriverBatch`."""
+    """Return the driver for an episode of `task`; for friction (n,) Nm, rotors, speed_share see `DriverBatch`."""
     period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
     own = {"soft_start_s": soft_start_s, "rotors": rotors, "control": task.control(robot)}
     fence = CollisionCheck(robot, table=None, may_touch=task.may_touch)
@@ -72,14 +72,14 @@ class PolicyRunner:
         speeds: (1, T, n) rad/s after each control step of the last episode, see `smooth_speeds`.
         halted: why no further episode runs: a request to stop, the operator's refusal after a stop, or too many
             failed attempts to reach a start. None: not halted.
-        blocked: reason of the stop that ended the last episode, until the operator agrees to go on; None: no stop.
+        blocked: `Operated.blocked` at the end of the last episode; None: no stop is pending.
 
     Args:
         arm: an arm that waits for its commands.
         task: rates, torque limits and controller.
         friction: (n,) Nm, friction level of each joint: `Dynamics.level` of the dynamics the policy was trained on.
         soft_start_s: s, fade-in of an episode's torque; recommended on hardware, 0 for twins.
-        rotors: (n,) kg m^2, `Dynamics.armature` of the same dynamics; None: the robot's.
+        rotors: (n,) kg m^2, `Dynamics.armature` of the same dynamics; None: as in `arm.robot`.
         adapter: adds torque to the policy's; None: no adaptation.
     """
 
@@ -111,8 +111,8 @@ class PolicyRunner:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move to starts (1, n) rad and begin episode `first` there.
 
-        A stop during this move ends the episode. On an `Operated` arm the operator may first agree to new attempts,
-        up to ATTEMPTS in all; without consent or success neither this nor any later episode begins.
+        A stop during this move ends the episode. An `Operated` arm tries again if its operator agrees, up to
+        ATTEMPTS times in all. If the operator refuses or all attempts fail, this and later episodes do not run.
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []
@@ -126,20 +126,20 @@ class PolicyRunner:
         return self._observe()
 
     def step(self, command: np.ndarray) -> State:
-        """Run one control period with the command (1, c) of the controller, or until the arm stops."""
+        """Run one control period with the command (1, c), or less if the arm stops, and return the state."""
         self.timing.policy.append(time.perf_counter() - self._observed_at)
         self.run(chain([command[0]], repeat(None, self._substeps - 1)))
         return self._observe()
 
     def run(self, commands: Iterable[np.ndarray | None]) -> None:
-        """Run one 1 kHz cycle per command (c,), None for no new one, until the commands end or the arm stops."""
+        """Run one 1 kHz cycle for each command (c,) or None (no new command); end early if the arm stops."""
         for command in commands:
             self._cycle(command)
             if self._stopped:
                 return
 
     def end(self) -> np.ndarray:
-        """Stop the arm; return (1,) bool: whether arm, driver, a request or missed commands stopped the episode."""
+        """Stop the arm; return (1,) bool: whether arm, driver, a request or lost commands ended the episode."""
         reason = self._loop.end() or requested() or self.timing.refusal(self._arm)
         if not self._stopped and reason is not None:  # a stop that had not yet been raised when the episode ended
             self._record_stop(f"{self._loop.state.t:.2f} s", reason)
@@ -157,7 +157,7 @@ class PolicyRunner:
 
     def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
         """Return the arm's state, the low-pass filtered target (n,) Nm, whether the episode was stopped, and the
-        number of its cycles in which the safety filter changed the torque.
+        number of cycles in which the safety filter changed the torque.
         """
         driver = self._loop.driver
         return self._loop.state, driver.effort, self._stopped, driver.limited
@@ -208,9 +208,9 @@ class PolicyRunner:
 
 
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
-    """Return smoothed speeds (., n) rad/s at every `every`-th cycle of a series of angles (n,) rad.
+    """Return smoothed joint speeds (k, n) rad/s at every `every`-th of the measured angles (n,) rad.
 
-    Each is the slope of a parabola over SMOOTHING_CYCLES on each side (Savitzky and Golay, Anal. Chem. 36(8), 1964).
+    A speed is a parabola's slope over SMOOTHING_CYCLES on each side (Savitzky and Golay, Anal. Chem. 36(8), 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:
@@ -220,7 +220,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Return the `State` of one arm, a batch of one; effort (n,) Nm, stopped and limited as in `State`."""
+    """Return the `State` of one arm, as a batch of one; effort (n,) Nm, stopped and limited become its entries."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],

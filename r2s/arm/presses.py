@@ -1,7 +1,7 @@
 """Record presses and slides on a surface with any arm, from which the surface can be identified.
 
 The arm follows paths of `task=wipe` by hybrid control with its identified model, through the driver. The force rises
-along one path and falls along the next. Joints must move: friction at rest hides force (docs/how_to/surfaces.md).
+along one path and falls along the next. Joints must move: friction at rest hides the force (docs/how_to/surfaces.md).
 """
 
 from collections import deque
@@ -23,7 +23,7 @@ from r2s.recordings.recording import Recording
 from r2s.tasks.wipe import WipeTask
 
 LOADS = 0.25, 0.9  # lowest and highest force of a path, as shares of the controller's largest force
-PAUSE_S = 2.0  # s added to the clock between two paths, so that identification/contact counts them as two presses
+PAUSE_S = 2.0  # s added to the clock between two paths, so that identification/contact treats them as two presses
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def press_plan(
     point: Sequence[float] | None = None,
     normal: Sequence[float] | None = None,
 ) -> PressPlan:
-    """Return the plan for an arm with a tool; point (3,) m and normal (3,) of the plane, within 5 mm and 5 degrees.
+    """Return the plan for a plane whose point (3,) m and normal (3,) are known within 5 mm and 5 degrees.
 
     Raises:
         UserError: the robot has no tool, or the plane is invalid.
@@ -72,12 +72,12 @@ def record_presses(
     Rows are as in `r2s.arm.recorder.record`; between two paths the recorded time advances by PAUSE_S.
 
     Args:
-        arm: moved above the first point of each path, and always stopped at the end. dynamics: the arm's model.
-        seed: of the paths. progress: called after every path with (paths done, total).
+        arm: it moves above the first point of each path, and is always stopped at the end. dynamics: its model.
+        seed: random seed of the paths. progress: called after every path with (paths done, total).
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver ended a path; the exception's `recording` holds earlier paths, if any.
+        ArmStopped: the arm or the driver ended a path; the exception's `recording` contains earlier paths, if any.
         UserError: the tip does not reach the surface, or no safe path leads there.
     """
     robot, control = arm.robot, plan.control(arm.robot)

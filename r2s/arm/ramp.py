@@ -1,6 +1,6 @@
 """The paper's breakaway protocol: ramp the torque of one joint after the other, in both directions, until it moves.
 
-It runs on any `Arm`; r2s/identification/breakaway.py estimates breakaway torques from the recording.
+It runs on any `Arm`; r2s/identification/friction/breakaway.py estimates breakaway torques from the recording.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,21 +27,21 @@ SLOW_TAU_MAX = 40.0  # Nm: joints with at least this tau_max have a large inerti
 SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; at 4 Nm/s light links move visibly within ms
 MAX_SHARE = 0.2  # of tau_max, default torque at which a ramp gives up
 AFTER_MOTION = 5  # cycles recorded after the joint has moved
-STRAY = DEVIATION  # rad: a ramp ends if any joint moves so far; an arm so far from its pose is moved there again
+STRAY = DEVIATION  # rad: a ramp ends if any joint moves this far; an arm this far from its pose moves back to it
 POSE_MARGIN = 0.15  # rad from a pose to the position limits; more than any joint moves in one ramp
-UNFILTERED_HZ = 1e30  # disables the driver's low-pass: a ramp has no steps, and resting joints need a command of 0
+UNFILTERED_HZ = 1e30  # disables the driver's low-pass: a ramp has no steps, and joints at rest need a command of 0
 # The stop after a ramp: a PID controller with three equal real poles brakes each joint, then its torque is released
-BANDWIDTH = 20.0  # rad/s, of the poles: well damped with 5 ms of delay and 3 ms of lag
-DAMPED_CYCLES = 20  # of damping only; a spring would slowly pull a joint back to where braking began
-BRAKE_SHARE = 0.1  # of tau_max: small enough that the rate limit adds no delay
+BANDWIDTH = 20.0  # rad/s, of the three poles: well damped with 5 ms of delay and 3 ms of lag
+DAMPED_CYCLES = 20  # cycles of damping only, because a spring would slowly pull a joint back to where braking began
+BRAKE_SHARE = 0.1  # share of tau_max for braking: small enough that the rate limit adds no delay
 BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; attempts to stop before the next ramp starts anyway
-RELEASE_CYCLES = 10  # of the release, of the rest before a ramp, and of each mean angle that a speed is computed from
-# rad/s, largest mean speed: of any joint before the release, of the next ramp's joint then, of any joint afterwards
+RELEASE_CYCLES = 10  # cycles of the release, of the rest before a ramp, and per mean angle for a speed in braking
+# rad/s, mean speeds: release begins with all joints below SLOW, the next ramp's below STILL; rest: below SLIDING
 SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return (count, n) rad: home, then postures that differ from the previous one by 0.3 rad in every joint."""
+    """Return (count, n) rad: home, then postures, each 0.3 rad from the previous one in every joint, if in limits."""
     change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
     poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
@@ -68,11 +68,11 @@ def ramp(
     A ramp begins with a short rest at zero command. Then the command of one joint rises from 0 at `rate`, with the
     others at 0, until the joint has moved by MOVED (or the command reaches `largest`, or any joint moves by STRAY).
     The stop after each ramp is not recorded. Each row has the state and the command of one cycle, as in
-    `r2s.arm.recorder`. A joint slides at zero command if gravity compensation leaves more torque than its friction
-    holds. It then rests at the command that stopped it, and its ramp starts from that command.
+    `r2s.arm.recorder`. If the error of gravity compensation exceeds a joint's friction, the joint slides at zero
+    command. It is then braked until it rests under a constant command, from which its ramp starts.
 
     Args:
-        arm: moved to each pose, and always stopped at the end.
+        arm: it moves to each pose, and is always stopped at the end.
         poses: (P, n) rad, at least 0.15 rad inside the position limits; poses and the paths between them
             (r2s/excitation/paths.py) must be clear of table and arm, otherwise nothing moves.
         rate: (n,) or one number, Nm/s; default: 2.2 for joints with tau_max of at least 40 Nm, 4 for weaker ones, and
@@ -84,7 +84,7 @@ def ramp(
     Raises:
         ArmStopped: the arm or the driver ended the motion, or in real time the arm missed more than 1 % of the
             commands; no recording is returned.
-        UserError: an argument is out of range, or a pose has no path.
+        UserError: an argument is out of range, or no path leads to a pose.
     """
     robot = arm.robot
     places = _poses(robot, poses)
@@ -94,7 +94,7 @@ def ramp(
     # all joints in one direction, then in the other, so that each joint rests in between
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
-    # a sliding joint's ramp starts at the command that holds it; 2 * most bounds the unknown friction
+    # a sliding joint's ramp starts at the command that stopped it; 2 * most bounds the unknown friction
     most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
     timing = timing or Timing()
     how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot), "speed_share": speed_share(arm)}
@@ -135,7 +135,7 @@ class _Drive:
 
     Attributes:
         rows: t, q, dq and command of every cycle since the list was last emptied.
-        base: (n,) Nm, command of the resting arm. held: (n,) Nm, mean command that held the arm in the last stop.
+        base: (n,) Nm, command of the resting arm. held: (n,) Nm, mean command at the end of the last braking.
     """
 
     def __init__(self, loop: CommandLoop, timing: Timing):
@@ -189,7 +189,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints and release them, repeatedly if one slides on; `next_joint` has the lowest speed limit."""
+        """Brake all joints and release their torque, again if one slides on; `next_joint` must be slowest (STILL)."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -198,7 +198,7 @@ class _Drive:
             still = self.rest()
             if still.all():
                 return
-            if attempt:  # the motion after the first attempt may be bristles that spring back
+            if attempt:  # after the first attempt, bristles that spring back may cause the motion
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:
@@ -209,7 +209,7 @@ class _Drive:
         return self._speed(RELEASE_CYCLES // 2) < SLIDING
 
     def _speed(self, cycles: int) -> np.ndarray:
-        """Return the speeds (n,) rad/s between the mean angles of the last `cycles` rows and of as many before."""
+        """Return speeds (n,) rad/s from the mean angles of the last `cycles` rows and of the `cycles` rows before."""
         q = np.array([row[1] for row in self.rows[-2 * cycles :]]).reshape(2, cycles, -1).mean(1)
         return np.abs(q[1] - q[0]) / (cycles * SIM_DT)
 

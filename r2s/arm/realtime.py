@@ -1,4 +1,4 @@
-"""Real time: settings that the computer needs during a motion, and measured timing that shows if they suffice."""
+"""Set the computer up for real time during a motion, and measure timing to see whether the settings suffice."""
 
 import ctypes
 import gc
@@ -18,7 +18,7 @@ PRIORITY = 80  # of SCHED_FIFO; libfranka's own thread has the highest, 99
 SWITCH_S = 1e-4  # longest wait for Python's global lock while another thread computes; the default is 5 ms
 LOCK_ALL = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT of mlockall(2): pages stay in memory after first use
 LEAST_SUCCESS = 0.99  # share of the commands that must reach the arm in time
-SUCCESS_CYCLES = 100  # over which the arm averages its success rate; in a motion's first cycles it is incomplete
+SUCCESS_CYCLES = 100  # cycles over which the arm averages its success rate; before that the average is incomplete
 _warned: set[str] = set()
 
 
@@ -29,7 +29,7 @@ def realtime_section(priority: int | None = PRIORITY) -> Iterator[None]:
     Each missing permission causes one warning per process. At the end all settings are restored.
 
     Args:
-        priority: of this thread; None: leave scheduler and memory as they are.
+        priority: SCHED_FIFO priority of this thread; None: do not change scheduler and memory.
     """
     with ExitStack() as stack:
         if gc.isenabled():  # a full collection takes up to 0.3 s
@@ -48,7 +48,7 @@ def realtime_section(priority: int | None = PRIORITY) -> Iterator[None]:
 
 @contextmanager
 def kept_scheduler() -> Iterator[None]:
-    """Restore this thread's scheduler afterwards: libfranka 0.21 gives the connecting thread FIFO 99 for good."""
+    """Restore this thread's scheduler at the end, because libfranka 0.21 sets FIFO 99 permanently on connection."""
     thread = threading.get_native_id()  # the code after `yield` may run in another thread
     before = os.sched_getscheduler(thread), os.sched_getparam(thread)
     try:
@@ -88,7 +88,7 @@ class Timing:
         policy: time from a state to the policy's command, once per control step. driver: time to compute one command.
         adapter: time of one update of the adapter, if there is one. period: time from one command to the next.
         robot: time from one state to the next by the arm's clock; above 1 ms if cycles were lost.
-        success: reported share of the last 100 commands that arrived in time, from a motion's 100th cycle on.
+        success: the rate that the arm reports for its last 100 commands, in each cycle after a motion's first 100.
     """
 
     policy: list[float] = field(default_factory=list)
@@ -99,11 +99,11 @@ class Timing:
     success: list[float] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Begin a motion."""
+        """Prepare for the cycles of a new motion."""
         self._begun, self._last = len(self.success), (0.0, 0.0)
 
     def cycle(self, clock: tuple[float, float, float], state: ArmState, adapts: bool = False) -> None:
-        """Add the timing of a cycle of `CommandLoop`, from its `clock` and the state after it."""
+        """Add the durations of one cycle, from `CommandLoop.clock` and the state after the cycle."""
         began, driven, adapted = clock
         (sent_at, t), self._last = self._last, (driven, state.t)
         if not t:  # the first command starts the motion, which takes longer than a cycle
@@ -120,7 +120,7 @@ class Timing:
             self.success.append(float(rate))
 
     def refusal(self, arm: Arm) -> str | None:
-        """Return why a real-time motion is rejected (too few commands arrived in time); None: it is accepted."""
+        """Return the reason to reject a real-time motion (too few commands came in time), or None to accept it."""
         rates = self.success[self._begun :]
         if not getattr(arm, "realtime", False) or not rates or (rate := float(np.mean(rates))) >= LEAST_SUCCESS:
             return None
@@ -128,7 +128,7 @@ class Timing:
         return f"the arm got {100 * rate:.1f} % of its commands in time, at least {least} are needed"
 
     def check(self, arm: Arm) -> None:
-        """Raise ArmStopped with `refusal`, if there is one."""
+        """Raise ArmStopped if `refusal` returns a reason."""
         if (reason := self.refusal(arm)) is not None:
             raise ArmStopped(reason)
 

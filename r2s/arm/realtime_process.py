@@ -1,10 +1,10 @@
-"""A policy on an arm whose clock does not wait: the 1 kHz cycle runs in its own process.
+"""Run a policy on an arm whose clock does not wait: a separate process runs the 1 kHz cycle.
 
 The arm's process continues whatever happens to the policy's process: if no new command arrives within the driver's
-deadline, it damps the arm and stops it. A thread would not suffice, because a policy that holds Python's global lock
+deadline, it damps and stops the arm. A thread would not suffice, because a policy that holds Python's global lock
 blocks every thread. The processes share memory without a lock, because a killed process would never release a lock.
 
-The arm's process has a session of its own, so that no signal of the terminal reaches it. Every motion, including the
+The arm's process runs in its own session, so signals from the terminal do not reach it. Every motion, including the
 approach, is damped and ended if the policy's process receives a signal or ends, or if the arm's process receives a
 signal (r2s/arm/stop_request.py).
 """
@@ -37,7 +37,7 @@ from r2s.tasks.task import State, Task
 START_S = 240.0  # longest time for the process to import, compile and connect to its arm
 POLL_S = 2e-4  # s between two reads of shared memory, a fifth of a cycle
 EXIT_S = 5.0  # s for the arm to come to rest at the end; after twice this time its process is ended by force
-READ_ATTEMPTS = 10  # to read a slot that is being written; then `Slot.read` returns None
+READ_ATTEMPTS = 10  # most attempts to read a slot that is being written; then `Slot.read` returns None
 
 
 class Slot:
@@ -68,9 +68,9 @@ class Channel(NamedTuple):
     """Memory that the two processes share.
 
     Attributes:
-        command: (c,) for the controller, written by the policy's process. state: by the arm's, see `_publish`.
+        command: (c,), written by the policy's process. state: written by the arm's process, see `_publish`.
         end: above 0 when the policy's process has ended the episode.
-        signal: number of a signal that the policy's process received. lifeline: held by the policy's process.
+        signal: number of a signal that the policy's process received. lifeline: locked by the policy's process.
     """
 
     command: Slot
@@ -93,7 +93,7 @@ class Channel(NamedTuple):
 
 
 class RealtimeRunner:
-    """Runs episodes on an arm and its driver in a process of their own; implements `Arms` of `r2s.tasks.rollout`.
+    """Runs episodes on an arm, with its driver, in a separate process; implements `r2s.tasks.rollout.Arms`.
 
     `with RealtimeRunner(...) as arms`: the process opens the arm, and always stops and closes it at the end.
 
@@ -101,7 +101,7 @@ class RealtimeRunner:
         robot: the arm's model. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
-        open_arm: returns the arm or a context manager of it; runs in the arm's process, so it must be picklable.
+        open_arm: function, called in the arm's process, that returns the arm or its context manager; picklable.
         robot: a model with the arm's number of joints. task, friction: see `PolicyRunner`.
         settings: further arguments of `PolicyRunner`; its adapter runs in the arm's process.
 
@@ -162,7 +162,7 @@ class RealtimeRunner:
         return self._latest()[0]
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Begin episode `first` at starts (1, n) rad, as `PolicyRunner.place`; this process asks the operator."""
+        """Begin episode `first` at starts (1, n) rad, see `PolicyRunner.place`; this process asks the operator."""
         self._channel.end.write(np.zeros(1))
         self._line.send(("place", starts, first))
         self.done, self.halted = self._receive("placed")
@@ -172,9 +172,9 @@ class RealtimeRunner:
         return self._observe()
 
     def step(self, command: np.ndarray) -> State:
-        """Write the command (1, c) of the controller, and return the state at the next control period.
+        """Pass the command (1, c) to the arm's process, and return the state when the next control period begins.
 
-        A command that arrives after its period takes effect at once; the next state is that of the following period.
+        If the command arrives after its period, it takes effect at once; the state is of the next period to begin.
         """
         self.timing.policy.append(time.perf_counter() - self._observed_at)
         self._channel.command.write(command[0])
@@ -191,7 +191,7 @@ class RealtimeRunner:
             time.sleep(POLL_S)
 
     def end(self) -> np.ndarray:
-        """Stop the arm; return (1,) bool: whether arm, driver, a request or missed commands stopped the episode."""
+        """Stop the arm; return (1,) bool: whether arm, driver, a request or lost commands ended the episode."""
         self._channel.end.write(np.ones(1))
         self._section.close()
         self.stops, stopped, timing, self.speeds, self.halted, self.blocked = self._receive("ended")
@@ -204,7 +204,7 @@ class RealtimeRunner:
             serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, filtered target (n,) Nm, stopped, and number of cycles that the filter changed."""
+        """Return cycle, state, low-passed target (n,) Nm, whether stopped, and number of safety-filtered cycles."""
         while (latest := self._channel.state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")
@@ -247,7 +247,7 @@ def _serve(
     channel: Channel,
 ) -> None:
     """Open the arm, run the requested episodes, and end when the process `parent` closes the line."""
-    os.setsid()  # signals of the terminal go to the other process
+    os.setsid()  # so that signals of the terminal reach only the other process
 
     def forward(reason: str) -> bool:
         line.send(("operator", reason))

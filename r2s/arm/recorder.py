@@ -24,9 +24,9 @@ from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
 
-TORQUE_SHARE = 0.8  # of tau_max, torque limit of the driver; the same share as in excitation/motion_checks.py
+TORQUE_SHARE = 0.8  # share of tau_max that the driver allows; the same as in excitation/motion_checks.py
 PROGRESS_EVERY = 500  # cycles
-MIN_ROWS = 100  # a stopped recording with fewer is discarded
+MIN_ROWS = 100  # a stopped recording with fewer rows is discarded
 
 
 def record(
@@ -40,13 +40,13 @@ def record(
 ) -> Recording:
     """Follow the excitation at 1 kHz and return the recorded motion.
 
-    Row k holds the state read in cycle k and, for 'commanded', the command sent in that same cycle (it is tau_J_d of
-    cycle k + 1): replaying tau[k : k + m] from state k predicts q[k + 1 : k + m + 1]. For 'measured', row k holds
-    tau_J read together with q and dq, as robot logs do. t is the arm's clock. Signals are those of the same state.
+    Row k contains the state of cycle k. With 'commanded', tau[k] is the command sent in cycle k, which is tau_J_d of
+    cycle k + 1: a replay of tau[k : k + m] from state k predicts q[k + 1 : k + m + 1]. With 'measured', tau[k] is
+    the tau_J read together with q[k] and dq[k], as in robot logs. t is the arm's clock; signals are of cycle k.
 
     Args:
-        arm: moved to the excitation's first posture, and always stopped at the end.
-        excitation: in steps of 1 ms; inside the limits and clear of table and arm, otherwise the arm does not move.
+        arm: it moves to the excitation's first posture, and is always stopped at the end.
+        excitation: in steps of 1 ms; it must be within limits and clear of table and arm, else the arm does not move.
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, includes gravity).
         progress: called every 0.5 s of motion with (cycles done, total), between two cycles: it must return at once.
         loaded: whether the arm may carry an undeclared payload; `LoadedTrackingController` then tracks the motion.
@@ -55,7 +55,7 @@ def record(
     Raises:
         ArmStopped: the arm or the driver ended the motion; the arm deviated from the plan by more than its
             `DeviationLimits`; or, in real time, more than 1 % of the commands did not reach the arm in time. The
-            exception's `recording` holds the rows so far.
+            exception's `recording` contains the rows so far, if they are at least MIN_ROWS.
         UserError: the excitation is not allowed.
 
     """

@@ -1,4 +1,4 @@
-"""A simulated arm behind the arm interface: MuJoCo with known dynamics, and sensor noise."""
+"""Simulate an arm behind the arm interface: MuJoCo with known dynamics, and sensor noise."""
 
 import numpy as np
 
@@ -15,13 +15,13 @@ class SimulatedArm:
 
     Attributes:
         external: (n,) Nm, external joint torque from the next cycle on; zero by default.
-        declared_payload: see below.
+        declared_payload: see the arguments.
 
     Args:
         robot, dynamics: the arm and its true dynamics.
         position_noise, velocity_noise: standard deviations of white noise on q, rad, and dq, rad/s.
-        seed: of the noise.
-        payload: the carried body and its times. declared_payload: the payload that gravity compensation assumes.
+        seed: random seed of the noise.
+        payload: carried body, and when it is attached. declared_payload: payload that gravity compensation assumes.
     """
 
     def __init__(

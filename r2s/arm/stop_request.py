@@ -1,6 +1,6 @@
-"""Requests to end every motion of this process: a signal, or the end of the process that sends the commands.
+"""Handle requests to end every motion of this process: signals, or the end of the process that sends commands.
 
-`CommandLoop` asks `requested` in every cycle. On a request the driver brings the arm to rest, and the motion ends
+`CommandLoop` calls `requested` in every cycle. On a request the driver brings the arm to rest, and the motion ends
 with `StopRequested`. No new motion begins after a request. A process has one request, as it has one set of signals.
 """
 
@@ -16,13 +16,13 @@ from r2s.errors import Stopped
 
 # a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; SIGKILL and SIGSTOP cannot be handled
 SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP)
-PARENT = "R2S_PARENT"  # environment variable: pid of the process whose end ends every motion of this one
+PARENT = "R2S_PARENT"  # environment variable: pid of the parent, at whose end every motion of this process ends
 FOLLOW_S = 0.1  # s between two checks that the parent still runs
 GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s each) before a KeyboardInterrupt
 
 
 class _Request:
-    """The first stop request of this process: its reason, whether a motion is ending, and whether none runs now."""
+    """The first stop request of this process: reason, whether a motion is ending for it, whether none runs now."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -34,7 +34,7 @@ _request = _Request()
 
 
 def requested() -> str | None:
-    """Return why every motion has to end, or None. The first reason stays."""
+    """Return the reason why every motion must end, or None; later reasons do not replace the first one."""
     if _request.reason is None:
         for source in _request.sources:
             if (reason := source()) is not None:
@@ -44,18 +44,18 @@ def requested() -> str | None:
 
 
 def begin_ending() -> None:
-    """Mark the request as one because of which a motion is now ending."""
+    """Note that a motion is now ending because of the request."""
     _request.ending = True
 
 
 def serve() -> None:
-    """Mark the request as served: no motion runs any more. A further signal then raises KeyboardInterrupt at once."""
+    """Note that no motion runs any more after the request; a further signal then raises KeyboardInterrupt at once."""
     _request.ending, _request.served = False, True
 
 
 @contextmanager
 def watched(source: Callable[[], str | None]) -> Iterator[None]:
-    """Let `requested` also call `source`, which returns a reason or None and may take only microseconds."""
+    """Let `requested` also call `source` in this context; `source` returns a reason or None, within microseconds."""
     _request.sources.append(source)
     try:
         yield
@@ -64,17 +64,17 @@ def watched(source: Callable[[], str | None]) -> Iterator[None]:
 
 
 def parent_ended(parent: int) -> Callable[[], str | None]:
-    """Return a source for `watched`: it reports that the process `parent`, which sends the commands, has ended."""
+    """Return a source for `watched` that reports the end of the process `parent`, which sends the commands."""
     return lambda: None if os.getppid() == parent else "the process of the policy has ended"
 
 
 def pipeline() -> int | None:
-    """Return the pid in PARENT, or None. Child processes inherit PARENT, but it is not the pid of their parent."""
+    """Return the pid in PARENT, or None. In a grandchild, which inherits PARENT, it is not the pid of its parent."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 
 def _follow(parent: int, over: threading.Event) -> None:
-    """Send this process SIGTERM when its parent ends before `over` is set."""
+    """Send SIGTERM to this process if its parent ends before `over` is set."""
     while not over.wait(FOLLOW_S):
         if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -82,7 +82,7 @@ def _follow(parent: int, over: threading.Event) -> None:
 
 
 def _leave_terminal() -> None:
-    """Discard output to a terminal: after SIGHUP it is closed, and writing to it would end the run with an error."""
+    """Discard output to the terminal, which SIGHUP has closed: writing to it would end the run with an error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         if stat.S_ISCHR(os.fstat(stream).st_mode):
@@ -98,11 +98,11 @@ def handled_signals(
 
     If no motion has responded to the request after GRACE_S, the main thread gets a KeyboardInterrupt; this context
     then raises `Stopped` with the name of the signal. It also raises `Stopped` if no motion has responded when the
-    block ends, because later code may move the arm. Outside the main thread Python allows no handlers: no effect.
+    block ends: later code may move the arm. Outside the main thread it does nothing, as Python allows no handlers.
 
     Args:
         forward: called by the signal handler with the number of each signal.
-        parent: pid of the parent process, whose end counts as SIGTERM; None: no process is watched.
+        parent: pid of the parent process, whose end acts as a SIGTERM; None: no process is watched.
 
     Raises:
         Stopped: a signal came while no motion ran.

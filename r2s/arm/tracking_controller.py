@@ -1,4 +1,4 @@
-"""PD tracking of a planned motion with nominal feedforward and an adaptive estimate of friction and offset."""
+"""Track a planned motion: PD control with nominal feedforward and an adaptive estimate of friction and offset."""
 
 import numpy as np
 
@@ -18,11 +18,11 @@ ADAPTATION_RATE = 0.8  # 1/s, adaptation gain over proportional gain; leaves hal
 FRICTION_DQ = 0.03  # rad/s, width of the sign change of the friction estimate
 MASS_EVERY = 10  # cycles between two mass matrices
 # Limits
-OFFSET_SHARE = 0.1  # of tau_max, limit of the offset estimate: enough for an undeclared 1 kg at a Panda's full reach
-CORRECTION_SHARE = 0.3  # of tau_max, limit of all torque that is added to the feedforward
-MAX_DEVIATION = 0.2  # rad off the plan; beyond it an obstacle blocks the arm, or it is not the arm of the plan
+OFFSET_SHARE = 0.1  # share of tau_max, limit of the estimated offset: enough for 1 undeclared kg at a Panda's reach
+CORRECTION_SHARE = 0.3  # share of tau_max, limit of all torque that is added to the feedforward
+MAX_DEVIATION = 0.2  # rad; an arm that deviates more is blocked by an obstacle, or is not the planned arm
 # For an arm with an undeclared payload
-LOADED_FACTOR = 2.0  # times OFFSET_SHARE and CORRECTION_SHARE
+LOADED_FACTOR = 2.0  # factor on OFFSET_SHARE and CORRECTION_SHARE
 LOADED_DEVIATION = 0.5  # rad
 
 
@@ -30,10 +30,10 @@ class TrackingController:
     """PD control with the nominal model's feedforward torque and an adaptive estimate of the missing torque.
 
     The estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max) per joint: offset, Coulomb and viscous friction,
-    adapted during the motion as in Slotine and Li (IJRR 6(3), 1987), within plausible limits. A light wrist needs it:
-    its gains must be small, so friction as large as its whole PD torque could hold it.
-    The gains are the nominal mass matrix times BANDWIDTH^2 and 2 BANDWIDTH. They suit any arm, also one with nearly
-    parallel joint axes, which gains per joint would destabilize.
+    adapted during the motion as in Slotine and Li (IJRR 6(3), 1987), within plausible limits. A light wrist needs
+    this estimate: its gains must be small, so friction can be as large as its whole PD torque and stop it.
+    The gains are the nominal mass matrix times BANDWIDTH^2 and 2 BANDWIDTH. They suit any arm; with nearly
+    parallel joint axes, separate gains per joint would be unstable.
 
     Args:
         robot: the nominal model. excitation: the plan.
@@ -67,7 +67,7 @@ class TrackingController:
 
     @property
     def offset(self) -> np.ndarray:
-        """(n,) Nm, the estimated offset; at rest it carries an undeclared payload."""
+        """(n,) Nm, the estimated offset, which at rest balances the weight of an undeclared payload."""
         return self._theta[0]
 
     def deviation(self, k: int, state: ArmState) -> str | None:
@@ -89,7 +89,7 @@ class TrackingController:
 class LoadedTrackingController(TrackingController):
     """Tracking controller for an arm that may carry an undeclared payload of up to half the arm's largest payload.
 
-    Its gains assume half of such a payload, because the sag of a strong joint would otherwise swing the wrist. It
+    Its gains are for half of that payload, because otherwise the sag of a strong joint would swing the wrist. It
     allows a larger deviation and a larger correction.
     """
 

@@ -1,4 +1,4 @@
-"""Run all code of the 1 kHz cycles once before a motion: its compilation takes up to a second, a cycle has 1 ms."""
+"""Compile the code of the 1 kHz cycles before a motion: compilation takes up to a second, but a cycle has 1 ms."""
 
 import copy
 from contextlib import suppress
@@ -17,7 +17,7 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import Task
 
-CYCLES = 200  # at rest, and as many in motion: ten spans of an estimator each
+CYCLES = 200  # cycles at rest, and again in motion: each ten spans of an estimator
 SWING_RAD, SWING_HZ = 0.05, 1.0  # up to 0.3 rad/s: every joint slides
 RAMP_NM = 0.02  # Nm, so that the ramps give up at once
 
@@ -49,13 +49,13 @@ class _Puppet:
 
 
 def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = None) -> None:
-    """Compile and run once the code that an arm's motions call in their cycles; its results are discarded.
+    """Run the code of an arm's 1 kHz cycles once, so that it is compiled; discard its results.
 
-    Call it in the process that will drive the arm, before the arm is opened. On an arm in memory it runs recordings
-    and ramps, and if there is a task, an episode with a copy of the adapter.
+    Call it in the process that will drive the arm, before the arm is opened. It uses a mock arm for recordings
+    and ramps and, if there is a task, for an episode with a copy of the adapter.
 
     Raises:
-        Exception: what the adapter raises.
+        Exception: any exception of the adapter.
     """
     rest = np.zeros((CYCLES, robot.n))
     still = Excitation(SIM_DT * np.arange(CYCLES), robot.q_home + rest, rest, rest)

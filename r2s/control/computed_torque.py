@@ -20,7 +20,7 @@ from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import SIM_DT, Robot
 
 LATENCY = 0.007  # s, assumed latency of the feedback: delay, lag and velocity filter (docs/explanation/arms.md)
-# rad: bandwidth times latency of the loop. It leaves a phase margin of 56 deg; at pi / 2 the loop oscillates forever.
+# rad: bandwidth times latency of the loop. 0.6 leaves a phase margin of 56 deg; pi / 2 is the stability limit.
 BANDWIDTH_LATENCY = 0.6
 
 
@@ -29,8 +29,8 @@ class ComputedTorque(Controller):
     """Computed torque about a task's trajectory; see `Controller`.
 
     Attributes:
-        model: the identified arm. ahead_s: s, look-ahead of the feedforward: half a control period, time constant of
-            the low-pass, and identified delay and lag.
+        model: the identified arm. ahead_s: s, look-ahead of the feedforward: half a control period plus time constant
+            of the low-pass plus identified delay and lag.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -75,7 +75,7 @@ def computed_torque(
         robot, task: the arm and its task. dynamics: the identified arm.
         residual: share of the task's torque limit that an action of 1 adds.
         bandwidth: w, rad/s, of the critically damped feedback; None: 2 w times the latency is BANDWIDTH_LATENCY, as
-            the damping 2 w sets the loop's bandwidth. The latency is a control period, the low-pass and LATENCY.
+            the damping 2 w sets the loop's bandwidth. The latency is the sum of control period, low-pass, LATENCY.
         feedback_hz: rate at which the feedback is updated, at most 1000; None: the policy's.
 
     Raises:

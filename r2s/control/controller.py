@@ -1,4 +1,4 @@
-"""The controller protocol: an action space, and the compiled law that maps a command to torque at 1 kHz."""
+"""The interface of a controller: an action space, and a compiled law that maps a command to torque at 1 kHz."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -29,16 +29,16 @@ class ControlledTask(Protocol):
 
 @dataclass(frozen=True)
 class Controller:
-    """An action space and a control law, for all arms of one robot; `control=` selects the function that makes it.
+    """An action space and a control law, for all arms of one robot; `control=` selects the function that creates it.
 
     A policy's action lies in [-1, 1]. In SI units it is action_offset + action_scale action. A command is the action
     in SI units, then the setpoint that the controller derives from the task.
 
     Attributes:
         name: the controller's name.
-        law: compiled; see r2s/physics/control_laws.py.
+        law: the compiled law; see r2s/physics/control_laws.py.
         action_scale, action_offset: (a,) in `unit`. action: name of the commanded quantity, for tables and contracts.
-        parameters: (p,) of the law. memory_size: number of values that the law stores between cycles.
+        parameters: (p,), the law's parameters. memory_size: number of values that the law stores between cycles.
         torque_limit: (n,) Nm, the largest target torque; None: the task's.
         cpp: body of the same law in C++17, for contract.hpp; "": the bundle gets no header.
     """
@@ -89,7 +89,7 @@ class Controller:
         """Return the commands (m, c) of the control period that begins at t (m,) s.
 
         Args:
-            action: (m, a) in [-1, 1]. task, goals: those of the episodes.
+            action: (m, a) in [-1, 1]. task, goals: the task and the goals of the episodes.
         """
         scaled = action * self.action_scale
         if self.action_offset.any():
@@ -99,5 +99,5 @@ class Controller:
         return np.concatenate([scaled, self.setpoint(task, t, goals)], axis=1)
 
     def torque(self, q: np.ndarray, dq: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n) Nm in the first cycle of a command: q, dq (m, n) rad, rad/s, command (m, c)."""
+        """Return the torque (m, n) Nm in the first cycle of a command (m, c), at q, dq (m, n) rad, rad/s."""
         return run_law(self.law, q, dq, command, self.parameters, self.memory_size)

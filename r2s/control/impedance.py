@@ -25,7 +25,7 @@ from r2s.physics.newton_euler import COM, LINK, MASS, links_of
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 
 ACTIONS = ("target", "stiffness", "both")
-# shares of the force that the torque limit allows in every direction at home: the rest is for damping and feedforward
+# share of the force that the torque limit allows in every direction at home; the rest is for damping and feedforward
 CLIP = 0.7
 CLIP_M = 0.05  # m, error at which the default spring saturates
 
@@ -35,8 +35,8 @@ class Impedance(Controller):
     """An impedance law; see `Controller`.
 
     Attributes:
-        model: the identified arm. target_size: numbers of the target that the task gives.
-        contact: (4,) normal and force N against it, of hybrid control; None: the task's. hybrid: whether it is that.
+        model: the identified arm. target_size: number of values in the task's target.
+        contact: (4,) normal, and force N against it, for hybrid control; None: the task's. hybrid: whether hybrid.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -46,12 +46,12 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Target; of hybrid control normal (3), force, measured force, and whether it is measured; pull (3)."""
+        """Number of values: target; hybrid: normal (3), force, measured force, whether measured; slides: pull (3)."""
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
     def slides(self) -> bool:
-        """Whether the target slides on a surface, so that the task has a pull."""
+        """Whether the target slides on a surface; the setpoint then contains the task's pull."""
         return bool(self.hybrid and self.parameters[law.APPROACH] == law.SLIDES)
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
@@ -97,9 +97,9 @@ def joint_impedance(
     Args:
         robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
         action: what an action sets: target, stiffness, or both.
-        torque_fraction: share of tau_max, the largest torque. displacement: rad, of the target, by an action of 1.
-        stiffness: Nm/rad, the highest; None: CLIP times the largest torque over displacement, or what latency allows.
-        softest: lowest stiffness of an action, share of the highest. damping: ratio of all modes.
+        torque_fraction: largest torque over tau_max. displacement: rad, shift of the target by an action of 1.
+        stiffness: Nm/rad, the highest; None: CLIP times torque limit over displacement, at most what latency allows.
+        softest: lowest stiffness of an action over the highest. damping: damping ratio of all modes.
         tank: J, first level and size of the energy tank.
 
     Raises:
@@ -164,18 +164,18 @@ def cartesian_impedance(
 
     Args:
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
-        displacement: m, of the target, by an action of 1. rotation: rad, the same for the orientation.
-        stiffness: N/m, the highest; None: force_clip over CLIP_M, or what latency allows.
+        displacement, rotation: m and rad, shift and rotation of the target by an action of 1.
+        stiffness: N/m, the highest; None: force_clip over CLIP_M, at most what latency allows.
         rotational_stiffness: Nm/rad, the highest; 0: the orientation is free and follows the null space.
         force_clip: N, largest force of the spring at the highest stiffness, at most what the torque limit allows in
             every direction at home; None: CLIP times that. moment_clip: Nm, likewise.
-        null_stiffness: 1/rad, stiffness towards home in the null space, per torque limit of each joint.
-        hybrid: whether a force acts along a normal, and the impedance across it only. A displacement against the
-            normal then adds its stiffness times as much force. If the task `approaches` a surface, its target moves
+        null_stiffness: 1/rad, stiffness towards home in the null space, over the torque limit of each joint.
+        hybrid: whether a force acts along a normal, and the impedance only across it. A displacement against the
+            normal adds a force, stiffness times displacement. If the task `approaches` a surface, its target moves
             into the surface, and the spring to the target bounds the force. So the tip approaches no faster than the
             target.
-        normal: (3,) in the base frame, out of the surface. force: N, against it. None: the task's contact.
-        integral_rate: 1/s, of the force error, where a force is measured. integral_max: its share of force_clip.
+        normal: (3,) in the base frame, out of the surface. force: N, against the normal. None: the task's contact.
+        integral_rate: 1/s, integral gain on a measured force error. integral_max: largest integral over force_clip.
 
     Raises:
         UserError: the task has no target or contact, or a setting is out of its range.
@@ -232,7 +232,7 @@ def cartesian_impedance(
 
 
 def _check(action: str, softest: float, displacement: float) -> None:
-    """Raise UserError for settings that both impedances share."""
+    """Raise UserError if a setting that both impedances share is out of range."""
     if action not in ACTIONS:
         raise UserError(f"action: '{action}'; {instead_of(action, ACTIONS)}")
     check_number("softest", softest, "(0, 1]")
@@ -240,7 +240,7 @@ def _check(action: str, softest: float, displacement: float) -> None:
 
 
 def _torque(robot: Robot, fraction: Sequence[float] | float) -> np.ndarray:
-    """Return the largest torque (n,) Nm."""
+    """Return the torque limit (n,) Nm: `fraction` of tau_max, checked."""
     share = per_joint("torque_fraction", fraction, robot.n, f"the {robot.n} joints of {robot.name}")
     if not ((share > 0) & (share <= 1)).all():
         raise UserError(f"torque_fraction: expected numbers in (0, 1], got {share.tolist()}")
@@ -248,7 +248,7 @@ def _torque(robot: Robot, fraction: Sequence[float] | float) -> np.ndarray:
 
 
 def _contact(task: Any, normal: Sequence[float] | None, force: float | None, most: float) -> np.ndarray | None:
-    """Return normal and force (4,) of the settings; None: the task has them."""
+    """Return normal and force (4,) from the settings; None if the task's contact is used."""
     if normal is None and force is None and hasattr(task, "contact"):
         return None
     if normal is None or force is None:
@@ -274,7 +274,7 @@ def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian
 
 
 def fastest_spring(task: ControlledTask) -> float:
-    """Return the highest frequency w of a spring, rad/s: critically damped, its loop has the rate 2 w."""
+    """Return the highest frequency w of a spring, rad/s; with critical damping, the loop has the rate 2 w."""
     return 0.5 * BANDWIDTH_LATENCY / (1 / (2 * np.pi * task.cutoff_hz) + LATENCY)
 
 
@@ -290,7 +290,7 @@ def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _action(
     action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return scale and offset of an action, and write its places in the command into the parameters."""
+    """Return an action's scale and offset, and write its indices in the command into the parameters."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
     parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]

@@ -1,4 +1,4 @@
-"""r2s/physics/impedance_laws.py and impedance.py as bodies in C++17 for contract.hpp; a test compares them."""
+"""The impedance laws (r2s/physics/impedance*.py) in C++17, for contract.hpp; a test compares both versions."""
 
 from r2s.physics import impedance, newton_euler
 

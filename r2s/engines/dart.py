@@ -1,7 +1,7 @@
-"""The arm in DART with the settings of Gazebo's physics plugin: second engine of Sim2Sim, engine of the rigid twin.
+"""The DART engine with the settings of Gazebo's physics plugin, for Sim2Sim transfer and for the rigid twin.
 
-Semi-implicit Euler, implicit joint damping, hard position limits, exact Coulomb friction. With the settings of
-this module DART and Gazebo's plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
+It has semi-implicit Euler steps, implicit joint damping, hard position limits and exact Coulomb friction. With these
+settings DART and Gazebo's plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ class DartEngine:
 
     Args:
         robot: the arm; its MJCF defines kinematics, inertia and limits.
-        gravity: False is libfranka's convention (the arm compensates it).
+        gravity: False is libfranka's convention (the arm compensates gravity).
         masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in link
             axes; each replaces the MJCF's values of the n moving links.
         armature: (n,) kg m^2, replaces the MJCF's values of the joints.
@@ -106,7 +106,7 @@ class DartEngine:
         return joint, link
 
     def relink(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
-        """Replace the last link's mass kg, centre (3,) m and tensor about it (3, 3) kg m^2; its motion continues."""
+        """Replace the last link's mass kg, centre (3,) m and tensor about it (3, 3) kg m^2; the motion continues."""
         at = self._last
         self._links.mass[at], self._links.com[at], self._links.inertia[at] = mass, com, inertia
         self._tip.setInertia(_dartpy().dynamics.Inertia(*self._links.lumped(at)))

@@ -1,4 +1,4 @@
-"""Episodes in an engine other than that of training, one by one, with the same goals, starts and random arms."""
+"""Episodes in an engine other than the training engine, one by one, with the same goals, starts and random arms."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ class EngineArms:
 
     Args:
         make: returns the engine of an arm with given dynamics.
-        robot, task, draw: those of training.
+        robot, task, draw: as in training.
         count: number of episodes.
     """
 

@@ -31,7 +31,7 @@ class GazeboEngine:
     integrates them. So `reset` stores q, dq; the next `step` applies them with its torque and starts exactly there.
 
     Args:
-        robot, dynamics: masses, centres, tensors and rotors; `FrictionTorque` adds friction.
+        robot, dynamics: the arm, its masses, centres, tensors and rotors; `FrictionTorque` adds friction.
         sim: the bindings; None imports the installed ones.
 
     Raises:

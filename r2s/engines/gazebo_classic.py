@@ -2,7 +2,7 @@
 
 `gzserver` loads the world plugin gazebo_classic.cc, which waits for a command over a pipe before each step. Gazebo
 Classic is a package of Debian 11 and Ubuntu up to 22.04. Elsewhere it runs from a root directory that
-gazebo_classic_root.sh makes; the environment variable R2S_GAZEBO_ROOT names it. No display is needed.
+gazebo_classic_root.sh creates; the environment variable R2S_GAZEBO_ROOT is its path. No display is needed.
 """
 
 import os
@@ -31,21 +31,21 @@ from r2s.physics.simulator import single_arm
 PHYSICS = ("ode", "dart")
 PLUGIN = Path(__file__).with_name("libr2s_gazebo_classic.so")
 ROOT = "R2S_GAZEBO_ROOT"  # environment variable: a root directory with Gazebo
-FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # with libraries, within Debian's library folder of a processor
+FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # library folders, relative to Debian's one of the processor
 NAME = "simulator=gazebo_classic"
 HELP = "docs/how_to/gazebo.md installs it; simulator=dart needs nothing more"
 START_S = 60.0  # s, longest wait for the server; a start takes 0.5 s
-SDF = "1.7"  # the newest that Gazebo 11 reads
+SDF = "1.7"  # newest SDF version that Gazebo 11 reads
 
 
 class GazeboClassicEngine:
     """One arm in a `gzserver` process, which ends with this object.
 
-    A command acts for one step. ODE holds the links together by constraints that it solves iteratively: expect
-    differences of 1e-4 m from MuJoCo after 1 s, where DART has none.
+    A command acts for one step. ODE solves the joints as constraints, iteratively: expect differences of 1e-4 m from
+    MuJoCo after 1 s; with DART there are none.
 
     Args:
-        robot, dynamics: masses, centres, tensors and rotors; `FrictionTorque` adds friction.
+        robot, dynamics: the arm, its masses, centres, tensors and rotors; `FrictionTorque` adds friction.
         physics: "ode" or "dart".
 
     Raises:
@@ -55,7 +55,7 @@ class GazeboClassicEngine:
     def __init__(self, robot: Robot, dynamics: Dynamics, physics: str = "ode"):
         self._n, self._limit = robot.n, robot.tau_max
         # SDF has no rotors. For DART the file has damping A/h, and a torque cancels it (r2s/engines/dart.py). ODE's
-        # damping is not implicit like that: with ODE the torque -A ddq acts, with ddq of links and rotors by MuJoCo.
+        # damping is not implicit, so with ODE the torque -A ddq acts; MuJoCo computes ddq of links with rotors.
         self._rotors = None
         if physics == "ode" and dynamics.armature.any():
             self._rotors = single_arm(robot, dynamics)
@@ -139,7 +139,7 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 def gzserver() -> list[str]:
     """Return the command that starts the server.
 
-    The server of a root directory starts through that directory's own loader, which, unlike chroot, needs no rights.
+    The server in a root directory is started by that directory's loader, which, unlike chroot, needs no root rights.
 
     Raises:
         UserError: the server or the plugin is missing.
@@ -171,7 +171,7 @@ def version() -> str:
 
 
 def _environment(folder: str) -> dict[str, str]:
-    """Return the server's environment: settings within `folder`, a port of its own, no model database."""
+    """Return the server's environment: settings within `folder`, a free port, no model database."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         master = f"http://127.0.0.1:{free.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""List of the installed physics engines with their versions, and of what missing engines need."""
+"""List of the physics engines: versions of the installed ones, and what the missing ones need."""
 
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version

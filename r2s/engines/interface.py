@@ -39,7 +39,7 @@ class FrictionTorque:
         robot, dynamics: the arm.
 
     Attributes:
-        contact: (COLUMNS,) of r2s/physics/contact.py, with the force of the last step; None without a surface.
+        contact: (COLUMNS,), state of r2s/physics/contact.py, with the last step's force; None without a surface.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics):
@@ -54,7 +54,7 @@ class FrictionTorque:
             self.contact[:] = contact_columns(robot, dynamics.surface)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return F (n,) Nm, which is added to the torque tau (n,) Nm of the step that begins at q, dq (n,)."""
+        """Return F (n,) Nm to add to the torque tau (n,) Nm in the step that begins at q, dq (n,)."""
         m, d = self._model, self._data
         d.qpos[:], d.qvel[:], d.qfrc_applied[:] = q, dq, tau
         mujoco.mj_forward(m, d)

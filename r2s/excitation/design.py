@@ -22,12 +22,12 @@ from r2s.physics.robot import SIM_DT, Robot
 SEGMENT_S = 60.0  # s, longest segment: two minutes of a series need 1 GB
 LONGEST_S = 600.0
 PEAKS = 1.875, 5.7735  # of velocity and acceleration at minimum jerk, for 1 rad in 1 s
-SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor on a duration with too high torque; most repetitions
+SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor on the duration while torque is too high; its most uses
 EVERY = round(1 / (COARSE_HZ * SIM_DT))  # step between the rows of a motion that a design evaluates
 
 
 class Design(Protocol):
-    """The criterion by which motions are chosen, given the motions chosen so far."""
+    """The criterion for choosing the next motion, given the motions chosen so far."""
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the scores (B,) of motions (B, T, n) at times t (T,) s, given the motions so far."""
@@ -53,9 +53,9 @@ def designed(
 
     Args:
         robot, space: limits, links and obstacles.
-        design: scores motions.
-        seconds: total of the segments. center: (n,) rad, centre posture, see `fourier.checked_center`.
-        seed: of the random draws. effort: motions tried per segment.
+        design: criterion that scores motions.
+        seconds: total duration of the segments. center: (n,) rad, centre posture, see `fourier.checked_center`.
+        seed: random seed. effort: number of motions tried per segment.
         report: called with the share of the work that is done.
 
     Raises:
@@ -77,7 +77,7 @@ def designed(
 
 
 def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Excitation:
-    """Return a motion between two postures (n,) rad on a path from `approach`; it is at rest at each corner.
+    """Return a motion between two postures (n,) rad on a path from `approach`, with rest at each corner.
 
     Raises:
         UserError: no path is free.

@@ -1,4 +1,4 @@
-"""How far an arm may deviate from a planned motion: less where a joint moves a link towards an obstacle."""
+"""Compute how far an arm may deviate from a planned motion: less where a joint moves a link towards an obstacle."""
 
 from dataclasses import dataclass
 
@@ -27,22 +27,22 @@ class DeviationLimits:
 
     @classmethod
     def along(cls, space: Space, motion: Motion, most: float) -> "DeviationLimits":
-        """Return limits that allow in each interval what `deviation_weights` allows at both of its ends."""
+        """Return limits for a motion: an interval allows what `deviation_weights` allows at both of its ends."""
         rows = geometry_rows(motion)
         weights = deviation_weights(space, motion.q[rows], most)
         return cls(np.maximum(weights[:-1], weights[1:]), int(rows[1] - rows[0]))
 
     def share(self, k: int, deviation: np.ndarray) -> np.ndarray:
-        """Return (K, n): share of each limit that each joint's deviation uses in cycle k; allowed: row sums <= 1."""
+        """Return shares (K, n) of the K limits that the joints use in cycle k; allowed if each row's sum is <= 1."""
         return self.weights[min(k // self.every, len(self.weights) - 1)] * np.abs(deviation)
 
 
 def deviation_weights(space: Space, q: np.ndarray, most: float) -> np.ndarray:
-    """Return weights (T, K + n, n) 1/rad of the deviations that stay clear of the fence at q (T, n) rad.
+    """Return weights (T, K + n, n) 1/rad that limit deviations from q (T, n) rad, so that no link meets the fence.
 
     The K limits keep each distance above FENCE_M, to first order: a joint uses up distance in proportion to its
     lever. The n limits keep each joint within `most`. A deviation of all joints by DEVIATION is allowed everywhere,
-    so that an arm that starts too near can leave.
+    so that an arm that starts too near to an obstacle can move away.
     """
     distances, levers = space.measured(q)
     levers = levers[:, 1:]

@@ -1,9 +1,9 @@
-"""Excitation by a finite Fourier series that is run at a ladder of speeds.
+"""Design an excitation: a finite Fourier series that the arm runs at a ladder of speeds.
 
 The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
-T-RA 13(5), 1997; a prior keeps quantities that a short motion cannot identify from dominating the determinant.
-Friction curves and delay need several speeds. So the series runs at 10 % to 100 % of its speed, on the rungs of a
-ladder, with rests between rungs. Slow rungs also run backwards, so that every joint reverses at low speed.
+T-RA 13(5), 1997; a prior prevents unidentifiable quantities from dominating the determinant.
+Friction curves and delay need several speeds. So the motion proceeds through the series in rungs, from 10 % to 100 %
+of full speed, with rests between them. Slow rungs also run backwards, so that every joint reverses at low speed.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 # Speed ladder: paces relative to full speed.
 SLOWEST = 0.1
-REVERSES_BELOW = 0.4  # a slower rung runs back part of its way
+REVERSES_BELOW = 0.4  # a slower rung also runs back part of its way
 RUNG_S = 4.0  # s, approximate duration of a rung with its rest
 SHORT = 0.3, 0.8  # paces if the duration allows one rung only
 LADDER = 6  # maximum number of rungs per ladder
@@ -38,7 +38,7 @@ LONGEST_S = 120.0
 LEAST_S = 5 * BLEND_S
 # Series.
 TOP_HZ = 1.0  # highest harmonic, in the series' own time
-DECAY = 1.5  # exponent of the amplitude over the harmonic: low ones give position range, high ones acceleration
+DECAY = 1.5  # exponent of amplitude over harmonic: low harmonics need position range, high ones acceleration
 SHORTEST_S = 4.0  # s, minimum fundamental period
 RANGE = 0.8  # share of the distance from the centre to the nearer position limit, or of pi rad if that is less
 SPEED = 0.65  # share of dq_max
@@ -46,12 +46,12 @@ ACCELERATION = 0.7  # share of ddq_max
 STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then it catches up at a higher speed
 # Search.
 DRAWS = 12  # random series
-KEPT = 3  # safe draws of which the best becomes the start of the search
+KEPT = 3  # number of safe draws; the search starts from the best of them
 TRIES = 5  # candidates per step of the local search
-MIN_AMPLITUDE = 0.3  # share of a joint's amplitude; a series that needs less to be safe is dropped
+MIN_AMPLITUDE = 0.3  # share of a joint's largest amplitude; a series that needs less to be safe is dropped
 MARGIN = 0.3  # share of each clearance, and 0.03 of tau_max: reserve for motion between two samples
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
-FINE = 10  # samples for limits per sample for information and safety
+FINE = 10  # number of samples for limits per sample for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
 Samples = tuple[np.ndarray, ...]  # offset from the centre, velocity, acceleration
 # Scores (B,) of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)
@@ -77,10 +77,10 @@ def fourier(
 
     Args:
         robot: limits, links and nominal model.
-        duration: s, ends included.
-        seed: of the random draws.
+        duration: s, including the rests at both ends.
+        seed: random seed.
         gravity: see `information`.
-        effort: motions tried by the local search; 0: no search, take the first safe draw.
+        effort: number of motions that the local search tries; 0: return the first safe draw.
         q_center: (n,) rad, centre posture; default: the middle of the position range.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
@@ -113,12 +113,12 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions: coefficients x (2 H, n) of a series, and a share a (n,) of each joint's largest amplitude.
+    """Candidate motions: coefficients x (2 H, n) of a series, and shares a (n,) of the largest joint amplitudes.
 
     A joint's limits determine its largest amplitude, so x determines only the shape.
 
     Args:
-        robot: its limits. center: (n,) rad. duration: s. space: the obstacles.
+        robot: limits and links. center: (n,) rad, centre posture. duration: s. space: computes distances.
         score: function that scores motions, the larger the better; see `Score`.
     """
 
@@ -194,7 +194,7 @@ class Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the motion at 1 kHz, scaled down if the dense samples require it; None if it becomes too small."""
+        """Return the motion at 1 kHz, scaled down until it is safe at GEOMETRY_HZ; None if it becomes too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))
@@ -206,12 +206,12 @@ class Candidates:
         return Excitation(self.clock[0], self.center + offset, dq, ddq)
 
     def scores(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return the scores (B,) of B pairs (x, a), computed together because that is faster."""
+        """Return the scores (B,) of B pairs (x, a); to compute them together is faster."""
         offset, dq, ddq = (np.stack(m) for m in zip(*(self._coarse(x, a) for x, a in motions), strict=True))
         return self.score(self.t, self.center + offset, dq, ddq)
 
     def _basis(self, rows: slice) -> Samples:
-        """Return matrices (T, 2 H) that map x to the series, its velocity and its acceleration at the ms `rows`."""
+        """Return matrices (T, 2 H) that map x to position, velocity, acceleration of the series at the ms `rows`."""
         _, s, pace, slope = (c[rows, None] for c in self.clock)
         order = np.arange(1, self.harmonics + 1)
         omega = 2 * np.pi / self.period * order
@@ -221,7 +221,7 @@ class Candidates:
         return np.hstack([sine, cosine]), first * pace, second * pace**2 + first * slope
 
     def _scaled(self, series: Samples, a: np.ndarray) -> Samples:
-        """Return offset from the centre, velocity and acceleration (T, n), scaled by a."""
+        """Return offset from the centre, velocity, acceleration (T, n), with shares a of the largest amplitudes."""
         r = self.robot
         q, dq, ddq = series
         room = RANGE * np.minimum([r.q_max - self.center, self.center - r.q_min], np.pi)
@@ -236,7 +236,7 @@ class Candidates:
         return q[::FINE], dq[::FINE], ddq[::FINE]
 
     def _safety(self, offset: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the smallest margin (T,), negative if unsafe: gap / clearance, or unused torque share / 0.1."""
+        """Return the smaller of two margins (T,), negative if unsafe: gap / clearance, unused torque share / 0.1."""
         q = self.center + offset
         torque = (TORQUE_SHARE - torque_share(self.robot, q, dq, ddq)).min(1)
         return np.minimum((self.space.gaps(q) / self.space.clearance).min(1), 10 * torque)
@@ -257,7 +257,7 @@ class Candidates:
     ) -> np.ndarray | None:
         """Return shares a, reduced until `_safety` reaches `margin`; None if one falls below `least`.
 
-        Each round reduces the joint with the largest effect at the least safe sample.
+        Each round reduces the amplitude of the joint that most improves the least safe sample.
         """
         a = a.copy()
         for every in (5, 1):  # first every fifth sample, so that most rounds are fast

@@ -1,4 +1,4 @@
-"""The expected information in a recording of a planned motion, from assumed noise and priors."""
+"""Compute the expected information of a recording of a planned motion, from assumed noise and priors."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from r2s.excitation.motion_checks import gravity_torque
 from r2s.physics.rigid_body import LinkInertia, regressor, tensor_elements
 from r2s.physics.robot import Robot
 
-COARSE_HZ = 10  # samples for information and safety
+COARSE_HZ = 10  # rate of the samples for information and safety
 # Standard deviations of noise and priors, rough values of torque-controlled arms.
 NOISE = 0.002  # share of tau_max, per sample
 FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
@@ -21,13 +21,13 @@ RESTING = 1e-3  # share of dq_max; a slower joint may stick, and its torque carr
 def information(
     robot: Robot, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool
 ) -> np.ndarray:
-    """Return the information (B,) nats of motions (B, T, n) at times (T,) s: half the log det ratio of precisions.
+    """Return the information (B,) nats in motions (B, T, n) at times (T,) s.
 
-    The ratio is posterior over prior; priors are independent and normal. Unknowns per joint: offset, Coulomb friction
-    as a tanh, its width and shift, viscous friction, and angle-dependent drag. Per link: mass and centre of mass
-    (gravity depends on their errors even if the arm compensates it). Without `gravity` (commanded torque): per link
-    the tensor's scale, and one delay. With `gravity` (link-side torque): the whole tensors. The noise is 0.2 % of
-    tau_max at 10 samples per second. A joint's rows at rest do not count, because its friction is undetermined there.
+    It is half of log(det posterior / det prior precision); priors are independent and normal. Unknowns per joint:
+    offset, Coulomb friction as a tanh, its width and shift, viscous friction, angle-dependent drag. Per link: mass,
+    centre of mass (gravity depends on their errors even if the arm compensates it). Commanded torque (no `gravity`)
+    adds each tensor's scale and one delay; link-side torque (`gravity`) adds the whole tensors. The noise is 0.2 % of
+    tau_max at 10 samples per second. Samples of a joint at rest are ignored: its friction is then undetermined.
     """
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)

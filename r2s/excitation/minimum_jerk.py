@@ -1,4 +1,4 @@
-"""Minimum-jerk motion (Flash and Hogan, J. Neurosci. 5(7), 1985)."""
+"""Compute minimum-jerk motions (Flash and Hogan, J. Neurosci. 5(7), 1985)."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ def minimum_jerk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return position, velocity and acceleration of a motion from `start` to `end` (n,) rad in `seconds`.
 
-    Each is (n,) for a time t, s, or (T, n) for times (T, 1). Before 0 and after `seconds` the motion is at rest.
+    Each array is (n,) for one time t, s, or (T, n) for times (T, 1). Before 0 and after `seconds` the arm is at rest.
     """
     s = np.clip(t / seconds, 0.0, 1.0)
     distance = end - start

@@ -1,4 +1,4 @@
-"""Safety checks of a motion before an arm runs it: consistency, limits, torque, and clearance to table and links.
+"""Check a motion before an arm runs it: consistency, limits, torque, and clearance to table and links.
 
 Joint limits are checked at every sample, torque and geometry at `GEOMETRY_HZ`. The links are the MJCF's geoms.
 """
@@ -140,14 +140,14 @@ def check_torque(robot: Robot, motion: Motion) -> None:
 def check_space(
     robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M, space: "Space | None" = None
 ) -> None:
-    """Raise UserError if a link comes too near to table, obstacles or another link; paths.py checks the approach."""
+    """Raise UserError if a link comes too near to table, obstacles or another link; for the approach see paths.py."""
     space = space or Space(robot, table=table, z_min=z_min)
     rows = geometry_rows(motion)
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
 
 
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return (T, n): the sum of |gravity|, |dynamics| of the nominal model and `friction_margin`, over tau_max.
+    """Return (T, n): |gravity| + |dynamics| of the nominal model + `friction_margin`, divided by tau_max.
 
     The sum of magnitudes is conservative: the arm differs from the nominal model, and the torque limit applies to
     the torque without gravity compensation on some arms, and to the torque with it on others.
@@ -168,13 +168,13 @@ def friction_margin(robot: Robot) -> np.ndarray:
 
 
 class Space:
-    """Distances of an arm's links from table, obstacles and each other; see `collision` for the geoms that count.
+    """Computes distances of an arm's links from table, obstacles and each other; `collision` selects the geoms.
 
-    An arm is not exactly where it was planned to be. If each joint j deviates by e_j rad, a distance shrinks by at
+    An arm does not follow its plan exactly. If each joint j deviates by e_j rad, a distance shrinks by at
     most sum_j lever_j |e_j|, to first order. The lever is the link's motion per rad of joint j, from the Jacobian at
-    the posture. A planned posture must leave room for a deviation of all joints by DEVIATION. The arm follows a plan
-    only within its `DeviationLimits`, which are larger where there is more room. So no plan is refused for a
-    deviation that the arm never has, and an arm that deviates stops before it comes near.
+    the posture. A planned posture must leave room for a deviation of all joints by DEVIATION. In motion, an arm that
+    exceeds its `DeviationLimits` is stopped before it comes too near; these limits are larger where there is more
+    room. So no plan is refused because of a deviation that the arm never has.
 
     Attributes:
         clearance: (K,) m, required distances: end effector above z_min (a scale for the search; `gaps` requires 0 m),
@@ -182,7 +182,7 @@ class Space:
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
-        robot: its links. table, z_min: m, see `check_motion`. deviation: rad, of all joints, to leave room for.
+        robot: links. table, z_min: m, see `check_motion`. deviation: rad, of all joints, to leave room for.
         obstacles: boxes.
     """
 
@@ -233,7 +233,7 @@ class Space:
         return need
 
     def measured(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distances (T, K) m and the joints' levers on each (T, K, n) m/rad; levers of the end effector: 0."""
+        """Return distances (T, K) m, and levers (T, K, n) m/rad of joints on distances; 0 for the end effector."""
         tip, apart = np.empty((len(q), 1)), np.empty((len(q), len(self.pairs)))
         places, frames = (np.empty((len(q), self.model.ngeom, k)) for k in (3, 9))
         levers = np.zeros((len(q), 1 + len(self.above) + len(self.pairs), q.shape[1]))
@@ -289,7 +289,7 @@ class Space:
         return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
 
     def _apart(self) -> np.ndarray:
-        """Return the distance of each pair (K,) m; beyond FAR_M the distance of the bounding spheres."""
+        """Return the distances of the `pairs`, m; beyond FAR_M, the distances of their bounding spheres."""
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         radius, place = self.model.geom_rbound, self.data.geom_xpos
         out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]
@@ -305,7 +305,7 @@ class Space:
     def _reach(self, g: int, up: np.ndarray) -> np.ndarray:
         """Return (T,) m from a geom's centre to its lowest point; `up` (T, 3) is the vertical in the geom's frame.
 
-        A signed distance field counts as its bounding sphere.
+        Other shapes, such as a signed distance field, are replaced by their bounding sphere.
         """
         m, kind, size = self.model, mujoco.mjtGeom, self.model.geom_size[g]
         across, along = np.hypot(up[:, 0], up[:, 1]), np.abs(up[:, 2])

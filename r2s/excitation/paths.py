@@ -12,7 +12,7 @@ from r2s.errors import UserError
 from r2s.excitation.motion_checks import CLEARANCE_M, Space
 from r2s.physics.robot import Robot
 
-CLOSER_M = 1e-3  # m, an arm that starts too near may come closer by this on its way out
+CLOSER_M = 1e-3  # m, an arm that starts too near to an obstacle may come closer by this on its way out
 SAME = 1e-3  # rad, a joint this close to its target need not move
 
 
@@ -92,6 +92,6 @@ def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
 
 
 def _where(leg: int, count: int, share: float) -> str:
-    """Return the description of a point on a path of `count` postures, at `share` of a leg."""
+    """Return a description of the point at `share` of a leg, on a path of `count` postures."""
     which = "" if count == 2 else f", from posture {leg + 1} to {leg + 2} of {count}"
     return f" {100 * share:.0f} % of the way{which}"

@@ -1,4 +1,4 @@
-"""Check that a bundle was made for the arm on which it will run. This module needs nothing of r2s."""
+"""Check that a bundle was made for the arm on which it will run. `r2s export` copies this module into the bundle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ class Arm:
     """Description of the arm on which a bundle will run. The runtime refuses a bundle made for another arm.
 
     Attributes:
-        joints: names in order from the base. cycle_hz: rate of its torque commands.
+        joints: joint names in order from the base. cycle_hz: rate at which the arm takes torque commands, Hz.
         torque: "without gravity" if the arm adds its own gravity compensation, as libfranka's arms do.
-        q_min, q_max: rad. dq_max: rad/s. tau_max: Nm. dtau_max: Nm/s. Limits of the arm, one per joint.
-        slows: deceleration, rad/s^2, and offset, rad/s, each one per joint, of an arm such as the FR3. At a distance
-            d from a position limit it allows the speed sqrt(2 deceleration d) - offset. None: no such limit.
+        q_min, q_max, dq_max, tau_max, dtau_max: the arm's limits, one per joint: rad, rad, rad/s, Nm, Nm/s.
+        slows: (decelerations rad/s^2, offsets rad/s), one value per joint, for an arm such as the FR3: at a distance
+            d from a position limit this arm allows the speed sqrt(2 deceleration d) - offset. None: no such limit.
     """
 
     joints: Sequence[str]
@@ -33,7 +33,7 @@ class Arm:
 
 
 def fits(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle was made for another arm, or allows itself more than the limits of this arm."""
+    """Raise BundleError if a bundle was made for another arm, or needs more than the limits of this arm allow."""
     own, n = contract["joints"], len(contract["joints"])
     if len(arm.joints) != n:
         raise BundleError(f"expected {n} joints, got {len(arm.joints)} of the arm")

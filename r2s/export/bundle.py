@@ -1,4 +1,4 @@
-"""`r2s export`: a folder with everything that another program needs to run a policy, described by a contract."""
+"""Write the bundle of `r2s export`: a folder with everything that another program needs to run a policy."""
 
 import ast
 import builtins
@@ -41,7 +41,7 @@ from r2s.tasks.task import Task
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
 # modules that r2s_runtime.py of a bundle contains in addition to runtime.py, in this order
 HERE, PARTS = "r2s.export.", ("law", "arm", "push", "control", "inverse_dynamics", "plan", "surface", "fences")
-EXAMPLES = 4  # plans in a bundle
+EXAMPLES = 4  # number of example plans in a bundle
 PLAN = "plan.npy"  # the first example plan if plans are on a surface; the C++ loop reads it
 SAME = 1e-4  # allowed difference between the actions of policy.onnx and policy.pt, as a share of action_scale
 
@@ -59,9 +59,9 @@ def write_bundle(
     """Write the bundle of a finished training into the new folder `to`, atomically.
 
     Args:
-        to: the new folder. source: the run folder of the training.
-        robot, task, policy: of the training. dynamics: of one arm, the center of the training's randomization.
-        config: of the training. places: names of all simulators and arms; the model card lists the untried ones.
+        to: the new folder. source: run folder of the training. robot, task, policy, config: those of the training.
+        dynamics: dynamics of one arm, the center of the training's randomization.
+        places: names of all simulators and arms; the model card lists those that were not tried.
 
     Raises:
         UserError: `to` exists, or policy.onnx of the run is missing or does not compute the actions of policy.pt.
@@ -109,7 +109,7 @@ def write_bundle(
 
 
 def surface_of(source: Path, robot: Robot, task: Task, dynamics: Dynamics) -> Surface | None:
-    """Return the surface that a task touches: the identified one of the run folder, or else the nominal one."""
+    """Return the surface that a task touches: as identified in the run folder, else nominal; None without contact."""
     if not task.touches:
         return None
     if (source / "contact.yaml").is_file():
@@ -174,7 +174,7 @@ def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
 
 
 def one_file(control: Controller) -> str:
-    """Return the text of r2s_runtime.py: runtime.py with the sources of PARTS and control laws instead of imports.
+    """Return the text of r2s_runtime.py: runtime.py, whose imports from r2s are replaced by the imported source.
 
     Raises:
         UserError: the control law uses names that a bundle does not contain.
@@ -208,10 +208,10 @@ def one_file(control: Controller) -> str:
 def law_source(law: Any) -> tuple[str, str]:
     """Return the name and the source of a control law as plain Python, without decorators.
 
-    If a law uses other functions or numbers, the source is a function that defines them locally and returns the law.
+    If the law uses other functions or numbers, the source is a function that defines them and returns the law.
 
     Raises:
-        UserError: the law uses a name that is no function, number, builtin or NumPy's `np`.
+        UserError: the law uses a name that is neither a function, a number, a builtin nor NumPy's `np`.
     """
     function = getattr(law, "py_func", law)
     sources: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""MODEL_CARD.md: training, measured performance and limits of a policy."""
+"""Make MODEL_CARD.md, which describes the training, the measured performance and the limits of a policy."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -28,8 +28,8 @@ def card(
     """Return the sections of the model card, {title: items}.
 
     Args:
-        source, config, meta: run folder of the training, its config.yaml and meta.json. contract: of the bundle.
-        bundle: the unfinished bundle folder. places: names of all simulators and arms.
+        source, config, meta: run folder of the training, its config.yaml and meta.json. contract: the bundle's
+            contract. bundle: the unfinished bundle folder. places: names of all simulators and arms.
     """
     best, measures = json.loads((source / "summary.json").read_text())["best"], measures_of(source)
     rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
@@ -75,7 +75,7 @@ def card(
 
 
 def contacts(contract: Mapping[str, Any]) -> str:
-    """Return the words for the contacts that did not occur in the training."""
+    """Return words that name the contacts that were absent from the training."""
     return "no contact but of the tip" if contract["goal"]["kind"] == "surface" else "no contact"
 
 
@@ -149,7 +149,7 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"place (run)": row} of a policy's ended transfers in the same root, if the row has `measure`."""
+    """Return {"place (run)": measures} of a policy's ended transfers in its root, if they include `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:

@@ -1,8 +1,8 @@
-"""contract.json: everything that a program needs to run a policy on the arm that it was trained for.
+"""Make contract.json: everything that a program needs to run a policy on the arm for which it was trained.
 
-It contains all numbers of driver and safety filter (r2s/arm/driver.py, r2s/physics/safety_filter.py), the controller,
-and the model for computed torque (r2s/physics/inverse_dynamics.py). A runtime adds no numbers of its own. JSON has no
-infinity, so null stands for a missing limit.
+The contract has all numbers of driver and safety filter (r2s/arm/driver.py, r2s/physics/safety_filter.py), the
+controller, and the model for computed torque (r2s/physics/inverse_dynamics.py), so a runtime needs no other numbers.
+JSON has no infinity, so null stands for a missing limit.
 """
 
 from typing import Any, Protocol, cast
@@ -43,9 +43,9 @@ MORE_OF = {  # additional sources, by the kind of goal
         "velocity",
     ),
 }
-NEAR_RAD = 0.05  # rad, allowed distance from the start posture; half of what `move_to` may be off its path
+NEAR_RAD = 0.05  # rad, allowed distance from the start posture; half the path error that `move_to` allows
 FIRST_ROW = "at rest, at the joint angles of a plan's first row"
-RESTING = 0.1  # rad/s, below which a joint rests: five times the driver's STILL, for noise of slower sensors
+RESTING = 0.1  # rad/s, speed below which a joint is at rest: five times the driver's STILL, for noisier sensors
 UNITS = {"q_low": "rad", "q_high": "rad", "q_fade": "rad", "most": "rad/s", "slowing": "rad/s^2", "offset": "rad/s"}
 UNITS |= {"dq_max": "rad/s", "added": "kg m^2", "tau_max": "Nm", "step": "Nm per cycle", "friction": "Nm"}
 UNITS |= {"asked": "Nm", "q_stop_low": "rad", "q_stop_high": "rad", "dq_stop": "rad/s"}
@@ -56,16 +56,16 @@ class DescribesObservation(Protocol):
     """A task that describes the terms of its observations."""
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms in the order of their numbers in an observation."""
+        """Return the terms in the order in which an observation lists them."""
         ...
 
 
 def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.ndarray | None = None) -> dict[str, Any]:
-    """Return the contract of a policy for this arm and task, without the keys files, versions, trained and seal.
+    """Return a policy's contract, except its keys files, versions, trained and seal, which `write_bundle` adds.
 
     Args:
-        robot, task: of the training. friction: (n,) Nm, see `r2s.physics.safety_filter.filter_torque`.
-        rotors: armatures (n,) kg m^2 for the safety filter; None: those of the robot.
+        robot, task: the training's. friction: Coulomb level (n,) Nm, see `r2s.physics.safety_filter.filter_torque`.
+        rotors: armatures (n,) kg m^2 for the safety filter; None: the armatures of `robot`.
 
     Raises:
         UserError: the task does not describe its observations, or the runtime of a bundle cannot run the task.
@@ -130,7 +130,7 @@ def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
 
 
 def check_exportable(robot: Robot, task: Task) -> None:
-    """Raise UserError if a runtime cannot run the task: it takes points, plans of `TrackTask` or on a surface."""
+    """Raise UserError unless a runtime can run the task: its goals are points or plans of known kinds."""
     control, kind = task.control(robot), kind_of(task)
     model = model_of(control, task)
     if model is not None and model.dynamics.family.name not in FRICTION:
@@ -167,7 +167,7 @@ def model_of(control: Controller, task: Task) -> InverseDynamics | None:
 
 
 def controller(control: Controller, task: Task) -> dict[str, Any]:
-    """Return the entry `control`: action space, parameters of the control law, and the model of `model_of`."""
+    """Return the entry `control`: action space, parameters of the control law, and the arm model that it needs."""
     kind, model = kind_of(task), model_of(control, task)
     return {
         "name": control.name,
@@ -222,7 +222,7 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
 
 
 def width(of: str, joints: int, preview: int) -> int:
-    """Return how many numbers an observation term with the source `of` has."""
+    """Return the number of values of an observation term whose source is named `of`."""
     own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
     own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
     return {**own, "above_target": 1}.get(of, joints)
@@ -260,7 +260,7 @@ def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, A
 
 
 def start(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the entry `start`: the posture in which motions begin at rest, and how far from it the arm may be."""
+    """Return the entry `start`: the start posture, and the allowed distance from it and speed at the start."""
     rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
         return {"words": FIRST_ROW} | rest
@@ -310,7 +310,7 @@ def identified(arm: InverseDynamics, ahead_s: float, kind: str) -> dict[str, Any
 
 
 def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[Any]]:
-    """Return the numbers of safety filter and driver that each joint has of its own, {name of UNITS: n numbers}."""
+    """Return the safety filter's and driver's parameters that differ between joints: {name in UNITS: n values}."""
     matrix = law.filter_limits(robot, task.torque_limit(robot))
     values = [matrix[:, k] for k in range(law.COLUMNS)]
     values += [friction, task.torque_limit(robot), robot.q_min + driver.Q_INSIDE, robot.q_max - driver.Q_INSIDE]
@@ -320,7 +320,7 @@ def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[
 
 
 def numbers(task: Task) -> dict[str, float]:
-    """Return the numbers of safety filter and driver that all joints share."""
+    """Return the safety filter's and driver's parameters that are the same for all joints."""
     deadline = max(driver.DEADLINE_S, driver.PERIODS / task.ctrl_hz)
     own = {"cycle_s": SIM_DT, "low_pass": low_pass_factor(task.cutoff_hz), "brake_s": law.BRAKE_S, "rate": law.RATE}
     own |= {"approach": law.APPROACH, "allowed": law.ALLOWED, "nothing": law.FADED, "exact": law.TOLERANCE}
@@ -329,7 +329,7 @@ def numbers(task: Task) -> dict[str, float]:
 
 
 def listed(values: Any) -> Any:
-    """Return a number or an array as JSON can express it; numbers that are not finite become null."""
+    """Return a number or an array in a form that JSON can express; values that are not finite become null."""
     if np.ndim(values) == 0:
         return float(values) if np.isfinite(values) else None
     return [listed(v) for v in values]

@@ -1,7 +1,7 @@
-"""Control laws in a bundle: the laws that r2s compiles, run here as plain Python.
+"""Run the control law of a bundle in plain Python; r2s itself compiles the same function.
 
-`r2s export` copies the source of the control law into r2s_runtime.py of the bundle. So a bundle needs nothing of r2s,
-and runs the same function as the training did.
+`r2s export` copies the source of the control law into r2s_runtime.py of the bundle. So the bundle runs the function
+that the training ran, although r2s is not installed.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ class Control:
     """The controller of a contract. It maps the policy's command and the state to target torques, once per cycle.
 
     Args:
-        contract: its entry `control` describes the controller.
+        contract: contract of the bundle; the entry `control` describes the controller.
     """
 
     def __init__(self, contract: dict[str, Any]):
@@ -34,13 +34,13 @@ class Control:
         self._memory = np.zeros(self._memory_size)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Return the target torque (n,) Nm of this cycle; the command is the action, then the setpoint."""
+        """Return the target torque (n,) Nm of this cycle. `command` is the action followed by the setpoint."""
         out = np.zeros(self._n)
         self._law(q, dq, command, self._parameters, self._memory, out)
         return out
 
     def at_rest(self, q: np.ndarray, dq: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm of the control law for the action zero and a cleared memory."""
+        """Return the torque (n,) Nm that the control law computes for a zero action and a cleared memory."""
         out = np.zeros(self._n)
         command = np.concatenate([np.zeros(self.action_dim), setpoint])
         self._law(q, dq, command, self._parameters, np.zeros(self._memory_size), out)

@@ -1,6 +1,6 @@
-"""Checks of start, goal and plan before a motion, and signals that bring the arm to rest; needs nothing of r2s.
+"""Check start, goal and plan of a motion, run the policy in a thread, and bring the arm to rest after a signal.
 
-If the arm's clock does not wait, the policy runs in its own thread and each cycle uses the newest action.
+`r2s export` copies this module into the bundle. The thread is for arms whose clock does not wait for the policy.
 """
 
 import signal
@@ -16,9 +16,9 @@ import numpy as np
 from r2s.export.law import BundleError, Model
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")  # Ctrl-C, kill, a closed terminal, Ctrl-\, Ctrl-Z
-POLL_S = 1e-4  # s, between two reads of the mailbox by the policy's thread: a tenth of a cycle
-ROUNDING_M = 1e-6  # m, by which a goal on the border of its region may be outside
-AGREE_M = 1e-3  # m, allowed distance between a plan's position and that of its joint angles
+POLL_S = 1e-4  # s, time between two reads of the mailbox by the policy's thread: a tenth of a cycle
+ROUNDING_M = 1e-6  # m, tolerance with which a goal is compared with the border of its region
+AGREE_M = 1e-3  # m, allowed distance between the position in a plan's row and the one that its joint angles reach
 
 
 def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
@@ -37,7 +37,7 @@ def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
 
 
 def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.ndarray) -> None:
-    """Raise BundleError unless the arm is at rest near the start posture `home` (n,) rad, as in the training."""
+    """Raise BundleError unless the arm is at rest near the start posture `home` (n,) rad. `start`: the limits."""
     if not (np.isfinite(q).all() and np.isfinite(dq).all()):
         raise BundleError("the arm's state is not finite")
     if start["within_rad"] is not None and (far := np.abs(q - home)).max() > start["within_rad"]:
@@ -51,7 +51,7 @@ def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.n
 
 
 def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError if a plan leaves the arm's limits or the training's region, or was made for another arm."""
+    """Raise BundleError if a plan exceeds the arm's limits or the training's region, or is for another arm."""
     at, own = contract["goal"]["columns"], contract["law"]["joint"]
     place, q, dq = (plan[:, slice(*at[name])] for name in ("place", "q", "dq"))
     low, high, most = (np.array([s if v is None else v for v in own[k]]) for k, s in BOUNDS.items())
@@ -73,7 +73,7 @@ BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # ke
 
 
 class PolicyThread:
-    """A policy in a thread beside the 1 kHz cycle. Two mailboxes for one item each exchange data without a lock.
+    """A thread that computes the actions, so that the 1 kHz cycle does not wait. Two one-item mailboxes need no lock.
 
     Args:
         act: maps an observation to an action.
@@ -81,7 +81,7 @@ class PolicyThread:
 
     def __init__(self, act: Callable[[np.ndarray], np.ndarray]):
         self._act = act
-        self._seen: deque[tuple] = deque(maxlen=1)  # if full, append drops the old item; all is atomic
+        self._seen: deque[tuple] = deque(maxlen=1)  # append replaces an old item; both calls are atomic
         self._made: deque[tuple] = deque(maxlen=1)
         threading.Thread(target=self._run, daemon=True).start()
 
@@ -90,7 +90,7 @@ class PolicyThread:
         self._seen.append((motion, seen, setpoint))
 
     def newest(self, motion: int) -> np.ndarray | None:
-        """Return the newest command, or None if it was taken already or belongs to another motion than `motion`."""
+        """Return the newest command, or None if the caller has it already or it belongs to another motion."""
         try:
             of, command = self._made.pop()
         except IndexError:

@@ -1,4 +1,4 @@
-"""contract.hpp: contract.json as C++ constants, with the control law; examples/libfranka includes it."""
+"""Make contract.hpp: the contract as C++ constants, and the control law, for the loop in examples/libfranka."""
 
 import json
 from collections.abc import Mapping
@@ -11,14 +11,14 @@ from r2s.export.law import LINK
 from r2s.export.push import PUSH_NUMBER, PUSH_VECTOR, STOPS
 
 LOWEST = ("q_low", "q_stop_low")  # lower limits, in which null stands for minus infinity
-PARAMETERS = 7  # of the friction family with the most parameters
+PARAMETERS = 7  # number of parameters of the largest friction family
 
 
 def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
     """Return a C++17 header: model, safety filter, control law and observation.
 
     Args:
-        contract: see contract.py. policy_sha256: of policy.onnx. law: C++ body of the control law, `Controller.cpp`.
+        contract: see contract.py. policy_sha256: digest of policy.onnx. law: C++ body of the law, `Controller.cpp`.
     """
     model, filter_, seen, rates, control = (contract[k] for k in ("model", "law", "observation", "rates", "control"))
     joints = ", ".join(json.dumps(name) for name in contract["joints"])
@@ -63,7 +63,7 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
 
 
 def _push(push: Mapping[str, Any] | None) -> list[str]:
-    """Return the constants of the push limit, zeros if there is none, and the thresholds of a Franka's reflexes."""
+    """Return the constants of the push limit (zeros without one) and the reflex thresholds of a Franka arm."""
     own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
         PUSH_VECTOR, [0.0] * 3
     )
@@ -80,7 +80,7 @@ def _push(push: Mapping[str, Any] | None) -> list[str]:
 
 
 def _surface(contract: Mapping[str, Any]) -> list[str]:
-    """Return the constants of plans on a surface, and of the model that estimates the observed contact force."""
+    """Return the constants for plans on a surface and for the arm model that estimates the contact force."""
     goal, model = contract["goal"], contract["control"]["model"]
     trained, family = goal["trained"], model["friction"]["family"]
     names, given = FRICTION[family], model["friction"]["parameters"]
@@ -111,7 +111,7 @@ OWN = {"own_offset": "offset_Nm", "load": "load", "drag_sin": "drag_sin_Nm", "dr
 
 
 def _fences(contract: Mapping[str, Any]) -> list[str]:
-    """Return the constants of the allowed start and the region of goals; infinite limits where a task has none."""
+    """Return the constants for the allowed start and the region of goals; a missing limit becomes infinity."""
     start, trained = contract["start"], contract["goal"].get("trained") or {}
     near, far = trained.get("shoulder_distance_m", (0.0, None))
     numbers = {"start_within": start["within_rad"], "start_fastest": start["fastest_rad_per_s"], "goal_nearest": near}
@@ -122,7 +122,7 @@ def _fences(contract: Mapping[str, Any]) -> list[str]:
 
 
 def _rows(name: str, values: list[Any], before: str = "") -> str:
-    """Return a constant with one row per link: nine numbers for a frame, six for an inertia tensor."""
+    """Return the C++ line of a constant with a row per link: a frame has nine numbers, an inertia tensor six."""
     if name == "frame":
         values = [[x for row in frame for x in row] for frame in values]
     elif name == "tensor":

@@ -1,7 +1,7 @@
-"""Inverse dynamics of the identified arm in NumPy: a second implementation of r2s/physics/inverse_dynamics.py.
+"""Compute the inverse dynamics of the identified arm in NumPy, as r2s/physics/inverse_dynamics.py does.
 
-It serves the setpoints of control=computed_torque and the estimate of contact force. It needs nothing of r2s:
-`r2s export` copies it into r2s_runtime.py of a bundle.
+The runtime of a bundle needs it for the setpoints of control=computed_torque and for the estimate of contact force.
+`r2s export` copies this module into r2s_runtime.py of a bundle.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ class InverseDynamics:
     """Inverse dynamics of the identified arm, and the setpoints that follow from a plan.
 
     Args:
-        contract: `control.model` is the identified arm, `model` the one of the arm's own gravity compensation.
+        contract: contract of the bundle. `control.model` is the identified arm, `model` the arm's nominal model.
     """
 
     def __init__(self, contract: dict[str, Any]):
@@ -45,7 +45,7 @@ class InverseDynamics:
     def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
         """Return the setpoints (rows, 3 n + n n) for the first `rows` rows of a joint motion (T, n) sampled at `hz`.
 
-        A setpoint is feedforward, Nm, q_d, dq_d, and the mass matrix row by row. A cycle of 1 ms is too short for it.
+        A setpoint is feedforward, Nm, q_d, dq_d, and the mass matrix row by row. Computing it takes longer than 1 ms.
         """
         n = q.shape[1]
         out = np.empty((rows, 3 * n + n * n))
@@ -61,7 +61,7 @@ class InverseDynamics:
         return out
 
     def equations(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm of a motion, less the arm's gravity compensation."""
+        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm for a motion; the arm itself compensates gravity."""
         self._own.place(q)
         self._nominal.place(q)
         mass, bias = self._own.equations(dq)

@@ -1,6 +1,6 @@
-"""Driver and safety filter in NumPy for the arm of a contract; the original is r2s/physics/safety_filter.py.
+"""Run driver and safety filter in NumPy, as r2s/arm/driver.py and r2s/physics/safety_filter.py do on an arm.
 
-This module needs nothing of r2s. `r2s export` merges it, others and runtime.py into a bundle's r2s_runtime.py.
+`r2s export` copies this module, with others, into r2s_runtime.py of a bundle, so it imports nothing from r2s.
 """
 
 from collections.abc import Sequence
@@ -10,15 +10,15 @@ import numpy as np
 
 LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
 
-OVER = 3  # last phase of a stop: nothing is left to do about the contact, see push.py
+OVER = 3  # last phase of a stop: the contact needs no further action, see push.py
 
 
 class BundleError(ValueError):
-    """A bundle that cannot run here, or a wrong call of its runtime; the message is one line."""
+    """Error: a bundle cannot run here, or its runtime was called wrongly; the message is one line."""
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
-    """Return a list of a contract as an array (n,). null becomes `none`, because JSON has no infinity."""
+    """Return a list from a contract as an array (n,). `none` replaces null, because JSON has no infinity."""
     return np.array([none if v is None else v for v in values], dtype=float)
 
 
@@ -30,7 +30,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class Model:
-    """The arm's kinematics and dynamics without gravity, from `model` of a contract."""
+    """Kinematics and dynamics of an arm, from the entry `model` of a contract. `place` sets the joint angles."""
 
     def __init__(self, model: dict[str, Any]):
         self.n = len(model["links"])
@@ -63,14 +63,14 @@ class Model:
         return self.point(self._hand)
 
     def point(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (3,) m and Jacobian (3, n) m/rad of the point at `own` (3,) m in the last link's frame."""
+        """Return position (3,) m and Jacobian (3, n) m/rad of the point `own` (3,) m in the last link's frame."""
         place = self.frame[-1] @ own + self.origin[-1]
         return place, cross(self.axis, place - self.origin).T
 
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
 
-        The torque is by Newton-Euler; the matrix is the sum of J_k^T (m, I)_k J_k over the links k.
+        The torque comes from Newton-Euler recursion, the matrix from the sum of J_k^T (m, I)_k J_k over the links k.
         """
         R, p, z, n = self.frame, self.origin, self.axis, self.n
         spin = z * dq[:, None]
@@ -115,8 +115,8 @@ class Driver:
         limited: number of cycles of this motion in which the safety filter changed the torque.
 
     Args:
-        law: of a contract. model: of the same contract. soft_start_s: time over which the torque fades in, s.
-        control: `Control` of the contract; None: commands are torques. push: `PushLimit` of the contract, or None.
+        law: entry `law` of a contract. model: `Model` of the arm. soft_start_s: time in which torque fades in, s.
+        control: the contract's `Control`; None: commands are torques. push: the contract's `PushLimit`, or None.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class Driver:
         n = self._model.n
         self.effort, self._target, self._filtered, self._sent, self._held = np.zeros((5, n))
         self.stopping: str | None = None
-        self._brakes_alone = False  # a limit or an invalid state caused the stop: brake, whatever the contact
+        self._brakes_alone = False  # a limit or an invalid state caused the stop: brake, even in contact
         self._share, self._cycle, self._silent, self._damped, self._rests = 1.0, 0, 0, 0, False
         self.limited = 0
         self._command: np.ndarray | None = None
@@ -143,7 +143,7 @@ class Driver:
 
     @property
     def done(self) -> bool:
-        """Whether a stop has ended: the arm is at rest, or the time for the stop is over."""
+        """Whether a stop has ended, because the arm is at rest or the time for a stop is over."""
         over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
         return self.stopping is not None and self._damped > 0 and (self._rests or over)
 
@@ -153,8 +153,8 @@ class Driver:
         """Return the torque command (n,) Nm of this cycle.
 
         Args:
-            q, dq: (n,) rad, rad/s, of this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            command: (c,) for the controller; None: no new one. placed: whether the model is at q already.
+            q, dq: joint state (n,) rad, rad/s, in this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
+            command: input (c,) of the controller; None: unchanged. placed: whether `model.place(q)` was called.
         """
         j, c = self._j, self._number
         seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
@@ -182,7 +182,7 @@ class Driver:
                 self._target = np.clip(target, -j["asked"], j["asked"])
                 self._rests = self._rests and self._push.phase == OVER
             self._share = max(needs, self._share - c["cycle_s"] / c["brake_s"])
-            if seen and self._share == 0.0:  # a spring against joints that a load or wrong friction still moves
+            if seen and self._share == 0.0:  # a spring stops joints that a load or a wrong friction model still moves
                 slides = np.abs(dq) > c["still"]
                 along = np.where(slides & (dq * self._held > 0), np.minimum(j["release"], np.abs(self._held)), 0.0)
                 turned = self._held - along * np.sign(dq) - c["cycle_s"] * j["spring"] * np.where(slides, dq, 0.0)
@@ -228,7 +228,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within the joint bounds and the push limit that is nearest to the effort.
+        """Return the torque (n,) Nm nearest to the effort that respects the joint bounds and the push limit.
 
         The second value is whether the safety filter changed the effort.
         """
@@ -252,9 +252,9 @@ class Driver:
     def _bounded(
         self, tau: np.ndarray, dq: np.ndarray, ddq: np.ndarray, bounds: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to tau that keeps accelerations within bounds, and whether it differs.
+        """Return the torque (n,) Nm nearest to tau with accelerations within bounds, and whether it differs from tau.
 
-        ddq: (n,) rad/s^2 caused by tau. bounds: inverse of the mass matrix, low and high (n,) rad/s^2.
+        ddq: acceleration (n,) rad/s^2 due to tau. bounds: inverse mass matrix, lowest and highest ddq (n,) rad/s^2.
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():
@@ -269,11 +269,11 @@ class Driver:
         return tau + self._stops(mobility, ddq, low, high), True
 
     def fastest(self, q: np.ndarray, up: bool) -> np.ndarray:
-        """Return the speeds (n,) rad/s that the safety filter allows at q (n,) rad, upwards or downwards."""
+        """Return the speeds (n,) rad/s that the safety filter allows at q (n,) rad; `up`: towards the upper limit."""
         return self._allowed(self._j["q_high"] - q if up else q - self._j["q_low"])
 
     def _allowed(self, way: np.ndarray) -> np.ndarray:
-        """Return the speeds (n,) rad/s that are allowed at the distances `way` (n,) rad before the limits."""
+        """Return the speeds (n,) rad/s that are allowed at the distances `way` (n,) rad from the position limits."""
         j, c = self._j, self._number
         speed = np.minimum(self._share * j["most"], c["approach"] * way)
         slows = (way > 0.0) & np.isfinite(j["slowing"])
@@ -285,7 +285,7 @@ class Driver:
         return speed
 
     def _stops(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the torques (n,) Nm that mechanical stops at the bounds would add: block principal pivoting."""
+        """Return the torques (n,) Nm that stops at the bounds would add, found by block principal pivoting."""
         c = self._number
         side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))
         push = np.zeros_like(ddq)

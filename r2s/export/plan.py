@@ -1,7 +1,7 @@
-"""Plans of a policy that tracks a trajectory, in NumPy: a second implementation of r2s/tasks/track.py.
+"""Make and follow the plans of a policy that tracks a trajectory; in training, r2s/tasks/track.py does so.
 
 A plan is a timed path with a row per control step: position and velocity of the end effector, and angles, speeds and
-accelerations of the joints. It needs nothing of r2s: `r2s export` copies it into r2s_runtime.py of a bundle.
+accelerations of the joints. `r2s export` copies this module into r2s_runtime.py of a bundle.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ NO_PLAN = "the policy of this bundle follows plans: pass one to `reset`"
 
 
 def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a plan as an array; raise BundleError if it is missing, has another shape, or is not finite."""
+    """Return a plan as an array; raise BundleError if it is missing, not finite, or of a wrong shape."""
     if plan is None:
         raise BundleError(NO_PLAN)
     plan = np.array(plan, dtype=float)
@@ -30,10 +30,10 @@ def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Follower:
-    """Follow a plan: return what the policy observes of it and the setpoint of the controller, step by step.
+    """Follow a plan: return the observation sources and the controller's setpoint for each control step.
 
     Args:
-        contract: its goals are plans. control, model: made from the contract; `model` is not used.
+        contract: contract with plans as goals. control, model: made from it; `model` is not used.
     """
 
     def __init__(self, contract: dict[str, Any], control: Control, model: Model | None = None):
@@ -46,7 +46,7 @@ class Follower:
         self._shape, self._plan = tuple(goal["shape"]), np.zeros(0)
 
     def take(self, plan: Any) -> None:
-        """Store the next motion's plan; raise BundleError if it is missing, has another shape, or is not finite."""
+        """Store the next motion's plan; raise BundleError if it is missing, not finite, or of a wrong shape."""
         plan = finite_plan(plan, self._shape)
         if self._dynamics is not None:
             q, dq, ddq = (plan[:, self._at[k]] for k in ("q", "dq", "ddq"))

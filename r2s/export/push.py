@@ -1,7 +1,7 @@
-"""Limit of contact force and closing speed in NumPy, and the stop of an arm whose tip presses on a surface.
+"""Limit contact force and closing speed, and stop an arm whose tip presses on a surface, in NumPy.
 
-The originals are r2s/physics/push_limit.py, with the derivation, and r2s/physics/contact_stop.py. This module needs
-nothing of r2s, because `r2s export` copies it into r2s_runtime.py of a bundle.
+r2s/physics/push_limit.py, which has the derivation, and r2s/physics/contact_stop.py do the same in r2s. `r2s export`
+copies this module into r2s_runtime.py of a bundle.
 """
 
 from collections.abc import Callable
@@ -21,10 +21,10 @@ BEGINS, PRESSES, CLEAR = range(3)  # phases of a stop, before OVER
 
 
 class PushLimit:
-    """The push limit of one arm. Call in every cycle `see`, then `stop` while the arm is being stopped, then `limit`.
+    """The push limit of one arm. In every cycle call `see`, then `stop` if the arm is being stopped, then `limit`.
 
     Args:
-        law: of a contract. model: of the arm; the caller sets its joint angles in every cycle.
+        law: entry `law` of a contract. model: the arm's `Model`; call `model.place(q)` in every cycle before `see`.
     """
 
     def __init__(self, law: dict[str, Any], model: Model):
@@ -35,9 +35,9 @@ class PushLimit:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the estimated force and the phase of a stop, before a motion."""
+        """Clear the estimated force and the phase of a stop, before a motion."""
         self._resisted, self._speed = 0.0, 0.0
-        self._before: float | None = None  # closing speed one cycle ago, m/s; None: the tip was far
+        self._before: float | None = None  # closing speed one cycle ago, m/s; None: tip far from the plane
         self.phase, self._felt, self._from, self._pull = BEGINS, 0.0, 0.0, 0.0
 
     def see(self, dq: np.ndarray, mass: np.ndarray, bias: np.ndarray) -> None:
@@ -62,7 +62,7 @@ class PushLimit:
         self._dq, self._mass, self._bias = dq, mass, bias
 
     def _bound(self, last: np.ndarray) -> float:
-        """Return the bound, m/s^2, of the inward acceleration lever @ torque, given the previous torque (n,) Nm."""
+        """Return the largest allowed `lever @ torque`, m/s^2, inwards. last: torque (n,) Nm of the previous cycle."""
         p, c, mobility = self._p, self._c, self._mobility
         if self._height > p["near_m"]:
             self._resisted, self._before = 0.0, None
@@ -83,9 +83,9 @@ class PushLimit:
         return most - own
 
     def limit(self, effort: np.ndarray, last: np.ndarray, bounded: Callable[..., Any]) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within all bounds nearest to the effort (n,) Nm, and whether they differ.
+        """Return the torque (n,) Nm within all bounds nearest to the effort (n,) Nm, and whether these two differ.
 
-        bounded: maps a torque and a bias that includes the contact, (n,) Nm, to the torque within joint bounds.
+        bounded: function (torque, bias torque with contact), (n,) Nm, that limits the torque to the joint bounds.
         """
         bound, p, row = self._bound(last), self._p, self._row
         bias = self._bias + max(self._resisted, 0.0) * row
@@ -111,10 +111,10 @@ class PushLimit:
         return out, True
 
     def stop(self, held: np.ndarray, cycles: int) -> tuple[np.ndarray, float]:
-        """Return the target torque (n,) Nm of a cycle of a stop, and the share of the allowed speeds that it needs.
+        """Return the target torque (n,) Nm for a cycle of a stop, and the share of the allowed speeds that it needs.
 
         Args:
-            held: (n,) Nm, torque that the driver adds to the target. cycles: number of cycles of the stop so far.
+            held: torque (n,) Nm that the driver adds to the target. cycles: number of cycles since the stop began.
         """
         p, row, lever, mobility = self._p, self._row, self._lever, self._mobility
         if cycles * self._c["cycle_s"] > p["leaves_s"]:

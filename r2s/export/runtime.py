@@ -4,12 +4,12 @@
 
     runtime = Runtime("BUNDLE", Arm(joints=[...], cycle_hz=1000, torque="without gravity", ...))
     runtime.reset()                      # at rest, before a motion
-    with stopped_by_signals(runtime):    # Ctrl-C and the like bring the arm to rest
+    with stopped_by_signals(runtime):    # Ctrl-C and similar signals bring the arm to rest
         while not runtime.done:          # every millisecond
             tau = runtime(q, dq, tau_J_d, goal)
 
-If the policy follows plans, pass the plan to `reset` and no goal in a cycle. `Runtime.plan` makes a plan from joint
-motion. The bundle's requirements are in its contract.json. A mismatch raises BundleError with a message of one line.
+If the policy follows plans, pass the plan to `reset`, and no goal in the cycles. `Runtime.plan` makes a plan from a
+joint motion. contract.json has the bundle's requirements; if the arm misses one, BundleError says so in one line.
 """
 
 import hashlib
@@ -38,10 +38,10 @@ def seal_of(contract: dict[str, Any]) -> str:
 
 
 def load(folder: str | Path) -> dict[str, Any]:
-    """Return the contract of a bundle, after a check that the bundle is complete and unchanged.
+    """Check that a bundle is complete and unchanged, and return its contract.
 
     Raises:
-        BundleError: a file is missing or was changed, or this runtime does not have the bundle's control law.
+        BundleError: a file is missing or was changed, or this runtime lacks the bundle's control law.
     """
     path = Path(folder) / "contract.json"
     try:
@@ -76,11 +76,11 @@ class Runtime:
     """A policy with its controller and driver. It maps the joint state to the torque command, cycle by cycle.
 
     Attributes:
-        contract: content of contract.json. driver: see `Driver`.
+        contract: content of contract.json. driver: the `Driver`, which makes the torque obey the arm's limits.
 
     Args:
-        folder: the bundle. arm: the arm that it runs on. soft_start_s: time over which the torque fades in, s.
-        live: whether the arm's clock runs on during computations; if so, the policy runs in its own thread.
+        folder: the bundle. arm: the arm on which it runs. soft_start_s: time over which the torque fades in, s.
+        live: whether the arm's clock does not wait for computations; if so, the policy runs in a separate thread.
 
     Raises:
         BundleError: the bundle is damaged or made for another arm.
@@ -95,7 +95,7 @@ class Runtime:
         options.intra_op_num_threads = options.inter_op_num_threads = 1  # do not wait for other threads
         try:
             self._policy = onnxruntime.InferenceSession(Path(folder) / "policy.onnx", options)
-        except Exception as error:  # of many kinds
+        except Exception as error:  # ONNX Runtime raises many kinds
             raise BundleError(f"policy.onnx cannot be loaded: {' '.join(str(error).split())}") from None
         self._model = Model(contract["model"])
         self._control = Control(contract)
@@ -116,7 +116,7 @@ class Runtime:
 
         Args:
             plan: (rows, columns) as `goal` of the contract describes, if the policy follows plans. The arm has to be
-                at the joint angles of the first row. Setpoints for computed torque take a tenth of a second.
+                at the joint angles of the first row. Setpoints for computed torque take 0.1 s to compute.
 
         Raises:
             BundleError: the plan is missing, has another shape, is not finite, or exceeds the arm's limits or the
@@ -134,7 +134,7 @@ class Runtime:
         self._motion += 1
 
     def stop(self, why: str = "asked for") -> None:
-        """Bring the arm to rest, from the next cycle on. `driver.stopping` is the first reason that was given."""
+        """Bring the arm to rest from the next cycle on. `driver.stopping` stays at the reason of the first call."""
         self.driver.stopping = self.driver.stopping or why
 
     @property
@@ -148,9 +148,9 @@ class Runtime:
         """Return the torque (n,) Nm to send in this cycle.
 
         Args:
-            q, dq: (n,) rad, rad/s, as measured. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            goal: (3,) m in the base frame, finite; None if the policy follows a plan. The time in the plan is the
-                number of cycles since `reset`.
+            q, dq: measured joint state (n,) rad, rad/s. tau_J_d: (n,) Nm, the torque that the arm applied last.
+            goal: finite point (3,) m in the base frame; None if the policy follows a plan, whose time is the number
+                of cycles since `reset`.
 
         During a motion, a goal outside the region of the training's goals brings the arm to rest.
 
@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Raise BundleError if start or goal is outside the training's region; during a motion, stop instead."""
+        """Raise BundleError if start or goal is outside the training's region; after the first cycle only stop."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)
@@ -207,7 +207,7 @@ class Runtime:
     def _look(
         self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray | None
     ) -> dict[str, np.ndarray]:
-        """Return the sources of the observation in this control step; the model must be at q already."""
+        """Return the observation sources of this control step; call `model.place(q)` before."""
         ee, jacobian = self._model.hand()
         made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort, "tau_J_d": tau_J_d}
         if self._follower is not None:
@@ -233,8 +233,8 @@ class Runtime:
     def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the plan of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2. Call it between motions.
 
-        Rows are one control step apart. The motion has to begin and end at rest: the first row and `steps` others are
-        the path, and as many rows follow as the policy previews.
+        Rows are one control step apart. The motion has to begin and end at rest. The first `steps` + 1 rows are the
+        path; further rows follow, one for each row that the policy previews.
 
         Raises:
             BundleError: goals are points or plans on a surface, or the motion has another shape.

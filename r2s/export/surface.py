@@ -1,8 +1,8 @@
-"""Plans on a surface for policies that press and wipe, in NumPy: a second implementation of tasks/surface_task.py.
+"""Check and follow plans on a surface, for policies that press and wipe; in training, tasks/surface_task.py does so.
 
 A plan has a row per control step: the point of the path on the nominal plane, the plane's normal, the depth of the
 target below the point, the desired force, the path's velocity, the start posture, and the controller's setpoint. This
-module needs nothing of r2s: `r2s export` copies it into r2s_runtime.py of a bundle.
+module imports no part of r2s that a bundle lacks: `r2s export` copies it into r2s_runtime.py of the bundle.
 """
 
 from typing import Any
@@ -16,18 +16,18 @@ from r2s.export.plan import NO_PLAN, finite_plan
 
 WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
 NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and its position in the plan
-ROUNDING = 1e-6  # m, N, by which a plan at the border of the training's ranges may be beyond it
+ROUNDING = 1e-6  # m and N, tolerance with which a plan is compared with the training's ranges
 
 
 def columns_of(n: int, setpoints: int) -> dict[str, list[int]]:
-    """Return {name: [first column, column after the last]} of each group of columns of a plan."""
+    """Return {name: [first column, column after the last]} for each group of columns in a plan."""
     widths = {**WIDTHS, "q": n, "setpoint": setpoints}
     ends = np.cumsum([0, *widths.values()]).tolist()
     return {name: [begin, end] for name, begin, end in zip(widths, ends[:-1], ends[1:], strict=True)}
 
 
 def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError if a plan is outside the training's plane, area or force, or its start does not fit it."""
+    """Raise BundleError if a plan leaves the training's plane, area or force range, or its start posture is wrong."""
     goal = contract["goal"]
     at, own, trained = goal["columns"], contract["law"]["joint"], goal["trained"]
     place, normal, depth, force, q = (plan[:, slice(*at[k])] for k in ("place", "normal", "depth", "force", "q"))
@@ -62,10 +62,10 @@ LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # keys of the law, and 
 
 
 class SurfaceFollower:
-    """Follow a plan on a surface: return what the policy observes of it and the setpoint of the controller.
+    """Follow a plan on a surface: return the observation sources and the controller's setpoint for each control step.
 
     Args:
-        contract: its goals are plans on a surface. control, model: made from the contract; `control` is not used.
+        contract: contract with plans on a surface as goals. control, model: made from it; `control` is not used.
     """
 
     def __init__(self, contract: dict[str, Any], control: Control, model: Model):
@@ -77,7 +77,7 @@ class SurfaceFollower:
         self._plan = np.zeros((0, self._shape[1]))
 
     def take(self, plan: Any) -> None:
-        """Store the next motion's plan; raise BundleError if it is missing, has another shape, or is not finite."""
+        """Store the next motion's plan; raise BundleError if it is missing, not finite, or of a wrong shape."""
         self._plan = finite_plan(plan, self._shape)
 
     @property
@@ -93,7 +93,7 @@ class SurfaceFollower:
         After the last step the target stays at the end of the plan.
 
         Args:
-            step: control step, from 0. seen: q, dq (n,) rad, rad/s, and tau_J_d (n,) Nm; the model must be at q.
+            step: control step, from 0. seen: q, dq (n,) rad, rad/s, tau_J_d (n,) Nm; call `model.place(q)` before.
             limited: share of the last control period in which the safety filter changed the command.
         """
         now = self._plan[min(step, self._steps)]
@@ -108,7 +108,7 @@ class SurfaceFollower:
         return {name: np.atleast_1d(value) for name, value in made.items()}
 
     def _force(self, seen: dict[str, np.ndarray], jacobian: np.ndarray) -> np.ndarray:
-        """Return the estimated force (3,) N of the surface on the tip."""
+        """Return the estimated force (3,) N that the surface exerts on the tip."""
         q, dq = seen["q"], seen["dq"]
         external = seen["tau_J_d"] - self._dynamics.equations(q, dq, np.zeros_like(q))[1]
         return np.linalg.solve(jacobian @ jacobian.T + self._regular, jacobian @ external)

@@ -1,4 +1,4 @@
-"""Entries of the contract of a policy that presses or wipes: its plans on a surface, and its push limit."""
+"""Make those entries of a contract that only policies which press or wipe need: plans on a surface, push limit."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from r2s.tasks.surface_task import REGULAR, START, SurfaceTask
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
-    """Return the plans (k, steps + 1, columns) for k goals (k, ...) of the task."""
+    """Return the plans (k, steps + 1, columns) for k goals (k, ...) that the task drew."""
     control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
     none, starts, out = np.zeros((len(t), 3)), np.zeros((len(t), robot.n)), []
     for goal in goals:
@@ -52,9 +52,9 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
 
 
 def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return the start posture of the first example plan, rad, and how far each joint may be from a plan's start.
+    """Return the start posture, rad, of the first example plan, and the allowed distance of each joint from a start.
 
-    The distance is so small that the tip is certainly above the surface.
+    Within this distance the tip is certainly above the surface.
     """
     q = task.goals(robot, np.random.default_rng(0), 1)[0, START : START + robot.n]
     lever = np.abs(task.plane(robot)[1] @ Tip(robot)(q)[1]).sum()
@@ -62,7 +62,7 @@ def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
 
 
 def pushes(robot: Robot, limit: law.PushLimit | None) -> dict[str, Any] | None:
-    """Return the numbers of the push limit and of a stop in contact, or None without a limit."""
+    """Return the parameters of the push limit and of a stop in contact; None without a push limit."""
     if limit is None:
         return None
     columns = limit.columns(robot)
@@ -74,7 +74,7 @@ def pushes(robot: Robot, limit: law.PushLimit | None) -> dict[str, Any] | None:
         out[name] = columns[at : at + 3].tolist()
     out |= {"stop": limit.stop, "collision_torque_Nm": None, "collision_force_N": None}
     assert limit.stop in STOPS
-    if robot.n == 7:  # a Franka arm; thresholds for libfranka's setCollisionBehavior; null: cautious ones
+    if robot.n == 7:  # a Franka arm: add thresholds for libfranka's setCollisionBehavior; null: cautious defaults
         try:
             own = thresholds_of(robot, limit)
         except UserError as error:

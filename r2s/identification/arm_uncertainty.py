@@ -1,4 +1,4 @@
-"""An identified arm, and the changes of a torque residual that its uncertainty causes."""
+"""Compute how the uncertainty of an identified arm changes a torque residual."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.robot import Robot
 
 GAIN = 0.05  # standard deviation of a sensor's gain, the prior of conf/identify
-MASSES = 0.1  # standard deviation of a relative error that all masses in a robot's file share
+MASSES = 0.1  # standard deviation of the relative error that all masses in a robot's file have in common
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An identified arm: its parameter space, values x (P,), and `samples` (S, P) of their posterior or None."""
+    """An identified arm: parameter space, values x (P,), and draws of their posterior, `samples` (S, P) or None."""
 
     space: ParameterSpace
     x: np.ndarray
@@ -32,25 +32,25 @@ class Arm:
 def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
     """Return a correction factor (n,) for a payload's torque in each joint, and its standard deviation (n,).
 
-    The factor corrects for errors in the masses of the robot's file that were attributed to sensor gains. The torque
-    of an unloaded arm shows only the product of gain and masses. If gains are estimated with the file's masses, they
-    take up the masses' error, and the torque of a payload would be wrong by as much. Gains of joints are independent,
-    but all masses share one error. Its likely value minimizes the sum of squares of gains and error, with standard
-    deviations GAIN and MASSES.
+    The torque of an unloaded arm shows only the product of sensor gain and masses. If the masses in the robot's file
+    are wrong, the estimated gains absorb this error, and the computed torque of a payload would have the same error.
+    The factor corrects it. Sensor gains are independent between joints, but the relative error is the same for all
+    masses. Its likely value minimizes the sum of squares of gains and mass error, with standard deviations GAIN and
+    MASSES.
     """
     space, n = arm.space, arm.robot.n
     if "gain" not in space.blocks or LINK[0] in space.blocks:
         return np.ones(n), np.zeros(n)
     at = space.where("gain")
     gain, sd = arm.x[at], np.zeros(n) if arm.samples is None else arm.samples[:, at].std(0)
-    seen = sd < 0.5 * GAIN  # the other joints' gains are those of their prior
+    seen = sd < 0.5 * GAIN  # the data do not determine the gains of the other joints
     information = seen.sum() / GAIN**2 + 1.0 / MASSES**2
     shift = -gain[seen].sum() / GAIN**2 / information
     return np.where(seen, 1.0 + shift / (1.0 + gain), 1.0), np.where(seen, information**-0.5 / (1.0 + gain), 0.0)
 
 
 def sliding_sign(torque: TorqueResidual) -> np.ndarray:
-    """Return the sign of friction (F, n) at the instants of a residual's motion; it is smooth if joints may rest."""
+    """Return the sign of friction (F, n) at the instants of a residual's motion; if joints may rest, it is smooth."""
     if torque.space.nominal.family.has_memory:
         return torque.motion.bristle
     dq = torque.motion.friction_dq
@@ -60,12 +60,12 @@ def sliding_sign(torque: TorqueResidual) -> np.ndarray:
 def arm_directions(
     torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
 ) -> np.ndarray:
-    """Return (T, n, r) Nm: changes of the residual by one standard deviation along r independent directions.
+    """Return the residual's change (T, n, r) Nm by one standard deviation along each of r independent directions.
 
     Args:
         torque: the residual. x: (P,) parameters of the arm. samples: (S, P), draws of their posterior, or None.
-        friction_drift: share of each joint's friction; offset_drift: (n,) Nm. Both are standard deviations of the
-            change since the calibration.
+        friction_drift: standard deviation of friction's change since the calibration, as a share of each joint's
+            friction. offset_drift: (n,) Nm, standard deviation of the offset's change.
     """
     d, n = torque.space.dynamics(x), torque.space.n
     friction = torque.motion.filtered(d.friction(torque.motion.friction_dq, sliding_sign(torque)))

@@ -1,8 +1,8 @@
 """Base parameters: the fewest combinations of inertial parameters on which joint torque depends.
 
-Torque is linear in ten standard parameters per link and one per rotor, but many of them only act in combination. QR
-without pivoting of the regressor at random states selects the first columns that are independent. The parameters of
-the other columns are regrouped with these (Gautier, J. Robotic Systems 8(4), 1991).
+Torque is linear in ten standard parameters per link and one per rotor, but many of them only act in combination. The
+regressor has a column per parameter. Its QR decomposition without pivoting, at random states, selects the first
+independent columns; the other parameters are regrouped with these (Gautier, J. Robotic Systems 8(4), 1991).
 """
 
 from typing import NamedTuple
@@ -18,13 +18,13 @@ from r2s.physics.robot import Robot
 STANDARD = ("mass", "mx", "my", "mz", "xx", "yy", "zz", "xy", "xz", "yz")  # of a link, about its origin
 UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
 ORDER = (*range(4, 10), 1, 2, 3, 0)  # within a link: the mass comes last, so it is regrouped first
-DEPENDENT, NONE = 1e-9, 1e-9  # relative size of a dependent column; of a coefficient that counts as 0
+DEPENDENT, NONE = 1e-9, 1e-9  # relative size below which a column is dependent, and a coefficient is set to 0
 
 
 class BaseParameters(NamedTuple):
     """K base parameters: `matrix` (K, 10 n + n) times the standard parameters of links and rotors.
 
-    names: (K,), the first parameter of each combination. units: (K,). combinations: (K,), e.g. "zz[2] + 0.1 my[3]".
+    names: (K,), the first parameter of each combination. units: (K,). combinations: (K,), as "zz[2] + 0.1 my[3]".
     """
 
     names: list[str]
@@ -33,7 +33,7 @@ class BaseParameters(NamedTuple):
     matrix: np.ndarray
 
     def values(self, d: Dynamics) -> np.ndarray:
-        """Return the base parameters (..., K) of the dynamics of one or many arms."""
+        """Return the values (..., K) of the base parameters for the dynamics of one or many arms."""
         links = LinkInertia(d.mass, d.com, d.inertia).standard()
         links = links.reshape(*links.shape[:-2], -1)
         count = links.shape[-1]  # d may have many arms' rotors but one arm's links
@@ -43,7 +43,7 @@ class BaseParameters(NamedTuple):
 def base_parameters(robot: Robot, rotors: bool) -> BaseParameters:
     """Return the base parameters of an arm.
 
-    rotors: whether the measured torque accelerates the rotors; link-side torque does not.
+    rotors: whether the measured torque includes the torque on the rotors; link-side torque does not.
     """
     n, rng = robot.n, np.random.default_rng(0)
     q = rng.uniform(*robot.q_range, (40 * n, n))
@@ -77,7 +77,7 @@ def base_table(space: ParameterSpace, found: ParameterEstimate, rotors: bool) ->
 
 
 def _combination(row: np.ndarray, names: list[str], first: int) -> str:
-    """Return a row of the matrix as a sum of names, beginning with that of column `first`."""
+    """Return a row of the matrix as a sum of parameter names, the name of column `first` at the beginning."""
     others = [k for k in np.flatnonzero(row).tolist() if k != first]
     parts = [f"{'-' if row[k] < 0 else '+'} {_factor(abs(row[k]))}{names[k]}" for k in others]
     return " ".join([names[first], *parts])

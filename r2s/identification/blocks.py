@@ -1,4 +1,4 @@
-"""Blocks of a recording whose errors count as independent; they are the clusters of a posterior's covariance.
+"""Divide a recording into blocks with independent errors, the clusters of a posterior's covariance.
 
 Model error lasts longer than noise: torque ripple at low speed lasts seconds, and recurs when motion is repeated. So
 a block lasts several correlation times of the residual. If residuals recur, repetitions of a motion are one block.
@@ -7,11 +7,11 @@ a block lasts several correlation times of the residual. If residuals recur, rep
 import numpy as np
 
 BLOCK_S = 0.5  # s, shortest block
-BLOCKS = 20, 400  # fewest and most blocks in a recording: the scatter of fewer is uncertain, and more cost time
-LENGTH = 5.0  # correlation times in a block: its sum has nine tenths of the variance per length of a long block
+BLOCKS = 20, 400  # fewest and most blocks in a recording: fewer make the scatter uncertain, more cost time
+LENGTH = 5.0  # correlation times per block: the block sum then has 90 % of a long block's variance per length
 WINDOW = 5.0  # correlation times; beyond this lag, autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
 LONGEST_S = 60.0  # s, longest lag of the autocorrelation
-REPEATED = 0.3  # relative growth of the variance by repetition, above which repetitions are one block
+REPEATED = 0.3  # relative growth of variance due to repetition, above which repetitions are one block
 SAME = 0.1  # distance of a repetition's mean angle from the usual one, in standard deviations of the motion
 
 
@@ -25,8 +25,8 @@ def blocks_of(
     """Return the block (T,) of each moment, numbered from 0 to B - 1.
 
     Args:
-        t: (T,) s, rising within a trajectory. q: (T, n) rad. period: s, of the motion; None: it does not repeat.
-        residual: (T, n) of a fit; None: blocks last `shortest_s`, and each repetition has its own blocks.
+        t: (T,) s, rising within a trajectory. q: (T, n) rad. period: s, of a repeated motion; None: no repetition.
+        residual: (T, n), residual of a fit; None: blocks last `shortest_s`, with separate blocks per repetition.
     """
     run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of times that the clock has restarted
     steps = np.diff(t)[np.diff(run) == 0]
@@ -46,7 +46,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return blocks (T,) of phase that all repetitions `visit` (T,) share, except where their q (T, n) differs."""
+    """Return blocks (T,) of phase, joined over repetitions `visit` (T,) except where their q (T, n) differ."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -58,7 +58,7 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
     """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,).
 
-    It is the integral of squared autocorrelation, a bound for scores (residual times slope) even if they oscillate.
+    It is the integral of squared autocorrelation, an upper bound even for oscillating scores (residual times slope).
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))
@@ -74,7 +74,7 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether residuals (T, n) at equal phase, `at` (T,), are similar in the repetitions `visit` (T,)."""
+    """Return whether residuals (T, n) at the same phase `at` (T,) are similar between repetitions `visit` (T,)."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]
@@ -92,7 +92,7 @@ def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
 
 
 def _labels(*keys: np.ndarray) -> np.ndarray:
-    """Return (T,) the number of each moment's combination of keys (T,)."""
+    """Return for each moment the number (T,) of its combination of keys (T,)."""
     out = np.zeros(len(keys[0]), dtype=int)
     for key in keys:
         index = np.unique(key, return_inverse=True)[1]

@@ -1,4 +1,4 @@
-"""Checks of a recording before a fit: number of joints, limits, enough motion, damaged rows, units."""
+"""Check a recording before a fit: number of joints, limits, enough motion, damaged rows, units."""
 
 import numpy as np
 
@@ -9,10 +9,10 @@ from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-SPIKE = 5.0  # times the limits of speed and torque: more than any sensor noise
+SPIKE = 5.0  # times the limits of speed and torque: beyond any sensor noise
 NONSENSE = 1e9  # times the same limits: no wrong unit reaches this factor, and larger squares would overflow
 JUMP = 0.05  # rad, an allowed jump of an encoder
-MARGIN = 0.05  # rad beyond the position limits: logs of arms at their limits do occur
+MARGIN = 0.05  # rad by which a log may exceed the position limits, as happens at a limit
 LEAST_S = 1.0  # s, least duration of a recording
 
 
@@ -31,7 +31,7 @@ def check_recording(robot: Robot, recording: Recording) -> Judged | None:
 
 def check_rate(cutoff_hz: float, recording: Recording) -> None:
     """Raise UserError unless a cutoff is below the recording's Nyquist frequency."""
-    if cutoff_hz >= 0.499 * recording.rate_hz:  # the clock of a log jitters
+    if cutoff_hz >= 0.499 * recording.rate_hz:  # not 0.5: a log's clock jitters
         raise UserError(
             f"identify.cutoff_hz: expected less than {0.5 * recording.rate_hz:.4g} Hz, half the rate of "
             f"{recording.name or 'the recording'} ({recording.rate_hz:.4g} Hz), got {cutoff_hz:g}"
@@ -39,7 +39,7 @@ def check_rate(cutoff_hz: float, recording: Recording) -> None:
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if the recording is of another arm, exceeds its limits or hardly moves."""
+    """Raise UserError if the recording is of another arm, exceeds this arm's limits or hardly moves."""
     _check_joints(robot, recording, "the recording")
     moved = np.ptp(recording.q, axis=0)
     if moved.max() < MOVED or recording.duration < LEAST_S:
@@ -50,7 +50,7 @@ def check_motion(robot: Robot, recording: Recording) -> None:
 
 
 def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
-    """Raise UserError if a row exceeds the arm's limits by more than the factor `most`, as in a damaged file."""
+    """Raise UserError if a row exceeds `most` times the arm's limits, as in a damaged file."""
     r = recording
     steps = np.diff(r.t)
     steps[np.diff(r.trajectory) != 0] = np.inf
@@ -73,7 +73,7 @@ def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
 
 
 def check_ramps(robot: Robot, ramps: Ramps) -> None:
-    """Raise UserError if the ramps are of another arm, exceed its limits or have other units."""
+    """Raise UserError if the ramps are of another arm, exceed this arm's limits or have other units."""
     _check_joints(robot, ramps.recording, "the ramps")
     most = np.abs(ramps.recording.tau).max(0)
     j = int((most / robot.tau_max).argmax())

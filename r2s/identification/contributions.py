@@ -1,4 +1,4 @@
-"""What each of several recordings adds to an identification, and whether one contradicts the others.
+"""Assess what each of several recordings adds to an identification, and whether one contradicts the others.
 
 For each recording there are two further fits: one without it, and one to it alone. Both take a few steps of least
 squares on torque, starting at the fit to all recordings. A recording's rows are weighted by the residual of the fit
@@ -19,13 +19,13 @@ from r2s.identification.search.levenberg_marquardt import minimize, normal_equat
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CONTRADICTS = 2.0  # ratio of two sums of squares: one fit to all recordings, over one recording fitted apart
+CONTRADICTS = 2.0  # ratio of sums of squares: one fit to all recordings, over a separate fit to one of them
 WORSE = 4.0  # ratio of a recording's RMSE, fitted alone, to the others'; above it the model does not fit
-CARRIED = 0.5  # share of the left-out error's square that a body on the last link must explain to be reported
+CARRIED = 0.5  # a body on the last link is reported if it explains this share of the squared left-out error
 LEAST_MASS = 0.01  # of the arm's mass: least mass of such a body
 ROUNDS = 3  # reweighted fits of each recording alone
-STEPS, FTOL = 10, 1e-3  # largest number of Jacobians in a fit, and relative gain of a step at which it ends
-USED_S, RATE_HZ = 120.0, 50.0  # s of a longer recording that are compared, and rows per second
+STEPS, FTOL = 10, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by less (relative)
+USED_S, RATE_HZ = 120.0, 50.0  # s of a longer recording that are compared; rows per second
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class Contribution:
     """Contribution of one recording to a fit; errors are torque RMSE on this recording.
 
     Attributes:
-        label, torque, seconds: of the recording. use: "training" or "validation".
+        label, torque, seconds: name, kind of torque and length of the recording. use: "training" or "validation".
         rmse: (n,) Nm, error of the fit to all recordings.
-        left_out: (n,) Nm, error of a fit to the others. narrower: (P,) ratio of 95 % interval widths: without this
-            recording over with it. Both are None for validation.
-        alone: (n,) Nm, error of a fit to this recording alone. contradiction: see CONTRADICTS; 1 for a single one.
-        body_kg: additional mass on the last link that explains its contradiction; nan if none does.
+        left_out: (n,) Nm, error of a fit to the other recordings. narrower: (P,) ratio of 95 % interval widths: fit
+            without this recording over fit with it. Both are None for validation.
+        alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio, see CONTRADICTS; 1 if there is
+            no other recording. body_kg: mass on the last link that explains the contradiction; nan if none does.
     """
 
     label: str
@@ -56,7 +56,7 @@ class Contribution:
 def contributions(
     found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
 ) -> list[Contribution]:
-    """Return the contribution of each {label: recording}, all with one kind of torque, to the fit `found`."""
+    """Return the contribution of each recording, {label: recording} with one kind of torque, to the fit `found`."""
     space, u = found.space, found.space.to_unit(found.x)
     r0, slope = found.prior_rows
     flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # a flat prior has no row of its own
@@ -67,7 +67,7 @@ def contributions(
     for _ in range(ROUNDS):
         alone = [_fitted([p], u, prior) for p in parts]
         parts = [p.reweighted(space.from_unit(v), fitted=True) for p, v in zip(parts, alone, strict=True)]
-    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # unused parts have as much information
+    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # assume as much information in unused parts
     information = [k * normal_equations(p.linearize(u))[1] for k, p in zip(more, parts, strict=True)]
     total = sum(information) + prior[1].T @ prior[1]
     width, square = np.sqrt(np.diag(np.linalg.inv(total))), _square(parts, _fitted(parts, u, prior))
@@ -110,7 +110,7 @@ def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the fit (P,) to the recordings `parts`, from u (P,); prior: rows (B,) at u and their Jacobian (B, P)."""
+    """Return the fit (P,) to the recordings `parts`, started at u (P,); prior: rows (B,) at u and Jacobian (B, P)."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:
@@ -126,7 +126,7 @@ def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndar
 
 
 def _rmse(error: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the RMSE (n,) Nm over the rows that count, `seen`; nan for a joint without such rows."""
+    """Return the RMSE (n,) Nm over the rows marked in `seen`; nan for a joint without marked rows."""
     square = np.where(seen, error**2, 0.0).sum(0)
     return np.sqrt(square / np.where(seen.any(0), seen.sum(0), np.nan))
 

@@ -1,8 +1,8 @@
-"""Predicted widths of the 95 % intervals that an identification of a recording will have, before it runs.
+"""Predict the widths of the 95 % intervals of an identification before it runs.
 
 A few least-squares steps on torque with all terms estimate the noise and a point at which to linearize the model. The
-widths come from the same posterior as in an identification, at this point. The slow parts of an identification are
-left out: comparison of families, selection of terms, convergence, replays, breakaway.
+widths are those of `posterior` at this point. The slow parts of an identification are skipped: comparison of
+families, selection of terms, convergence, replays, breakaway.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-STEPS, FTOL = 6, 1e-2  # most Jacobians between two reweightings, and relative gain of a step at which a fit ends
+STEPS, FTOL = 6, 1e-2  # most Jacobians between reweightings; a fit ends at a smaller relative gain of a step
 USED_S = 120.0  # s of a longer recording that are used
 
 
@@ -34,8 +34,8 @@ class ExpectedWidths:
     Attributes:
         space: the parameters. width: (P,) SI units. share: (P,) ratio of posterior to prior standard deviation.
         identifiable: (P,) whether the data will determine the value, by the same rule as in `conclude`.
-        late: s, lateness and its standard deviation: of measured or motor torque behind the motion, or of the motion
-            behind commands.
+        late: s, lateness and its standard deviation. It is the lateness of measured or motor torque relative to the
+            motion, or of the motion relative to commands.
     """
 
     space: ParameterSpace
@@ -46,9 +46,9 @@ class ExpectedWidths:
 
 
 def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> Problem:
-    """Return the torque problem that an identification with these settings solves, with all of their terms.
+    """Return the torque problem that an identification with these settings solves, with all terms of the settings.
 
-    For family=auto the family of the nominal arm is used.
+    For family=auto, the problem has the friction family of the nominal arm.
     """
     if settings.family != "auto":
         nominal = with_family(nominal, settings.family)
@@ -71,7 +71,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
     sure = posterior(problem, u, settings.seed)
     found = conclude(problem, space, sure._asdict(), history=pd.DataFrame(), families={}).found
     share = np.minimum(sure.steps.std(0) / problem.prior_width, 1.0)
-    # rows that are left out are taken to have as much information as those that are used
+    # assume that unused rows have as much information as used ones
     more = recording.duration / used.duration
     less = 1.0 / np.sqrt(share**2 + more * (1.0 - share**2))
     seen = found.identifiable | ((more > 1.0) & (Z_95 * less * share < 1.0 / SHARPER))
@@ -84,7 +84,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
 
 
 def _lateness(problem: Problem, u: np.ndarray) -> tuple[float, float]:
-    """Return the lateness of tau, s, that the parameters do not explain, and its standard deviation."""
+    """Return the lateness of tau, in s, that the parameters do not explain, and its standard deviation in s."""
     data = problem.torque_data
     r, j = data(problem.space.from_unit(u[None]))[0], data.jacobian(u)
     change = (data.motion.command(0.0, 0.0) - data.motion.command(SIM_DT, 0.0)) / SIM_DT

@@ -49,14 +49,14 @@ from r2s.recordings.recording import Recording
 STANDSTILL = 0.02  # rad/s; for commanded torque, friction below this speed is not a function of velocity
 CLEAR = 1.5  # times dq_min: below this speed a replayed joint may stick
 MAX_BATCH = 64  # candidates replayed at once
-SELECTED_S = 240.0  # s of a longer recording that the selection of family and terms uses
+SELECTED_S = 240.0  # s; the selection of family and terms uses at most this much of a recording
 REWEIGHTS = 2  # further fits of a local search, each with weights from the residual of the previous fit
-ALIKE = 0.2  # relative error of the number of independent rows
+ALIKE = 0.2  # relative uncertainty of the number of independent rows, and so of a sum of squares
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
 
 class History:
-    """Rows of progress. They are stored with the arrays of each step, so that a resumed run has them again."""
+    """Progress rows of an identification. A step stores its rows with its arrays, so a resumed run restores them."""
 
     def __init__(self, report: Report, memo: Memo):
         self.rows: list[dict] = []
@@ -81,14 +81,14 @@ class State:
     """State of an identification between two steps.
 
     Attributes:
-        robot to ramps: the arguments of `identify`; `select_family` changes the friction family of `nominal`.
+        robot, nominal, recording, searches, settings, ramps: see `identify`. `select_family` sets nominal.family.
         prior: {parameter: standard deviation, SI units}. terms: model terms that are estimated besides friction.
         families: {family: error of held-out torque}; empty if the user chose the family.
-        space: parameters and nominal values; they include breakaway and stiction once these are estimated.
+        space: the parameter space. `fit_breakaway` and `fit_stiction` add the results of their steps to it.
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
-        edges: breakaway commands from ramps. static_friction: residual of friction at the onset of sliding (only
-            Stribeck families).
-        refused: whether r2s discarded the replays. dynamics: the fitted arm with its breakaway torques.
+        edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
+            sliding (only Stribeck families).
+        refused: whether `fit` discarded a replay fit. dynamics: the fitted arm with its breakaway torques.
     """
 
     robot: Robot
@@ -116,12 +116,12 @@ class State:
 
     @property
     def slowest(self) -> float:
-        """rad/s, the speed above which a joint's torque rows count."""
+        """Speed in rad/s; only torque rows of faster joints are used."""
         return STANDSTILL if self.commanded else 0.0
 
     @property
     def cross_validation(self) -> CrossValidation:
-        """Data and settings for the steps that select family and terms."""
+        """The cross-validation, with its data and settings, that selects friction family and terms."""
         s, data = self.settings, (self.robot, self.nominal, spread(self.recording, SELECTED_S))
         return CrossValidation(*data, s.bounds, self.prior, s.folds, s.cutoff_hz, self.history.add, s.stated)
 
@@ -150,13 +150,13 @@ def identify(
     """Estimate the parameters of an arm, with intervals.
 
     Args:
-        robot: the arm. nominal: start of the searches, and values of the parameters that are not estimated.
-        recording: the training motion; the kind of its torque decides which residuals are possible.
-        searches: at least one; each starts at the solution of the previous one.
+        robot: the arm. nominal: start of the searches; parameters that are not estimated have its values.
+        recording: the training motion; only commanded torque allows replay residuals.
+        searches: one or more searches; each starts at the solution of the previous one.
         settings: parameters, bounds, prior, and how residuals are computed.
-        ramps: of the breakaway protocol; without them the breakaway torques are found by a scan on the recording.
-        report: called with a row of progress after every step or generation.
-        memo: called with the name of a step and a function that computes its arrays; it may return stored arrays.
+        ramps: recordings of the breakaway protocol; without them, a scan on the recording finds breakaway torques.
+        report: function that is called with a row of progress after every step or generation.
+        memo: function of a step's name and a function that computes its arrays; it may return stored arrays instead.
 
     Raises:
         UserError: the recording does not fit the arm or hardly moves.
@@ -248,7 +248,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the prior knowledge of a space's values: as the user states, else from an earlier identification."""
+    """Return prior knowledge of values in `space`: what the user states, else an earlier identification's result."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated
@@ -267,7 +267,7 @@ def fit(s: State) -> State:
         if k and fits_torque(s.searches[0]) and problem.uses_replays and worse_on_torque(problem, u, v):
             return replace(s, problem=replace(problem, data=problem.torque_data), u=u, refused=True)
         u = v
-        # only the last search, or one on torque, counts as fitted: an earlier residual contains model error
+        # `fitted` only after a torque search or the last search: earlier replay residuals contain model error
         problem = problem.reweighted(u, fitted=k == len(s.searches) - 1 or fits_torque(search))
     return replace(s, problem=problem, u=u)
 
@@ -298,7 +298,7 @@ def fit_presliding(s: State) -> State:
 
 
 def reweight(s: State) -> State:
-    """Repeat a local search with weights from its own residual; the last repetition decides if a lag is needed."""
+    """Repeat the last search, if it is local, with weights from its residual; finally decide if a lag is needed."""
     search = s.searches[-1]
     if not search.local:
         return s
@@ -359,7 +359,7 @@ STEPS: tuple[Callable[[State], State], ...] = (
 def _run(
     s: State, name: str, search: Search, problem: Problem, u: np.ndarray, report: Report | None = None
 ) -> tuple[np.ndarray, Problem]:
-    """Return the solution of a search, and the problem; a search on torque also updates the torque weights."""
+    """Run a search; return its solution and the problem, with new torque weights if the search fits torque."""
     v = np.asarray(s.history.step(name, lambda: {"u": search(problem, u, report or s.history.add)})["u"])
     return v, problem.torque_reweighted(v) if fits_torque(search) else problem
 
@@ -376,11 +376,11 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return the solution u (P,) of a local search without the lag, index `at`, or with it if the data need it.
+    """Return the solution u (P,) of a local search; the lag, index `at`, stays nominal unless the data need it.
 
-    If torque changes slowly, a short lag acts like a delay. The data need a lag that lowers the cost by more than the
-    logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The block that favours the lag most
-    does not count, because the rows of one block are correlated.
+    If torque changes slowly, a short lag acts like a delay. The data need the lag if it lowers the cost by more than
+    the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). This comparison omits the block
+    that favours the lag most, because the rows of one block are correlated.
     """
     having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
     u = start.copy()

@@ -1,6 +1,6 @@
-"""Prior knowledge of an arm's parameters: a normal distribution of named values.
+"""Represent prior knowledge of an arm's parameters as a normal distribution of named values.
 
-It comes from an earlier identification, from recordings of another kind of torque, or from the user (stated.py).
+Sources are an earlier identification, recordings of another kind of torque, or the user (stated.py).
 Between two dates, friction and offsets drift: x_now = x_then + w with w ~ N(0, drift^2). So the earlier posterior is
 widened by the drift before it becomes a prior (the prediction step of a Kalman filter; Kalman 1960). The reported
 drift is the estimate of w from the data of both dates.
@@ -18,17 +18,17 @@ from r2s.identification.posterior import Z_95
 
 BODY = (*OF_LINKS, *PAYLOAD)  # shared by all kinds of torque; friction, offsets and gains differ between kinds
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # parameters that drift besides those of the friction law
-FLOOR = 1e-4  # times `ParameterSpace.usual`: least standard deviation, as draws may all be clipped at a bound
-FAR = 5.0  # standard deviations in the worst of some thirty directions, beyond which knowledge and data disagree
+FLOOR = 1e-4  # least standard deviation over `ParameterSpace.usual`, as all draws may be clipped at a bound
+FAR = 5.0  # standard deviations in the worst of about thirty directions, above which knowledge and data disagree
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A normal distribution of named values, which serves a problem as an `ExtraResidual`.
+    """A normal distribution of named values, which a problem uses as an `ExtraResidual`.
 
     Attributes:
         names: K names such as coulomb[2]. mean: (K,) in SI units; of logarithmic parameters, their logarithm.
-        covariance: (K, K), drift included. drift: (K,) standard deviation of the change since then; 0: none.
+        covariance: (K, K), drift included. drift: (K,) standard deviation of the drift since the earlier date, or 0.
     """
 
     names: tuple[str, ...]
@@ -40,8 +40,8 @@ class Known:
     def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
         """Return the knowledge from an identification with values x (P,) and posterior draws (S, P).
 
-        drift: standard deviation of the change of friction, offsets and drag since then, relative to the value or to
-            its deviation among arms (`ParameterSpace.usual`), whichever is larger.
+        drift: standard deviation of the change of friction, offsets and drag since that identification, relative to
+            the larger of the value and its standard deviation among arms (`ParameterSpace.usual`).
         """
         names, usual = space.names, space.usual
         mean, least = coordinates(names, x), np.where(np.isfinite(usual), usual, 0.0)
@@ -54,7 +54,7 @@ class Known:
         return Known(tuple(names), mean, covariance + np.diag(change**2), change)
 
     def where(self, kept: Callable[[str], bool]) -> "Known":
-        """Return the marginal distribution of the values for whose name `kept` is true."""
+        """Return the marginal distribution of the values whose names satisfy `kept`."""
         at = [k for k, name in enumerate(self.names) if kept(name)]
         covariance = self.covariance[np.ix_(at, at)]
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
@@ -71,14 +71,14 @@ class Known:
         return Known((*own.names, *other.names), mean, covariance, drift)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return the whitened deviation from the mean, (C, K) in standard deviations, of candidates x (C, P)."""
+        """Return the whitened deviation (C, K) of candidates x (C, P) from the mean, in standard deviations."""
         at = [space.names.index(name) for name in self.names]
         off = coordinates(self.names, x[:, at]) - self.mean
         return np.linalg.solve(np.linalg.cholesky(self.covariance), off.T).T
 
 
 def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[float, str]:
-    """Return by how many standard deviations x (P,) contradicts the prior, and the value that contributes most.
+    """Return by how many standard deviations x (P,) contradicts the prior, and the name of the worst value.
 
     The number is the largest deviation along a principal axis of the prior's correlation matrix.
     """
@@ -94,7 +94,7 @@ def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[fl
 
 
 def block_of(name: str) -> str:
-    """Return the parameter in a value's name, such as coulomb in coulomb[2]."""
+    """Return the parameter that a value's name contains, such as coulomb for coulomb[2]."""
     return name.split("[")[0]
 
 
@@ -111,7 +111,7 @@ def coordinates(names: Sequence[str], x: np.ndarray) -> np.ndarray:
 
 
 def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.ndarray) -> pd.DataFrame:
-    """Return a row per value that may drift: then, now, and the difference with its 95 % interval, in SI units.
+    """Return a table of values that may drift: then, now, and the difference with its 95 % interval, in SI units.
 
     The difference is w in x_now = x_then + w, given the data of both dates. Let then ~ N(m, P), Q = diag(drift^2),
     S = P + Q, and now ~ N(x, V) after the new data. Then w ~ N(G (x - m), G V G^T + P - P S^-1 P) with G = Q S^-1

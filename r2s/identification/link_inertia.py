@@ -1,4 +1,4 @@
-"""Mass, centre of mass and inertia tensor of a link as ten parameters; all their values are physically consistent.
+"""Describe a link's mass, centre of mass and inertia tensor by ten parameters that are always physically consistent.
 
 Log-Cholesky parameters describe the pseudo-inertia J relative to the nominal link (Rucker and Wensing, RA-L 7(2),
 2022): J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
@@ -15,10 +15,10 @@ PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z")
 
 
 def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return (..., 4, 4) [[Sigma, h], [h^T, m]] about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
+    """Return [[Sigma, h], [h^T, m]] (..., 4, 4) about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
 
-    Sigma is the second moment of mass. About the centre of mass it is positive definite if and only if the tensor's
-    principal moments are positive and satisfy the triangle inequality. If not, eigenvalues are raised to a minimum.
+    Sigma, h and m are the second moment, first moment and mass. About the centre of mass, Sigma is positive definite
+    if the tensor's principal moments are positive and satisfy the triangle inequality, else eigenvalues are raised.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)
@@ -38,7 +38,7 @@ def _upper(j: np.ndarray) -> np.ndarray:
 
 
 def links(robot: Robot, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass (..., n) kg, com (..., n, 3) m and tensor about it (..., n, 3, 3) kg m^2 of theta (..., n, 10)."""
+    """Return mass (..., n) kg, com (..., n, 3) m, tensor about com (..., n, 3, 3) kg m^2 for theta (..., n, 10)."""
     v = np.zeros((*theta.shape[:-1], 4, 4))
     for i in range(3):
         v[..., i, i] = np.exp(theta[..., 1 + i])
@@ -70,7 +70,7 @@ def add_point_mass(
     A point mass suffices, because a gripper's tensor about its own centre is small compared with m r^2.
 
     Args:
-        mass, com, inertia: of the links without the point mass.
+        mass, com, inertia: properties of the links without the point mass.
         payload: (...) kg, the point mass, at least 0. place: (..., 3) m, its position in the last link's frame.
     """
     lead = np.broadcast_shapes(mass.shape[:-1], np.shape(payload))
@@ -85,5 +85,5 @@ def add_point_mass(
 
 
 def inertia_scale(inertia: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-    """Return the ratio (..., n) of the traces of inertia tensors (..., n, 3, 3) to those of the nominal ones."""
+    """Return the traces of inertia tensors (..., n, 3, 3) divided by those of the nominal tensors, (..., n)."""
     return np.trace(inertia, axis1=-2, axis2=-1) / np.trace(nominal, axis1=-2, axis2=-1)

@@ -1,4 +1,4 @@
-"""parameters.yaml and posterior.npz: the result of an identification as the other stages read it."""
+"""Write and read parameters.yaml and posterior.npz, which pass the result of an identification to other stages."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -41,7 +41,7 @@ def save_parameters(
     """Write parameters.yaml (value, unit, nominal, bounds, 95 % interval and identifiability) and posterior.npz.
 
     Args:
-        path: of parameters.yaml; posterior.npz is written to the same folder, for dr=identified.
+        path: the parameters.yaml to write; posterior.npz goes to the same folder and serves dr=identified.
         space, found: the parameters and their estimate.
         source: origin of the estimate (recording, search, run). note: further entries of parameters.yaml.
     """
@@ -65,10 +65,10 @@ def save_parameters(
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in FIXED}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
-    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; `load_parameters` skips it
+    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for people; `load_parameters` skips it
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
-    with atomic_write(path.with_name("posterior.npz")) as part:  # first: parameters.yaml must not exist alone
+    with atomic_write(path.with_name("posterior.npz")) as part:  # first, so parameters.yaml never exists alone
         np.savez_compressed(part, names=np.array(space.names), samples=found.samples)
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
@@ -77,10 +77,10 @@ def save_parameters(
 def load_parameters(
     folder: str | Path, robot: Robot, trust: Sequence[str] = (), option: str = "calibration"
 ) -> tuple[ParameterSpace, np.ndarray]:
-    """Return the space and the values x (P,) in a run folder (or parameters.yaml), for `ParameterSpace.dynamics`.
+    """Return the parameter space and its values x (P,) from a run folder or a parameters.yaml.
 
     trust: modules from which a friction family may be imported, besides those that are imported already. option: the
-    option that names the folder, for error messages.
+    option through which the user named the folder, for error messages.
 
     Raises:
         UserError: no such run or file, another robot's parameters, an untrusted friction family, or a damaged file.
@@ -103,7 +103,7 @@ def load_parameters(
 
 
 def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
-    """Parse the document for `load_parameters`; a malformed one raises KeyError, ValueError and the like."""
+    """Parse the document for `load_parameters`; a malformed one raises KeyError, ValueError or a similar error."""
     found, fixed = document["parameters"], document["fixed"]
 
     def numbers(name: str, value: Any, count: int) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""The parameter vector of an identification: its blocks, bounds and unit cube, and the dynamics that it describes.
+"""The parameter vector of an identification: blocks, bounds, map to the unit cube, and the dynamics it describes.
 
 A block is one parameter. It has a value per joint or link (a friction coefficient, offset, inertia) or one for the
-whole arm (delay, lag, payload). Searches work on the unit cube, with logarithms of positive parameters that span
-decades. Inertia has two parametrizations: `inertia_scale`, one factor per link as in the paper (Table III NEW is a
-multiple of OLD), and `link_...`, the ten log-Cholesky parameters of a link (link_inertia.py).
+whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are mapped by
+their logarithm. Inertia has two parametrizations: `inertia_scale`, one factor per link as in the paper (Table III:
+NEW is a multiple of OLD), and `link_...`, the ten log-Cholesky parameters of a link (link_inertia.py).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s", "signal_delay": "s"}
 OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
 TIMING = ("delay", "lag", "signal_delay")
-# standard deviation of a parameter among arms, by its unit; torque-like: per Nm of tau_max; of any logarithm: 1
+# standard deviation of a parameter among arms, by unit; torque-like ones: per Nm of tau_max; logarithms: always 1
 USUAL = {"Nm": 0.02, "Nm s/rad": 0.02, "kg m^2": 0.002, "kg": 0.02, "1": 0.1, "rad/s": 0.03, "m": 0.1, "s": 2e-3}
 WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
@@ -49,13 +49,13 @@ def torque_like() -> set[str]:
 
 
 def sizes(largest: np.ndarray) -> dict[str, Any]:
-    """Return {torque-like parameter: `largest`, (n,) Nm of each joint; payload mass: its maximum over the joints}."""
+    """Return {parameter: scale}: `largest` (n,) Nm for a torque-like parameter, its maximum for the payload mass."""
     return dict.fromkeys(torque_like(), largest) | {PAYLOAD[0]: largest.max()}
 
 
 @dataclass(frozen=True)
 class ParameterSpace:
-    """The estimated vector x (P,).
+    """The space of the parameter vector x (P,) that an identification estimates.
 
     Attributes:
         blocks: parameter names in the order of x; each has n values, or one for the whole arm.
@@ -63,8 +63,8 @@ class ParameterSpace:
         lower, upper: (P,) bounds in SI units.
         nominal: start values of a search, and the values of all parameters that are not in x.
         robot: the arm; inertia blocks are relative to its links.
-        breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. Breakaway torques are
-            then these commands plus the offset. Where it is NaN or None, they are nominal.
+        breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. A breakaway
+            torque is this command plus the offset; without a command (NaN or None) it is nominal.
         fixed: names of values that the user fixed; their bounds are too narrow for a search (stated.py).
     """
 
@@ -83,7 +83,7 @@ class ParameterSpace:
 
     @property
     def names(self) -> list[str]:
-        """The P names of the values, such as phi1[3] (joints count from 1)."""
+        """The P names of the values, such as phi1[3]; the first joint is 1."""
         return [b if b in WHOLE_ARM else f"{b}[{j + 1}]" for b in self.blocks for j in range(self.size(b))]
 
     @property
@@ -111,7 +111,7 @@ class ParameterSpace:
         return np.arange(at, at + self.size(name))
 
     def expand(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
-        """Return (P,) from {block: one value or one per joint (n,)}; blocks that `values` lacks get `default`."""
+        """Return a vector (P,) from `values`, {block: one value or (n,)}; blocks that it lacks get `default`."""
         return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
     @cached_property

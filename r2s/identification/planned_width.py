@@ -1,4 +1,4 @@
-"""Expected 95 % interval widths from a recording of a planned motion, for choosing the motion.
+"""Predict the 95 % interval widths that a recording of a planned motion will yield, to choose the motion.
 
 Parameters, bounds and prior are those of the later identification. The torque is linearized at the nominal arm.
 """
@@ -28,14 +28,14 @@ class PlannedWidths:
     """Expected 95 % interval widths from planned motions.
 
     Attributes:
-        space: the parameters. information: (P, P) on the unit cube, sum over the motions so far (see `add`).
+        space: the parameters. information: (P, P) on the unit cube, summed over the motions that `add` received.
 
     Args:
         robot, nominal: the arm, and the dynamics at which the identification will start.
-        settings: of the identification; for family=auto the family of the nominal arm is used.
+        settings: settings of the identification; for family=auto the nominal arm's friction family is used.
         torque: kind of torque that will be recorded.
         noise: torque noise, standard deviation of independent samples at COARSE_HZ, relative to tau_max.
-        chosen: parameters such as "offset" or "offset[3]" whose widths `score` counts; empty: all.
+        chosen: parameters such as "offset" or "offset[3]" whose widths `score` averages; empty: all.
 
     Raises:
         UserError: `chosen` contains an unknown parameter.
@@ -90,16 +90,16 @@ class PlannedWidths:
         return (j.transpose(0, 2, 1) @ j) * ((t[-1] - t[0]) * COARSE_HZ / len(t))
 
     def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
-        """Add the information of a motion (T, n) at times t (T,) to that of the motions so far."""
+        """Add the information of a motion (T, n) at times t (T,) s to `information`."""
         self.information = self.information + self.of(t, q[None], dq[None], ddq[None])[0]
 
     def half(self, information: np.ndarray) -> np.ndarray:
-        """Return half the 95 % widths (..., P) on the unit cube that information (..., P, P) and prior give."""
+        """Return half the 95 % widths (..., P) on the unit cube, from information (..., P, P) and prior."""
         covariance = np.linalg.inv(information + self._prior)
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the score (B,) of B motions, each added to those so far: minus the mean log of chosen widths."""
+        """Return minus the mean log of chosen widths (B,), with each of B motions alone added to those so far."""
         some = slice(None, None, 1 + len(t) // MOST_ROWS)
         information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
         return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)

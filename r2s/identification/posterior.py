@@ -14,7 +14,7 @@ LEAST_LEFT = 0.1  # lower limit of 1 minus a block's share of the information in
 
 
 class Linearized(Protocol):
-    """What `posterior` needs of a least-squares problem on the unit cube, such as `Problem`."""
+    """Interface of a least-squares problem on the unit cube, as `posterior` requires it; `Problem` implements it."""
 
     @property
     def clusters(self) -> np.ndarray:
@@ -27,7 +27,7 @@ class Linearized(Protocol):
 
 
 class Posterior(NamedTuple):
-    """The fit u (P,) on the unit cube, S draws minus u (`steps`, (S, P)), and the data's information (P, P)."""
+    """The fit u (P,) on the unit cube, `steps` (S, P) from u to S draws, and the data's information (P, P)."""
 
     u: np.ndarray
     steps: np.ndarray
@@ -37,14 +37,14 @@ class Posterior(NamedTuple):
 def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     """Return draws about the fit u (P,) from a normal distribution with a cluster-robust covariance.
 
-    Errors within a block are correlated. So the covariance is H^-1 (sum of s s^T + prior) H^-1, with the score s, a
-    block's part of the gradient (White, Econometrica 48(4), 1980; clusters: Liang and Zeger, Biometrika 73(1), 1986).
-    The mean score, which is not 0 at a bound, is removed. With few blocks the fit follows each of them, so a block's
-    residual is smaller than its error; its share of the information corrects this (CR2 of Bell and McCaffrey, Survey
-    Methodology 28(2), 2002). Student's t widens the draws for the unknown scatter of few blocks. Where single blocks
-    decide, their scatter underestimates the covariance, so in no direction is it less than for independent rows. A
-    bootstrap over blocks would sometimes draw an H with hardly any information on a value that few blocks determine;
-    such tails describe no arm.
+    Errors within a block are correlated. So the covariance is H^-1 (sum of s s^T + prior) H^-1; the score s is a
+    block's part of the gradient (White, Econometrica 48(4), 1980; clusters: Liang and Zeger, Biometrika 73(1), 1986),
+    minus the mean score, which is not 0 at a bound. If blocks are few, the fit follows the error of each, so its
+    residual is too small; a factor from the block's share of the information corrects this (CR2 of Bell and
+    McCaffrey, Survey Methodology 28(2), 2002). Student's t widens the draws, because few blocks show scatter poorly.
+    If one block determines a direction, the scatter is too small, so the covariance is at least that of independent
+    rows. No bootstrap over blocks is used: some of its H would have hardly any information on a value that few blocks
+    determine, and the resulting tails describe no arm.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -66,7 +66,7 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return information (K, P, P) and score (K, P) of each block, the prior's information (P, P), and a factor.
 
-    The factor is the RMS of the data rows, in standard deviations, and at least 1.
+    The factor is the RMS of the data rows in standard deviations, but at least 1.
     """
     clusters, p = problem.clusters, len(u)
     count, square, seen, row = int(clusters.max()) + 1, 0.0, 0, 0
@@ -79,14 +79,14 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
             some = np.flatnonzero(own == block)
             gram[block] += j[some].T @ j[some]
             score[block] += j[some].T @ r[some]
-        counts = j.any(1)  # padding rows, whose residual and slope are 0, do not count
+        counts = j.any(1)  # without padding rows, whose residual and slope are 0
         square, seen = square + float((r[counts] ** 2).sum()), seen + int(counts.sum())
     prior += np.diag(np.where(prior.any(0), 0.0, FLAT))  # a flat prior has no row of its own
     return gram, score, prior, float(np.sqrt(max(1.0, square / max(seen, 1))))
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return a root (P, P) of the covariance root root^T after raising it to at least least least^T.
+    """Return a square root (P, P) of the covariance root root^T, raised where least least^T is larger.
 
     Directions are compared, not single parameters: the sum of two correlated ones is known far better than each.
     """
@@ -95,9 +95,9 @@ def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
 
 
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return steps (S, P) that end in the cube: values outside are clipped, and the others compensate.
+    """Return `steps` (S, P) from u, changed to end in the cube: values outside are clipped, the others compensate.
 
-    The others minimize the sum of squares, half of whose Hessian is h (P, P). Clipping alone would bias sums: an
+    The other values minimize the sum of squares, whose Hessian is 2 h (P, P). Clipping alone would bias sums: an
     offset, for example, is correlated with an asymmetry at its bound. Values are clipped one at a time, the farthest
     first, because this often brings a correlated value back into the cube.
     """

@@ -12,7 +12,7 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 HORIZONS = (0.1, 0.5, 2.0)  # s, horizons of open-loop prediction
-SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording of which torque is compared, in total and per part
+SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording used to compare torque, in total and per part
 REPLAYED_S = 240.0  # s of a longer recording that are replayed
 MAX_WINDOWS = 100  # per horizon
 
@@ -31,7 +31,7 @@ def prediction_errors(
 
     The errors are torque RMSE per joint and, for commanded torque, position_rmse_mrad over replays of `window_s`, and
     ee_error_mm, the mean end-effector distance after each of the HORIZONS that trajectories reach. If no trajectory
-    lasts `window_s`, there is no position_rmse_mrad. Of a long recording, parts spread over it are used.
+    lasts `window_s`, there is no position_rmse_mrad. A long recording is represented by parts spread over it.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}
@@ -52,7 +52,7 @@ def prediction_errors(
 
 
 def open_loop_error(robot: Robot, dynamics: Dynamics, recording: Recording, nthread: int) -> dict[str, float]:
-    """Return {horizon in s: mm}, mean distance between simulated and recorded end effector after each horizon."""
+    """Return {horizon in s: mean distance in mm between simulated and recorded end effector after this time}."""
     errors = {}
     for horizon in HORIZONS:
         if (windows := windows_or_none(recording, horizon, MAX_WINDOWS)) is None:

@@ -17,11 +17,11 @@ from r2s.physics.robot import SIM_DT
 
 UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
-TAIL = 25.0  # degrees of freedom of the prior of link-side torque, plus 1
-# implicit friction: its effect's least significance in standard deviations, and range of its size over the expected
+TAIL = 25.0  # for link-side torque, the prior is Student's t: degrees of freedom plus 1
+# implicit friction: least significance of its effect in standard deviations; range of actual over expected size
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
 ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more, as nominal friction may be off by tens of Nm
-FIT_STEPS, FIT_FTOL = 12, 1e-3  # largest number of Jacobians in a fit, and relative gain of a step at which it ends
+FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by less (relative)
 Report = Callable[[dict], None]
 
 
@@ -29,7 +29,7 @@ class ExtraResidual(Protocol):
     """Residual rows from sources other than the data: ramps, presliding replays, or prior knowledge (`Known`)."""
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return the K rows, in standard deviations, for candidates x (C, P): (C, K)."""
+        """Return the K rows for candidates x (C, P) as an array (C, K), in standard deviations."""
         ...
 
 
@@ -38,11 +38,11 @@ class Problem:
     """A least-squares problem on the unit cube, with rows of data, prior and extra residuals in standard deviations.
 
     Attributes:
-        data: the residual of the recording: replays, or torque.
+        data: the residual that is fitted to the recording, of replays or of torque.
         torque_data: the torque residual, for a fast start; it may be `data` itself.
-        sigma: (P,) prior standard deviation about the nominal value (of the logarithm for logarithmic coordinates);
-            inf: flat prior.
-        extra: further residuals.
+        sigma: (P,) prior standard deviation about the nominal value, or about its logarithm for logarithmic
+            coordinates; inf means a flat prior.
+        extra: residuals of further sources.
     """
 
     data: ReplayResidual | TorqueResidual
@@ -63,7 +63,7 @@ class Problem:
 
     @property
     def space(self) -> ParameterSpace:
-        """The parameters."""
+        """The space of the estimated parameters."""
         return self.data.space
 
     @cached_property
@@ -73,7 +73,7 @@ class Problem:
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each data row; errors in different blocks count as independent."""
+        """(R,) block of each data row; errors in different blocks are treated as independent."""
         return self.data.clusters
 
     @property
@@ -88,10 +88,10 @@ class Problem:
 
     @property
     def prior_width(self) -> np.ndarray:
-        """(P,) the prior's standard deviation on the unit cube, with which the posterior's is compared.
+        """(P,) the prior's standard deviation on the unit cube, for comparison with the posterior's.
 
-        For a flat prior it is the standard deviation among arms in general (`ParameterSpace.usual`). It is at most
-        UNIFORM, that of a uniform distribution over the bounds.
+        A flat prior gets the standard deviation among arms in general (`ParameterSpace.usual`). All are limited to
+        UNIFORM, the standard deviation of a uniform distribution over the bounds.
         """
         stated = np.where(np.isinf(self.sigma), self.space.usual, self.sigma)
         return np.minimum(stated / self.space.width, UNIFORM)
@@ -102,17 +102,17 @@ class Problem:
         return self.space.width / self.sigma
 
     def fixed(self, at: np.ndarray) -> "Problem":
-        """Return the problem with the values at the indices `at` fixed at nominal, by a very narrow prior."""
+        """Return the problem with a very narrow prior that fixes the values at indices `at` at nominal."""
         sigma = self.sigma.copy()
         sigma[at] = FIXED * self.space.width[at]
         return replace(self, sigma=sigma)
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with a flat prior for these values, because an extra residual serves as their prior."""
+        """Return the problem with a flat prior for the values `names`, because an extra residual is their prior."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
-        """Return the problem with another torque residual; it also replaces `data` unless these are replays."""
+        """Return the problem with another torque residual, which also replaces `data` unless `data` are replays."""
         return replace(self, data=self.data if self.uses_replays else torque_data, torque_data=torque_data)
 
     def torque_reweighted(self, u: np.ndarray) -> "Problem":
@@ -130,11 +130,11 @@ class Problem:
         return float((self.residual(u[None]) ** 2).sum())
 
     def residual(self, u: np.ndarray) -> np.ndarray:
-        """Return (C, R + B) for u (C, P): data, prior and extra rows, in standard deviations."""
+        """Return residuals (C, R + B) at u (C, P), in standard deviations: data rows, then prior and extra rows."""
         return np.concatenate([self.data(self.space.from_unit(u)), self._prior(u)], axis=1)
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield `residual` and its Jacobian (., P) at u (P,) in parts: data rows first, then prior and extra rows."""
+        """Yield residual and Jacobian (rows, P) at u (P,) in parts: data rows first, then prior and extra rows."""
         if self.uses_replays:
             yield _differences(self.residual, u)
         else:
@@ -146,7 +146,7 @@ class Problem:
         return _differences(self._prior, u)
 
     def prior_information(self, u: np.ndarray) -> np.ndarray:
-        """Return (P, P) J^T J of the prior and extra rows at u (P,), half the Hessian of their sum of squares."""
+        """Return J^T J (P, P), with the Jacobian J of the prior and extra rows at u (P,)."""
         j = self.prior_rows(u)[1]
         return j.T @ j
 
@@ -154,7 +154,7 @@ class Problem:
         prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
         if not (self.torque_data.commanded or self.torque_data.at_motor):
             # heavy tails as in Student's t (Lange et al., J. Am. Stat. Assoc. 84(408), 1989): data that clearly
-            # contradict a narrow prior outweigh it; near the nominal value the prior is normal
+            # contradict a narrow prior outweigh it, while the prior is normal near the nominal value
             heavy = np.sign(prior) * np.sqrt(TAIL * np.log1p(prior**2 / TAIL))
             prior = np.where(self.sigma > 2 * FIXED * self.space.width, heavy, prior)
         return np.concatenate([prior, *(extra.residual(self.space, x) for extra in self.extra)], axis=1)
@@ -170,8 +170,8 @@ def _differences(residual: Callable[[np.ndarray], np.ndarray], u: np.ndarray) ->
 class Search(Protocol):
     """A search, which minimizes the sum of squares of `Problem.residual` from `start` (P,).
 
-    After every step or generation it calls `report` with a dict of search, evaluations, cost, done and total. `local`
-    is true for searches that continue from their start, so that they can refine the result of another search.
+    After every step or generation it calls `report` with a dict of search, evaluations, cost, done and total. A local
+    search (`local` is true) continues from its start, so it can refine the result of another search.
     """
 
     local: bool

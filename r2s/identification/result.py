@@ -14,12 +14,12 @@ from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterEstimate
 from r2s.identification.problem import Problem
 from r2s.physics.dynamics import Dynamics
 
-EDGE = 5e-4  # share of a parameter's range that counts as its bound
-RIDGE = 1e-6  # information on the unit cube that is added to every value, as some have a flat prior and no data
+EDGE = 5e-4  # a value closer to a bound than this share of its range is at the bound
+RIDGE = 1e-6  # information added to every value on the unit cube, as some values have a flat prior and no data
 UNSEEN = 0.9  # ratio of posterior to prior sigma, above which the data hardly determine a value
 SHARPER = 4.0  # a value is identifiable if half its 95 % interval is less than its prior's sigma divided by this
 NULL_SHARE = 0.5  # ratio of posterior to prior sigma, above which a direction counts as decided by the prior
-LISTED_PARTS, LEAST_PART = 6, 0.2  # of such a direction: most values that are listed, and least component of one
+LISTED_PARTS, LEAST_PART = 6, 0.2  # most values listed for such a direction, and least component of a listed value
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class IdentificationResult:
         space, found: the parameters and their estimate.
         history: a row per step or generation of each search.
         families: {"sigmoid": error of held-out torque relative to the best, ...}; empty if the user chose the family.
-        null_directions: combinations of parameters that mainly the prior decides: (posterior over prior sigma,
-            {name: component}), widest first.
+        null_directions: combinations of parameters that mainly the prior decides, widest first. Each is a pair (ratio
+            of posterior to prior sigma, {name: component}).
         unseen: names of values that stay nominal, because the data hardly determine them.
         edges: breakaway commands from ramps; None without ramps.
         refused: whether r2s discarded the replays, because they contradicted the torque fit.
@@ -60,7 +60,7 @@ class IdentificationResult:
 
     @property
     def at_bounds(self) -> list[str]:
-        """A line for each value at a bound other than 0 of the search; the best value may lie beyond this bound."""
+        """Messages, one for each value at a search bound other than 0; the best value may lie beyond this bound."""
         s, u, unit, lines = self.space, self.space.to_unit(self.found.x), units(), []
         for block in s.blocks:
             for k, at in enumerate(s.where(block)):
@@ -89,9 +89,9 @@ class IdentificationResult:
     def saved(self) -> tuple[ParameterSpace, ParameterEstimate]:
         """Parameter space and estimate for parameters.yaml, including the breakaway torques from ramps, if any.
 
-        Their interval combines Student's t (friction/repeatability.py) with the uncertainty of the offset. If no ramp
-        released a joint, its breakaway torque lies between the largest torque without motion and the bound. It is
-        then not identifiable, and all draws have the same value.
+        The interval of a breakaway torque combines Student's t (friction/repeatability.py) with the uncertainty of
+        the offset. If no ramp released a joint, the interval lies between the largest torque without motion and the
+        bound. The breakaway torque is then not identifiable, and all draws have the same value.
         """
         if self.edges is None:
             return self.space, self.found
@@ -100,7 +100,7 @@ class IdentificationResult:
         sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
         got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
         edges = self.space.dynamics(f.samples).breakaway
-        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # because of the offset
+        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # half-width due to the offset
         most = student.ppf(0.975, freedom)
         # policies train on these draws, and Student's far tails for few degrees of freedom describe no arm
         drawn = np.clip(np.random.default_rng(0).standard_t(freedom, edges.shape), -2 * most, 2 * most)
@@ -130,7 +130,7 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
 
     Args:
         problem: the solved problem.
-        space: its parameters, including the breakaway and stiction that were estimated after the fit.
+        space: the parameters, with the breakaway torques and stiction model that were estimated after the fit.
         sure: the fields of `Posterior`: fit, draws and information.
         story: the fields history, families, edges and refused of `IdentificationResult`.
     """
@@ -161,7 +161,7 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
 
 
 def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return u (P,), with poorly determined values set back to `start`, and (P,) bool, whether each was set back.
+    """Set poorly determined values of u (P,) back to `start`; return u and (P,) bool, whether each was set back.
 
     The data may determine values together but not one by one, like the masses of two consecutive links. So a value is
     set back only if the others, refitted, still explain data and prior: the sum of squares may rise by 1 in total.

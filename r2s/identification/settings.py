@@ -15,11 +15,11 @@ from r2s.physics.friction import family as friction_family
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of `identify`, as in conf/identify, with the terms and the prior for one kind of torque.
+    """Settings of `identify`, as in conf/identify; terms and prior are those for the recorded kind of torque.
 
     Attributes:
-        bounds: {"phi1": [low, high], ...} of every parameter that may be estimated; a bound is a number or (n,),
-            relative to the largest torque for torque-like parameters (terms.py: `scaled_bounds`).
+        bounds: {"phi1": [low, high], ...} for every parameter that may be estimated; a bound is a number or (n,).
+            Bounds of torque-like parameters are relative to the largest torque (terms.py: `scaled_bounds`).
         prior: {"inertia_scale": sigma or None (flat), ...} in the same units, see `scaled_prior` and `Problem`.
         terms: model terms that are estimated besides friction, see terms.py.
         family: friction family; auto selects it by cross-validation.
@@ -27,7 +27,7 @@ class Settings:
         stride: ms, time over which angles are averaged before they are compared (commanded torque).
         cutoff_hz: cutoff of the zero-phase filter for torque.
         breakaway: without ramps, breakaway torques are scanned up to this multiple of the identified friction
-            (commanded torque only: a link-side sensor does not measure the motor's). None leaves them nominal.
+            (commanded torque only: a link-side sensor does not measure motor torque). None: they stay nominal.
         folds: number of folds of the cross-validation within the recording.
         candidate_terms: terms that are added if they improve held-out prediction; `link` replaces `inertia_scale`.
         prunable_terms: terms that are removed if held-out prediction stays as good without them.

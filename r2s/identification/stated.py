@@ -1,4 +1,4 @@
-"""A user's prior statements about an arm: mean and width, or a fixed value, per parameter and joint, in SI units."""
+"""Read a user's statements about an arm: prior mean and width, or fixed value, per parameter and joint (SI units)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from r2s.physics.friction import family, known_families
 
 Stated = Mapping[str, Mapping[str, Any]]  # {"coulomb": {"mean": [3.1, None, 2.0], "width": 0.2}, ...}
 KEYS = ("mean", "width", "fixed")
-TINY = 1e-9  # half the distance between a fixed value's bounds, relative to the value or to its original bounds
+TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to the width of its original bounds
 
 
 def check_stated(stated: Stated, n: int | None = None) -> None:
@@ -74,7 +74,7 @@ def _values(entry: Mapping[str, Any], key: str, count: int) -> np.ndarray:
 
 
 def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
-    """Return the space with bounds so close to the user's fixed values that nothing is left to search."""
+    """Return the space with bounds so close to the user's fixed values that no search can change them."""
     lower, upper, names = space.lower.copy(), space.upper.copy(), []
     for block, entry in stated.items():
         if block not in space.blocks:
@@ -89,16 +89,16 @@ def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
 
 
 def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the prior that the user states by mean and width for values of a space; None if there is none.
+    """Return the prior that the user states by mean and width, for values in `space`; None if none is stated.
 
     A mean without a width gets its width from `prior`; a width without a mean is centred at the nominal value. Widths
     are standard deviations in SI units; those of logarithmic parameters are divided by the mean.
 
     Args:
-        space: of the search. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.
+        space: the searched parameters. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.
 
     Raises:
-        UserError: a stated parameter is not in the space, a mean is outside its bounds, or there is no width.
+        UserError: a stated parameter is not in `space`, a mean is outside its bounds, or a mean has no width.
     """
     names, means, widths = [], [], []
     for block, entry in stated.items():
@@ -129,7 +129,7 @@ def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, Arra
 
 
 def with_terms_of(stated: Stated, terms: Sequence[str], blocks_of: Any, every: Sequence[str]) -> list[str]:
-    """Return `terms` plus those of the stated parameters; `inertia_scale` and `link` replace each other."""
+    """Return `terms` plus the terms of the stated parameters; `inertia_scale` and `link` replace each other."""
     out = list(terms)
     for block in stated:
         own = [t for t in every if block in blocks_of(t)]

@@ -1,4 +1,4 @@
-"""Terms of the model besides friction: the parameters that each adds, and their bounds and prior in SI units."""
+"""Terms of the model besides friction: the parameters of each term, with bounds and prior in SI units."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -72,7 +72,7 @@ def search_space(
 ) -> ParameterSpace:
     """Return the parameter space of the friction family and of those terms that affect the recorded kind of torque.
 
-    bounds: as in `scaled_bounds`; friction parameters that they lack have the family's own bounds, in SI units.
+    bounds: see `scaled_bounds`; friction parameters without an entry have the bounds of their family, in SI units.
     stated: the user's statements, of which only fixed values are used here (stated.py).
 
     Raises:
@@ -96,7 +96,7 @@ def search_space(
 def scaled_bounds(
     bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
 ) -> dict[str, Sequence[ArrayLike]]:
-    """Return bounds in SI units; those of torque-like parameters are given relative to the largest torque.
+    """Return `bounds` in SI units; its entries for torque-like parameters are relative to the largest torque.
 
     Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. So for
     motor torque, these bounds extend at least to the largest torque.
@@ -114,10 +114,10 @@ def scaled_bounds(
 def scaled_prior(
     prior: Mapping[str, ArrayLike | None], robot: Robot, recording: Recording, nominal: Dynamics | None = None
 ) -> dict[str, ArrayLike]:
-    """Return the priors' standard deviations in SI units; flat priors (None) are left out.
+    """Return the priors' standard deviations in SI units, without flat priors (None).
 
-    Those of torque-like parameters are given relative to the largest torque; logarithmic ones have no unit. A viscous
-    coefficient in the arm's file is a guess, so its standard deviation is at least its value.
+    In `prior`, entries for torque-like parameters are relative to the largest torque, and those for logarithmic ones
+    have no unit. A viscous coefficient in the arm's file is a guess; its standard deviation is at least its value.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():

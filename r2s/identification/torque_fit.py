@@ -1,4 +1,4 @@
-"""How much of a recorded torque the nominal arm explains, and whether another joint order, mounting or mass does."""
+"""Test whether the nominal arm explains recorded torque, or another joint order, mounting or mass does."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -12,14 +12,14 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia, nominal_torque, regressor
 from r2s.physics.robot import Robot
 
-MASS, MASS_LEFT = 3.0, 0.1  # least factor of a link's mass that is reported, and most of the misfit that it may leave
+MASS, MASS_LEFT = 3.0, 0.1  # a mass is reported if wrong by this factor; most misfit that a correction may leave
 CARRIED = 3  # number of last links whose mass is not judged, because a payload may be undeclared
 TILTED = np.radians(20)  # least angle of a mounting that is reported; uncertain masses may cause smaller ones
 INERTIA = 0.3, 4.0  # allowed factor of the nominal torque: errors of tensors, payloads, sensor gains
-FRICTION, OFFSET = 0.5, 0.1  # of tau_max, at most
+FRICTION, OFFSET = 0.5, 0.1  # largest fitted friction and offset, of tau_max
 MAX_LEFT = 2.0  # upper limit of a joint's unexplained share
-# gravity is judged where it changes: least RMS of its change, of tau_max; factor by which correlated rows raise the
-# standard error; largest standard error of the share
+# gravity is judged where it changes: least RMS of the change, of tau_max; factor by which correlated rows raise the
+# standard error of the share of gravity; largest standard error
 CHANGES, CORRELATED, MAX_SIGMA = 0.01, 3.0, 0.15
 
 
@@ -33,14 +33,14 @@ class Moments(NamedTuple):
 
 
 class Unexplained:
-    """Share of the recorded torque's square that the model leaves unexplained; `seen` are the judged joints."""
+    """The share of squared recorded torque that the model does not explain; `seen` are the S judged joints."""
 
     def __init__(self, robot: Robot, m: Moments, gravity: bool):
         self.robot, self.m = robot, m
         self.seen, self.need = np.arange(robot.n), self.inverse_dynamics(gravity)
 
     def with_need(self, need: np.ndarray) -> "Unexplained":
-        """Return a copy with another nominal torque (T, n) Nm."""
+        """Return a copy with another nominal torque `need` (T, n) Nm."""
         out = copy(self)
         out.need = need
         return out
@@ -68,7 +68,7 @@ class Unexplained:
         return np.array(factors), left / whole
 
     def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return for each joint (T, K), of tau_max: K torques (T, n) minus the friction and offset fitted to each."""
+        """Return (T, K) per joint: K torques (T, n) over tau_max, minus the friction and offset fitted to each."""
         out = []
         for j in self.seen.tolist():
             own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
@@ -77,7 +77,7 @@ class Unexplained:
         return out
 
     def gravity_shares(self) -> np.ndarray | None:
-        """Return the share of nominal gravity torque in tau, for each joint whose motion determines it, or None."""
+        """Return the share of nominal gravity torque in tau, for joints whose motion determines it, or None."""
         inertial = self.inverse_dynamics(False)
         weight, shares = self.inverse_dynamics(True) - inertial, []
         for j in self.seen:
@@ -93,11 +93,11 @@ class Unexplained:
         return np.array(shares) if shares else None
 
     def each(self, tau: np.ndarray) -> np.ndarray:
-        """Return the share (S,) of each joint's tau, a column of (T, n), that its own motion leaves unexplained."""
+        """Return the unexplained share (S,) of each judged joint's tau (T, n) after a fit with its motion."""
         return np.array([self._share(j, tau[:, j]) for j in self.seen.tolist()])
 
     def pairs(self) -> np.ndarray:
-        """Return (S, S): element j, k is the share of tau's column k that joint j's motion leaves unexplained."""
+        """Return (S, S): element j, k is the unexplained share of tau's column k, fitted with joint j's motion."""
         return np.array([[self._share(j, self.m.tau[:, k]) for k in self.seen] for j in self.seen.tolist()])
 
     def _share(self, j: int, tau: np.ndarray) -> float:
@@ -113,7 +113,7 @@ class Unexplained:
 
 
 def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, words) for other joint orders of tau or all signals: by name, rotated, reversed, swapped."""
+    """Return (misfit, message) for other joint orders of tau or all signals: by name, rotated, reversed, swapped."""
     robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}
@@ -141,7 +141,7 @@ def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, words) for each link that would need another mass, with its moments in proportion."""
+    """Return (misfit, message) for each link that would need another mass, with moments in proportion to the mass."""
     robot, m, out = left.robot, left.m, []
     y = regressor(robot, m.q, m.dq, m.ddq, robot.gravity if gravity else None)
     standard, names = LinkInertia(robot.mass, robot.com, robot.inertia).standard(), robot.model(gravity=False)
@@ -159,7 +159,7 @@ def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def mounting(left: Unexplained) -> list[tuple[float, str]]:
-    """Return (misfit, words) for a direction of gravity fitted to the torque, such as for an arm on a wall, or []."""
+    """Return (misfit, message) for a direction of gravity fitted to the torque, as of an arm on a wall, or []."""
     robot, size = left.robot, float(np.linalg.norm(left.robot.gravity))
     inertial = left.inverse_dynamics(False)
     parts = np.array([left.inverse_dynamics(g) - inertial for g in np.eye(3)])

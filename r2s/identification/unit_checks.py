@@ -1,9 +1,9 @@
-"""Checks of a recording's units, signs, joint order, gravity and clock against the arm's model.
+"""Check a recording's units, signs, joint order, gravity and clock against the arm's model.
 
 dq is compared with the slope of q, its integral with q (r2s/recordings/clock.py), and torque with the nominal arm's
 torque for the same motion. The checks are coarse on purpose. A nominal arm that is wrong by a factor of 3, an
 undeclared payload, any friction and sensor offsets pass; a factor of 1000, of 57.3 or of -1, another joint order or
-mounting do not. Most checks refuse a recording only if a correction leaves at most a quarter of the unexplained part.
+mounting do not. Most checks refuse a recording only if a correction leaves a quarter of the unexplained part or less.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from r2s.recordings.clock import check_clock
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # low-pass, rate and number of compared rows
+CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # low-pass cutoff, rate and number of compared rows
 EDGE = 100  # ms, dropped at both ends of a trajectory, where the filter has transients
-JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s of a longer recording: for units; for the clock, per part
+JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s used of a longer recording: units; clock; clock, per part
 SLOWEST_HZ = 5.0  # sampling rate below which only the clock is judged
 MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
-STILL = 0.02  # rad, largest range of a joint that counts as at rest
-REFUSED, CORRECTED = 0.5, 0.25  # unexplained share that is too much; relative share that a correction may leave
+STILL = 0.02  # rad, range of a joint up to which the joint is treated as at rest
+REFUSED, CORRECTED = 0.5, 0.25  # largest unexplained share; a correction must reduce it at least to this fraction
 SUSPECT = 0.3  # misfit above which other joint orders are tried; correct recordings had 0.006 to 0.21
-TURNED = 0.05  # misfit above which other mountings are tried; their three numbers must leave a tenth of it
-HELD = 0.05  # of tau_max RMS: a joint with so much nominal torque is judged even at rest
-HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # shares of nominal gravity in a torque with it; largest without it
-CURRENT = 0.005  # A/Nm, least factor of a current: no arm's joint has 200 Nm/A
+TURNED = 0.05  # misfit above which other mountings are tried; a mounting (3 numbers) must leave a tenth of it
+HELD = 0.05  # of tau_max: a joint with a larger RMS nominal torque is judged even at rest
+HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity: range in torque with gravity; most without
+CURRENT = 0.005  # A/Nm, least ratio of a current to torque: no arm's joint has 200 Nm/A
 OVER_LIMIT = 3.0  # largest allowed torque over tau_max
 RATIO = 4.0  # factor between dq and the slope of q above which, or below its inverse, dq is refused
 UNITS = {"tau": {1e3: "mNm", 1e-3: "kNm"}, "dq": {np.degrees(1): "deg/s", 1e3: "mrad/s", np.radians(1): "", 1e-3: ""}}
@@ -47,11 +47,11 @@ class DataError(UserError):
 
 @dataclass(frozen=True)
 class Judged:
-    """Results of the checks of a recording; nan or None where the motion does not determine a result.
+    """Results of `check_units`; nan or None where the motion does not determine a result.
 
     Attributes:
         clock: (n,) ratio of the change of q to the integral of dq. scale: (n,) ratio of dq to the slope of q.
-        misfit: unexplained share of the torque's square. shares: (S,) of nominal gravity in tau, by joint.
+        misfit: unexplained share of the torque's square. shares: (S,) share of nominal gravity in each joint's tau.
     """
 
     clock: np.ndarray
@@ -146,7 +146,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints that other columns fit far better, and these columns, or None; for pairs see `Unexplained`."""
+    """Return joints that other columns fit far better, and these columns, or None; pairs: see `Unexplained.pairs`."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():
@@ -157,7 +157,7 @@ def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _check_torque(
     robot: Robot, m: Moments, recording: Recording, moved: np.ndarray
 ) -> tuple[float | None, np.ndarray | None]:
-    """Compare the torque with the nominal arm's for the same motion; return misfit and shares of `Judged`."""
+    """Compare tau with the nominal arm's torque for the same motion; return `misfit` and `shares` of `Judged`."""
     gravity = recording.torque != "commanded"
     most = np.quantile(np.abs(recording.tau), 0.99, axis=0) / robot.tau_max
     left = Unexplained(robot, m, gravity)
@@ -177,7 +177,7 @@ def _check_torque(
         corrections.append((left.each(-m.tau).mean() / own.mean(), UNITS_OF, words))
     misfit = left.misfit()
     if misfit > SUSPECT:
-        kind = left.with_need(left.inverse_dynamics(not gravity)).misfit()  # with or without gravity, the opposite
+        kind = left.with_need(left.inverse_dynamics(not gravity)).misfit()  # with the opposite assumption on gravity
         limit = min(SUSPECT, kind)
         orders = [(after / misfit, ORDER, words) for after, words in other_orders(left, gravity) if after < limit]
         corrections += orders
@@ -222,7 +222,7 @@ def _check_torque(
 
 
 def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, str, str]]:
-    """Return (remaining misfit, check, description) for corrections of some joints: other columns, other signs."""
+    """Return (remaining misfit, check, description) of corrections of some joints: other columns or other signs."""
     seen, out, pairs = left.seen, [], left.pairs()
     if (swap := _swapped(pairs, own)) is not None:
         order = np.arange(len(seen))
@@ -238,7 +238,7 @@ def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, s
 
 
 def _listed(joints: Sequence[int] | np.ndarray) -> str:
-    """Return " 3" or "s 1, 2, 3" for joints that are counted from 0."""
+    """Return " 3" or "s 1, 2, 3", numbers from 1, for joint indices from 0."""
     return f"{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
 
 

@@ -1,4 +1,4 @@
-"""Verdict on a recording before it is fitted: pass, warn or fail for each check, and expected interval widths.
+"""Judge a recording before a fit: pass, warn or fail for each check, and expected interval widths.
 
 A recording fails if the checks of an identification refuse it (checks.py, unit_checks.py). Each line also shows what
 its check measured.
@@ -26,14 +26,14 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 PASS, WARN, FAIL, OPEN = "pass", "warn", "fail", "-"  # OPEN: not judged
-UNEVEN, UNEVEN_SHARE = 0.5, 0.05  # an uneven step's deviation, of the median step; allowed share of such steps
-OFF_CLOCK = 0.03  # filters of dq and elastic gears change slow motion by 1 to 2 % (recordings/clock.py)
+UNEVEN, UNEVEN_SHARE = 0.5, 0.05  # a step is uneven if it deviates by this share of the median; allowed share
+OFF_CLOCK = 0.03  # largest error of dq's scale; filters and elastic gears cause 1 to 2 % (recordings/clock.py)
 LATE_S = 1e-3  # s, or half a row: the resolution of a log
-SURE = 2.0  # standard deviations
-LOADED = 0.7, 1.4  # shares of nominal gravity that need no undeclared load: files' masses are accurate to a third
+SURE = 2.0  # standard deviations, half-width of the shown interval of lateness
+LOADED = 0.7, 1.4  # range of gravity's share without an undeclared load: masses in files are accurate to a third
 SPEEDS_S = 600.0  # s of a longer recording whose speeds are examined
 FAST, SLOW = 0.2, 0.05  # of dq_max: a friction curve needs speeds from below SLOW to above FAST
-LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # least shares of moving rows that are below SLOW, and in each direction
+LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # of a joint's moving rows: least share below SLOW, and in each direction
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcomes of all checks of a recording, and the expected widths; these are None if a check fails."""
+    """The outcomes of all checks of a recording, and the expected widths (None if a check fails)."""
 
     lines: tuple[Line, ...]
     expected: ExpectedWidths | None = None
@@ -69,11 +69,11 @@ class Verdict:
 
     @property
     def worst(self) -> str:
-        """The verdict on the recording as a whole: that of the worst check."""
+        """The verdict on the whole recording, which is the verdict of the worst check."""
         return FAIL if self.fails else WARN if self.warnings else PASS
 
     def refuse(self, name: str = "") -> None:
-        """Raise UserError about the first failed check, if any; the message begins with `name`, the recording's."""
+        """Raise UserError about the first failed check, if any; the message begins with `name`, of the recording."""
         for line in self.fails:
             raise UserError(f"{name}{line.found}")
 
@@ -97,8 +97,8 @@ def judge(robot: Robot, nominal: Dynamics, recording: Recording, settings: Setti
 
     Args:
         robot, nominal: the arm, and the dynamics at which an identification starts.
-        recording: with its period, if the motion repeats (`Recording.in_phase`).
-        settings: of the identification.
+        recording: the recording, with its period if the motion repeats (`Recording.in_phase`).
+        settings: settings of the identification.
     """
     lines, judged = _file(recording), None
     try:
@@ -260,7 +260,7 @@ def _span(x: np.ndarray, form: str = "{:.3g}") -> str:
 
 
 def with_validation(verdict: Verdict, error: UserError | None, name: str = "") -> Verdict:
-    """Return the verdict with a line about validation file `name`; error: why it is refused, or None."""
+    """Return the verdict with a line about validation file `name`; error: why the file is refused, or None."""
     check = f"validation {name}".strip()
     line = Line(check, FAIL, str(error)) if error else Line(check, PASS, "holds other motion")
     return replace(verdict, lines=(*verdict.lines, line))

@@ -22,9 +22,9 @@ class BoxRandomization(UniformRandomization):
     x, y ~ U(-spread, spread) and yaw ~ U(-yaw, yaw) about the nominal place
 
     Attributes:
-        size: (3,) m, edges. mass: kg, table, friction (with the tip), stiffness: N/m, damping: s/m, bristle: m, all
-            [least, most], see `Surface`.
-        spread: m. yaw: degrees. point: (3,) m, normal: (3,), of the table; None: default of `table_frame`.
+        size: (3,) m, edges of the box. mass (kg), table, friction (coefficients at table, tip), stiffness (N/m),
+            damping (s/m), bristle (m): ranges [least, most], see `Surface`.
+        spread (m), yaw (degrees): see above. point (3,) m, normal (3,): of the table; None: see `table_frame`.
 
     Raises:
         UserError: a range is malformed, the box would tilt, or there is no tool.
@@ -48,7 +48,7 @@ class BoxRandomization(UniformRandomization):
 
     def __post_init__(self):
         super().__post_init__()
-        _ = self._frame  # raise for wrong settings
+        _ = self._frame  # raises for wrong settings
         for name in ("stiffness", *RANGES):
             check_pair(name, getattr(self, name), "(0, inf)" if name in ("mass", "stiffness") else "[0, inf)")
         check_size("dr.size", self.size, self.table[1])

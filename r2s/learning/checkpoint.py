@@ -1,9 +1,9 @@
-"""Checkpoints of a training: its state in one file, and the transitions of the replay buffer in chunks beside it.
+"""Checkpoints of a training: the state in one file, and the transitions of the replay buffer in files called chunks.
 
 Each transition is written once. The state names the chunks that belong to it, so an interrupted write leaves the
-previous checkpoint intact. A chunk is removed when the buffer has overwritten all of it. So the files hold the buffer
-and at most the transitions of one more checkpoint interval. Files hold tensors, numbers and names only, which
-torch.load(weights_only=True) reads.
+previous checkpoint intact. A chunk is removed when the buffer has overwritten all of it. So the chunks contain the
+buffer, and older transitions of at most one checkpoint interval. All files contain only tensors, numbers and names,
+so torch.load(weights_only=True) can read them.
 """
 
 import errno
@@ -20,11 +20,11 @@ from r2s.learning.replay import Replay
 
 
 class Checkpoint:
-    """The checkpoint of one training, in its own folder."""
+    """The checkpoint of one training, in a separate folder."""
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._chunks = list[int]()  # for each chunk, transitions seen at its end; the next chunk begins there
+        self._chunks = list[int]()  # per chunk, `Replay.seen` at its end, where the next chunk begins
 
     @property
     def env_steps(self) -> int:
@@ -47,7 +47,7 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill `replay`, an empty buffer, with the saved transitions and return the state; None without a checkpoint.
 
-        Every transition gets its former row, so a seed draws the same batches.
+        Every transition returns to its former row, so a restored generator draws the same batches.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.
@@ -66,7 +66,7 @@ class Checkpoint:
         return state
 
     def _path(self, end: int) -> Path:
-        """Return the file of the chunk that ends at this number of transitions."""
+        """Return the file of the chunk whose last transition has the number `end` - 1."""
         return self.folder / f"replay_{end:012d}.pt"
 
     def clear(self) -> None:
@@ -79,7 +79,7 @@ DISK_FULL = ("PytorchStreamWriter", "iostream error", "inline_container.cc")
 
 
 def save_tensors(path: Path, content: dict[str, Any]) -> None:
-    """Write tensors atomically; raises OSError if the disk is full."""
+    """Write tensors atomically; raise OSError if the disk is full."""
     with atomic_write(path) as part:
         try:
             torch.save(content, part)

@@ -1,7 +1,7 @@
 """Demonstrations: a model-based controller with noise fills the replay buffer before the first update.
 
 Off-policy learners need only good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random torques
-hardly ever reach a goal and stay there. The controller does both, and its noise explores around its motion.
+hardly ever reach a goal and stay there. The controller does both, and noise explores around its motion.
 """
 
 import math
@@ -17,12 +17,12 @@ from r2s.tasks.push import PushTask
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-NOISE = 0.3  # standard deviation on the last arm's action; first value tried, development seeds 0 to 2 of reach
+NOISE = 0.3  # standard deviation on the last arm's action; first value tried, on development seeds 0 to 2 of reach
 KEPT = 0.9  # correlation of the noise between steps: white noise hardly moves an arm
 
 
 class Demonstrator:
-    """A model-based controller with noise; on arm i of B its standard deviation is NOISE i / (B - 1), 0 on the first.
+    """A model-based controller with noise; the noise's standard deviation grows from 0 on arm 0 to NOISE on the last.
 
     Args:
         reference: the controller, with the interface of `r2s.learning.networks.Policy`.
@@ -42,7 +42,7 @@ def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstra
     """Return the demonstrator for reaching with torque, or for pushing with a Cartesian impedance, else None.
 
     Args:
-        robot, task: the arm and its task. dynamics: model of one arm, the center of the training's draws.
+        robot, task: the arm and its task. dynamics: model of one arm, the center of the training's randomization.
     """
     control = task.control(robot)
     if isinstance(task, ReachTask) and control.name == "torque":

@@ -35,8 +35,8 @@ class TaskEnv(EnvBase):
         draw: domain randomization, called at every reset; a `Pushes` also applies joint torques at every step.
         nsim: number of arms. nthread: threads, 0: all cores.
         seed: seed of goals, starts and draws.
-        stagger: whether GROUPS groups of arms end their first episodes at different times.
-        reward: terms and weights; None: the task's terms with its `paper_weights`.
+        stagger: whether GROUPS groups of arms end their first episode at different times.
+        reward: terms and weights; None: terms and `paper_weights` of the task.
     """
 
     batch_locked = True
@@ -63,7 +63,7 @@ class TaskEnv(EnvBase):
         self.reward, self.control = reward or Reward(), task.control(robot)
         self.reward.terms(task)  # raises if the reward does not fit the task
         self.weights = self.reward.weights(task, 0.0)
-        self._factor = self.reward.factor  # for `set_progress`, like the sum of the terms and its steps
+        self._factor = self.reward.factor  # `set_progress` adapts it to the mean of the terms since the last call
         self._seen, self._seen_steps = np.zeros_like(self.weights), 0
         self._torque = task.torque_limit(robot)
         self._staggered = self._stagger = stagger  # the setting, and whether the next reset staggers
@@ -130,9 +130,9 @@ class TaskEnv(EnvBase):
         return replace(drawn, speed_noise=np.maximum(drawn.speed_noise, noise))
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Return the step, and the next state after a reset of truncated episodes.
+        """Return the step, and the state of the next step, with truncated episodes reset.
 
-        It does the same as in EnvBase without checks and copies, which take a fifth of the time of a step of 32 arms.
+        EnvBase does the same with checks and copies, which take a fifth of the time of a step of 32 arms.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)
@@ -170,12 +170,12 @@ class TaskEnv(EnvBase):
         return self.reward.judge(self.task, state, ddq, self.goal, self._scale)
 
     def state(self) -> dict[str, Any]:
-        """Return the state of simulation and generators, in arrays, numbers and names, for `set_state`."""
+        """Return the state of simulation and generators, as arrays, numbers and names, for `set_state`."""
         own = {name: getattr(self, name).copy() for name in ("goal", "_dq", "_count", "_scale")}
         return own | {"arms": self.arms.state(), "rng": self.rng.bit_generator.state, "_stagger": self._stagger}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state` returned; the same actions then give the same steps, bit for bit."""
+        """Restore a result of `state`; the same actions then lead to the same steps, bit for bit."""
         for name in ("goal", "_dq", "_count", "_scale"):
             getattr(self, name)[:] = state[name]
         self.arms.set_state(state["arms"])

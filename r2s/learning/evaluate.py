@@ -1,7 +1,7 @@
-"""Evaluation in simulation: 200 fixed episodes, deterministic, the same for every policy.
+"""Evaluation in simulation: 200 deterministic episodes, the same for every policy.
 
-There are two sets of goals, starts and draws. SELECTION selects the best policy during a training. REPORT is for the
-reported measures; no policy is selected on it. Settings of conf/algo and conf/reward were compared on REPORT as well,
+There are two sets of goals, starts and dynamics. Set SELECTION selects the best policy during a training. Set REPORT
+yields the reported measures and selects no policy. But settings of conf/algo and conf/reward were compared on REPORT,
 so benchmarks/minutes.py uses a third set.
 """
 
@@ -20,7 +20,7 @@ SELECTION, REPORT = 7_000_000, 2_026_1122  # seeds, larger than those of trainin
 
 
 def generators(seed: int) -> list[np.random.Generator]:
-    """Return independent random generators for starts, goals and draws."""
+    """Return independent random generators for starts, goals and dynamics."""
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)]
 
 
@@ -39,7 +39,7 @@ def fixed_draws(draw: Draw, count: int, seed: int = REPORT) -> Dynamics:
 def make_evaluation(
     robot: Robot, task: Task, draw: Draw, *, episodes: int = 200, nthread: int = 0, seed: int = REPORT
 ) -> Callable[[PolicyLike], Episodes]:
-    """Return a function policy -> Episodes that runs all fixed episodes in parallel, each on an arm of its own draw.
+    """Return a function policy -> Episodes that runs all fixed episodes in parallel, each with its random dynamics.
 
     The function raises FloatingPointError if an action or a reward is not finite.
     """

@@ -1,7 +1,7 @@
 """A task as Gymnasium environments: `ArmVectorEnv`, a batch of simulated arms, and `ArmEnv`, one of them.
 
 Each arm of a batch has its own random generator, so arm i runs the same episodes as a single arm with the same seed.
-Observations are normalised with the scales of the task, as in the policies of r2s.
+Observations are normalised with the scales of the task, as in r2s's policies.
 """
 
 from typing import Any
@@ -74,7 +74,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
-        UserError: the autoreset_mode is none of these three.
+        UserError: autoreset_mode is not one of these three.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
-        """Return observations (m, d) of r2s in the normalised form of this environment."""
+        """Return observations (m, d), given in SI units, in the normalised form of this environment."""
         return ((observation - self.mean) / self.std).clip(-CLIP, CLIP).astype(np.float32)
 
     def reset(
@@ -116,7 +116,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes of all arms, or of the arms of `options["reset_mask"]` (num_envs,) bool.
 
-        seed: a number, arm i gets seed + i; or a list with one seed per arm; None: the arms' generators continue.
+        seed: with a number, arm i gets seed + i; or a list with one seed per arm; None: the generators continue.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
@@ -164,7 +164,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         return observation, reward.astype(np.float64), terminated, truncated, info
 
     def _restarted(self, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start new episodes of the arms of `mask`; return observations and info of all arms."""
+        """Start new episodes of the arms in `mask`; return observations and info of all arms."""
         self.env._restart(np.flatnonzero(mask))
         self.ended[mask] = False
         return self._presented(self.env.read())

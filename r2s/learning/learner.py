@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from r2s.errors import UserError, check_number
 from r2s.learning.networks import Actor, Critics, Normalizer, Policy
 
-KERNELS = 4  # most C++ files of a compiled update
+KERNELS = 4  # largest number of C++ files of a compiled update
 
 
 class Learner(nn.Module, ABC):
@@ -26,21 +26,21 @@ class Learner(nn.Module, ABC):
     Args:
         scale: mean and standard deviation (d,) that normalize an observation.
         action_scale: (a,), value of an action of 1 in SI units; part of the policy.
-        critics: number of critics, and outputs of each.
+        critics: (number of critics, outputs per critic).
         hidden: units per hidden layer of actor and critics.
         gamma: discount. tau: Polyak step of the target networks. lr: learning rate of Adam.
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
             critics hardly distinguish actions, the policy then prefers small actions to alternating full torque.
-        explore_correlation: correlation of an arm's exploration noise, a first-order process with constant variance,
-            between two steps; 0: white. For equal displacement, correlated noise accelerates an arm less (Lillicrap
-            et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
+        explore_correlation: correlation of an arm's exploration noise between two steps; 0: white. The noise is a
+            first-order process of constant variance. Per displacement, correlated noise accelerates an arm less
+            (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
 
     Raises:
         UserError: a setting has the wrong type or is out of range.
     """
 
     action_scale: Tensor
-    compiled: tuple[str, ...] = ("gradients",)  # methods that take most of an update's time
+    compiled: tuple[str, ...] = ("gradients",)  # methods to compile, which take most of the time
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Learner(nn.Module, ABC):
         self.register_buffer("action_scale", action_scale.float())
         self.gamma, self.tau, self.lr, self.action_l2 = gamma, tau, lr, action_l2
         self.explore_correlation, self.explore_share = explore_correlation, 1.0
-        self._noise: Tensor | None = None  # that of the last exploration
+        self._noise: Tensor | None = None  # noise of the last exploration
         self.updates = 0
         # One optimizer suffices: Adam skips parameters without a gradient, such as the actor's in a delayed update.
         self.optimizer = torch.optim.Adam([*self.actor.parameters(), *self.critics.parameters()], lr=lr, fused=True)
@@ -89,7 +89,7 @@ class Learner(nn.Module, ABC):
 
         Args:
             batch: see `update`, with normalized observations.
-            noise: random draws of the algorithm.
+            noise: random draws that the algorithm needs.
         """
 
     @abstractmethod
@@ -103,7 +103,7 @@ class Learner(nn.Module, ABC):
     def gradients(self, batch: Mapping[str, Tensor], *noise: Any) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
         """Return `losses` of a batch in SI units, and the gradient of their sum with respect to each of `trained`.
 
-        One function computes both, so that they compile to one graph; `backward` would be a second graph.
+        One function computes both, so that both compile to one graph; `backward` would be a second graph.
         """
         return differentiate(self.losses(self.normalized(batch), *noise), self.trained)
 
@@ -137,14 +137,14 @@ class Learner(nn.Module, ABC):
 
     @property
     def trained(self) -> list[Tensor]:
-        """The parameters that the optimizer changes: all but those of target networks."""
+        """The parameters that the optimizer changes: all except the target networks'."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def compile(self, batch_size: int) -> bool:  # type: ignore[override]
         """Compile the losses with their gradient for this batch size, before the first update.
 
         This takes half a minute of one core, or some seconds with a cached result. On a GPU it captures a graph.
-        If compilation fails, for example without a C++ compiler, it warns once, and the losses stay uncompiled.
+        If compilation fails, for example without a C++ compiler, a warning follows, and the losses stay uncompiled.
 
         Returns:
             Whether the losses are compiled.
@@ -199,7 +199,7 @@ class Learner(nn.Module, ABC):
         return {"optimizer": self.optimizer.state_dict(), "updates": self.updates, "noise": self._noise}
 
     def set_extra_state(self, state: dict) -> None:
-        """Restore what `get_extra_state` returned."""
+        """Restore a result of `get_extra_state`."""
         # torch keeps references to the given moments: without a copy, two learners would share and overwrite them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         noise = state.get("noise")  # older checkpoints have none
@@ -241,7 +241,7 @@ class EntropyLearner(Learner):
 
     Args:
         scale, action_scale, critics, shared: see `Learner`.
-        alpha_init: initial temperature. target_entropy: of the policy; None: minus the dimension of an action.
+        alpha_init: initial temperature. target_entropy: entropy goal; None: minus the dimension of an action.
     """
 
     entropy_goal: Tensor
@@ -267,7 +267,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Shift the target entropy by that of a Gaussian whose standard deviations are multiplied by `share`."""
+        """Shift the target entropy as a Gaussian's entropy shifts if `share` multiplies all standard deviations."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -294,7 +294,7 @@ class EntropyLearner(Learner):
         return out | {"alpha": self.log_alpha.detach().exp()}
 
     def entropy_losses(self, alpha: Tensor, value: Tensor, action: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        """Return actor and alpha losses and the entropy; value and log_prob (B,) belong to action (B, a)."""
+        """Return actor and alpha losses and the entropy; value, log_prob (B,): those of action (B, a)."""
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.entropy_goal)).mean()
         return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}
@@ -326,7 +326,7 @@ def differentiate(
 
 @torch.no_grad()
 def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
-    """Move every parameter of `target` by the fraction tau towards that of `source`."""
+    """Move every parameter of `target` by the fraction tau towards the parameter of `source`."""
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
 
 

@@ -1,6 +1,6 @@
 """Model-based baselines: minimum-jerk joint motion, computed torque, friction compensation.
 
-They have the interface, observations and rate of a policy, and use the model in which policies train.
+Baselines have the interface, observations and rate of a policy, and use the model in which policies train.
 """
 
 import mujoco
@@ -28,7 +28,7 @@ class Oracle:
 
     Args:
         robot, task: the arm and its task, under control=torque. dynamics: model of one arm.
-        move_s: s, shortest duration of a motion, longer if a joint would exceed the share FAST of its speed limit.
+        move_s: s, duration of a motion, or longer if a joint would exceed the share FAST of its speed limit.
     """
 
     def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
@@ -111,7 +111,7 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
     """Return `algo=computed_torque`: zero actions under control=computed_torque, `Oracle` for reaching with torque.
 
     Raises:
-        UserError: the task or its controller is another one.
+        UserError: the task or its controller is not supported.
     """
     if task.control(robot).name == "computed_torque":
         return ZeroAction(robot.n)
@@ -129,7 +129,7 @@ def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     The controller exerts the force in open loop: J^T f plus the friction of its model.
 
     Raises:
-        UserError: the controller is another one, or the task has no contact.
+        UserError: the controller is not control=hybrid, or the task has no contact.
     """
     control = task.control(robot)
     if control.name != "hybrid" or not hasattr(task, "contact"):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 CLIP = 10.0  # largest normalised observation, in standard deviations
-LOG_STD = -5.0, 2.0  # bounds of the logarithm of the actor's scale
+LOG_STD = -5.0, 2.0  # bounds of the logarithm of the actor's standard deviation
 
 
 class Normalizer(nn.Module):
@@ -30,8 +30,8 @@ class Normalizer(nn.Module):
 class Actor(nn.Module):
     """Gaussian whose tanh is the action: observation (B, d) -> loc, scale (B, a).
 
-    Deterministic algorithms use only `mode` and do not train the outputs for the scale. So the policy files of all
-    algorithms have the same format, and compared networks have the same size.
+    Deterministic algorithms use only `mode` and do not train the outputs for the scale. With these outputs, policy
+    files of all algorithms have the same format, and compared networks have the same size.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, hidden: tuple[int, ...]):

@@ -1,4 +1,4 @@
-"""Files of a policy: policy.pt for r2s, policy.onnx for other programs; SI units in and out."""
+"""Files of a policy: policy.pt for r2s, policy.onnx for other programs, both with inputs and outputs in SI units."""
 
 import contextlib
 import io

@@ -3,7 +3,7 @@
 Its model is quasi-static: a frictionless push at a face point p along the inward normal n moves a box with v = n and
 w = (p x n) / r^2 (limit surface of r2s/physics/sliding.py), whatever its mass and friction. From many points on the
 four faces, the pusher selects the one that reduces the error |e|^2 + r^2 e_yaw^2 fastest (steepest descent), minus a
-cost of the way to this point. It has no memory and plans anew in every control period.
+cost of the way to this point. The pusher has no memory and plans anew in every control period.
 """
 
 import numpy as np
@@ -20,22 +20,22 @@ from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
 
 POINTS, EDGE = 9, 0.75  # points per face, and share of a half edge that they span
 CLEAR = 0.02  # m, clearance between tip and box on the way around it
-NEAR = 0.012  # m, lateral error of the tip in front of a face below which it pushes
-WAY = 0.4  # 1/m, cost of the way per length, as a share of the steepest descent
-DONE = 0.008  # m, error below which it stops pushing
-SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, on the way; m, error from which a push slows down
-GAIN = 0.25  # gain of the tip speed feedback, share of the law's damping: 25 Hz and the latency allow little more
+NEAR = 0.012  # m, lateral error of the tip in front of a face, below which the tip pushes
+WAY = 0.4  # 1/m, cost of a point per m of the way to it, as a share of the steepest possible descent
+DONE = 0.008  # m, error below which the pusher stops
+SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, on the way; m, error below which it slows down
+GAIN = 0.25  # gain of the tip speed feedback / damping of the law: 25 Hz and the latency allow little more
 
 
 class Pusher:
     """The pusher for B arms, with the `action` of `r2s.learning.networks.Policy`.
 
     Args:
-        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm; its
-            friction is compensated.
+        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm,
+            whose friction is compensated.
 
     Raises:
-        UserError: the task or its controller is another one.
+        UserError: the task or its controller is not supported.
     """
 
     def __init__(self, robot: Robot, task: PushTask, dynamics: Dynamics):
@@ -83,9 +83,9 @@ class Pusher:
         return np.einsum("bnk,bn->bk", inverse, torque)
 
     def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip velocity (3,) m/s along the table, and the direction (2,) of a push, 0 without a push."""
+        """Return the tip velocity (3,) m/s along the table, and the direction (2,) of the push (none: 0)."""
         c, s = np.cos(box[2]), np.sin(box[2])
-        rotation = np.array([[c, s], [-s, c]])  # from the table to the box
+        rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
         at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), self._reach * error[2]])
         radius, r = self._task.tip_radius, self._reach
         size = float(np.linalg.norm(e))
@@ -117,7 +117,7 @@ class Pusher:
         if not _crosses(at, to, edge + 0.2 * CLEAR):
             return to
         inside = edge + 0.2 * CLEAR - np.abs(at)
-        if (inside > 0).all():  # touching a face: leave along its normal first
+        if (inside > 0).all():  # the tip touches a face: move away along the normal first
             k = int(np.argmin(inside))
             out = at.copy()
             out[k] = np.sign(at[k]) * clear[k]

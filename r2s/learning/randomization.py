@@ -1,4 +1,4 @@
-"""Domain randomization: dynamics drawn around a center, every link tensor physically valid."""
+"""Domain randomization: random dynamics around a center, with physically valid inertia tensors of all links."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from r2s.physics.tip import nominal_plane, tilted
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or one for all arms
 
 DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # drawn fields of a `Surface`
-TRIES = 64  # draws of a tensor; if all are rejected, the center is used
+TRIES = 64  # most draws of a tensor; if all are rejected, the link has the center's tensor
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class UniformRandomization:
     The paper states independent elements within 5 %. Rejection is necessary: where the triangle inequality is tight,
     independent elements yield impossible bodies. At 5 %, the Panda's links 4 and 7 accept every draw. Link 1, a rod
     (I_zz is 0.013 I_xx), accepts 22 %, which correlates I_xx and I_yy by 0.97. Links 2, 3, 5 and 6 accept 47 to 63 %,
-    and no two of their elements correlate by more than 0.6. Each element still spans its 5 %.
+    and no two of their elements correlate by more than 0.6. Each element still spans +-5 %.
 
     Attributes:
         robot: the arm.
-        center: its dynamics, without a batch dimension.
-        phi_relative, inertia_relative: relative half widths; 0: the center itself.
+        center: dynamics of the arm, without a batch dimension.
+        phi_relative, inertia_relative: half widths of the ranges, relative to the center; 0: no variation.
         payload: [least, most] kg, range of each arm's payload, see `with_payloads`; None: no payload.
 
     Raises:
@@ -79,7 +79,7 @@ class UniformRandomization:
 
 @dataclass(frozen=True)
 class PosteriorRandomization:
-    """Draws from the posterior of an identification: rows of `samples` (S, P) of `space`, with their correlations.
+    """Draws from an identification's posterior: whole rows of `samples` (S, P) of `space`, which are correlated.
 
     Every row is physically valid: tensor scales are positive, and the full parametrization has no invalid values.
     payload: see `UniformRandomization`.
@@ -115,7 +115,7 @@ class ForceRandomization:
     after the safety filter.
 
     Attributes:
-        robot: the arm. center: its dynamics, without a batch dimension.
+        robot: the arm. center: dynamics of the arm, without a batch dimension.
         share: largest torque, relative to `Dynamics.level`.
 
     Raises:
@@ -156,10 +156,10 @@ class ContactRandomization(UniformRandomization):
     point ~ point + U(-place, place) normal; normal tilted by U(0, tilt) about a random axis
 
     Attributes:
-        point: (3,) m, normal: (3,), of the nominal plane; None: a table below the tip at home.
-        stiffness: N/m, exponent, damping: s/m, friction, bristle: m, all [least, most], see `Surface`.
-        place: m, largest displacement along the normal. tilt: degrees, the largest.
-        surface: run folder of an identified surface; draws come from its posterior. None: from the ranges.
+        point, normal: (3,) m and (3,), nominal plane; None: a table below the tip at home.
+        stiffness (N/m), exponent, damping (s/m), friction, bristle (m): ranges [least, most], see `Surface`.
+        place: m, largest displacement along the normal. tilt: degrees, largest tilt.
+        surface: run folder of an identified surface, from whose posterior to draw. None: draw from the ranges.
 
     Raises:
         UserError: a range is malformed or outside what a surface allows, or the robot has no tool.
@@ -178,7 +178,7 @@ class ContactRandomization(UniformRandomization):
 
     @cached_property
     def _identified(self) -> Surface | None:
-        """All posterior draws of the identified surface; None: there is none."""
+        """All posterior draws of the identified surface; None without an identified surface."""
         if not self.surface:
             return None
         draws = load_contact(self.surface, "dr.surface").draws
@@ -190,7 +190,7 @@ class ContactRandomization(UniformRandomization):
 
     def __post_init__(self):
         super().__post_init__()
-        _ = self._plane, self._identified  # raise for wrong settings
+        _ = self._plane, self._identified  # raises for wrong settings
         for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
             low = {"stiffness": "(0, inf)", "exponent": "[1, 2]"}.get(name, "[0, inf)")
             check_pair(name, getattr(self, name), low)
@@ -220,7 +220,7 @@ class ContactRandomization(UniformRandomization):
 def posterior_randomization(
     robot: Robot, center: Dynamics, calibration: str | Path | None, payload: Sequence[float] | None = None
 ) -> PosteriorRandomization:
-    """Return the randomization by the posterior in the run folder `calibration`; `center` is not used.
+    """Return the randomization with the posterior in the run folder `calibration`; `center` is ignored.
 
     Raises:
         UserError: there is no such folder, or it has no posterior draws.

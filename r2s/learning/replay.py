@@ -7,12 +7,12 @@ from torch import Tensor
 
 
 class Replay:
-    """The last `size` of all added transitions; transition number k is in row k % size.
+    """Buffer of the last `size` transitions; transition number k is in row k % size.
 
-    It is less general than TorchRL's TensorDictReplayBuffer and takes a fifth of its time (benchmarks/bench.py).
+    It is less general than TorchRL's TensorDictReplayBuffer and needs a fifth of the time (benchmarks/bench.py).
 
     Args:
-        size: capacity in transitions. device: of its tensors.
+        size: capacity in transitions. device: device of the tensors.
 
     Attributes:
         seen: transitions added so far.
@@ -30,7 +30,7 @@ class Replay:
         if not self._rows:  # empty tensors take no memory before they are written to
             self._rows = {k: v.new_empty(self.size, *v.shape[1:], device=self.device) for k, v in transitions.items()}
         count = len(next(iter(transitions.values())))
-        self.seen += max(0, count - self.size)  # transitions that later ones of this call overwrite
+        self.seen += max(0, count - self.size)  # transitions that later ones of this call would overwrite
         count = min(count, self.size)
         first = self.seen % self.size
         fits = min(count, self.size - first)  # the rest continues in row 0

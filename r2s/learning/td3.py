@@ -21,7 +21,7 @@ class TD3(DeterministicLearner):
     Args:
         scale, action_scale, shared: see `DeterministicLearner`.
         n_critics: number of critics; the target uses the smallest of their values, the actor loss the first critic.
-        smoothing_std, smoothing_clip: standard deviation and limit of the noise on the target's action.
+        smoothing_std, smoothing_clip: standard deviation and limit of the noise on the action in the target.
         policy_delay: critic updates per update of the actor and of the target networks.
     """
 
@@ -57,7 +57,7 @@ class TD3(DeterministicLearner):
         return {"loss_critic": self._critic_loss(batch, noise), "loss_actor": self._actor_loss(batch)}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step; return the losses, with the last actor loss if this update has none."""
+        """Do one gradient step; return the losses, with the previous actor loss if this update has none."""
         critics, actor = list(self.critics.parameters()), list(self.actor.parameters())
         out, gradients = self._critic_gradients(batch, torch.randn_like(batch["action"]))
         due = self.updates % self.policy_delay == 0  # also in the first update: every logged row has an actor loss

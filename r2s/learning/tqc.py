@@ -19,7 +19,7 @@ class TQC(EntropyLearner):
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.
-        n_critics, n_quantiles: numbers of critics, and of atoms of each. drop_per_critic: omitted atoms per critic.
+        n_critics, n_quantiles: numbers of critics, of atoms per critic. drop_per_critic: omitted atoms per critic.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class TQC(EntropyLearner):
 
 
 def quantile_huber(quantiles: Tensor, target: Tensor) -> Tensor:
-    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): its mean over pairs, summed over C.
+    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): mean over pairs, summed over critics.
 
     A pair with difference delta = target - quantile costs |tau - [delta < 0]| huber(delta). tau is the fraction of
     the quantile, huber(delta) is delta^2 / 2 within 1 and |delta| - 1/2 beyond.

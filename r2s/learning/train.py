@@ -1,10 +1,10 @@
 """The training loop of all algorithms: act, step all arms, store, update, evaluate at intervals.
 
-The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows the share spent.
-With env_steps alone, runs of one seed and one number of threads are equal bit for bit, even if stopped and resumed.
+The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows the spent share.
+With env_steps alone, runs with equal seeds and numbers of threads are equal bit for bit, even if stopped and resumed.
 With minutes, the curriculum depends on the clock.
 
-The arms step in their own thread while the learner updates, so updates draw from the transitions before that step. On
+The arms step in their own thread while the learner updates, so updates use the transitions before this step. On
 one core, step and updates alternate with the same result. One shared team of OpenMP threads would be slower for both:
 after an update these threads spin for milliseconds on the cores that the physics then needs, and on a busy machine
 each of their barriers waits for a thread that the system has suspended.
@@ -40,7 +40,7 @@ class Budget:
     """The length of a training: minutes of wall clock or env_steps, whichever ends first.
 
     Raises:
-        UserError: neither is given, or a value is not positive.
+        UserError: neither minutes nor env_steps is given, or a value is not positive.
     """
 
     minutes: float | None
@@ -72,7 +72,7 @@ class Loop:
         lr_decay, lr_end: from the share lr_decay of the budget on, the learning rate falls linearly to lr_end times
             its initial value.
         explore_end: factor to which the standard deviation of exploration falls geometrically over the budget.
-        eval_env_steps: environment steps between two evaluations; another evaluation ends the training.
+        eval_env_steps: environment steps between two evaluations; a training ends with one more evaluation.
         compile: compile the losses first, within the budget. concurrent: step the arms in their own thread.
         matmul: precision of matrix products in updates, see torch.set_float32_matmul_precision. "medium" rounds their
             factors to bfloat16 if the processor has instructions for it; "auto": see `fastest_matmul`.
@@ -117,8 +117,8 @@ class Callbacks:
     """Functions that a training calls.
 
     Attributes:
-        log: gets each row of metrics.csv. evaluated: gets each row of evaluations.csv.
-        progress: gets the spent share of the budget and the numbers to show, after every step.
+        log: called with each row of metrics.csv. evaluated: called with each row of evaluations.csv.
+        progress: called after every step, with the spent share of the budget and the numbers to show.
     """
 
     log: Callable[[dict], None] = lambda row: None
@@ -181,7 +181,7 @@ class Training:
     """The state of a training: arms, learner, replay buffer and counters; arguments as in `train`.
 
     Attributes:
-        env_steps, updates: counters. next_eval: environment steps of the next evaluation.
+        env_steps, updates: counters. next_eval: value of env_steps from which the next evaluation is due.
         factor: last result of `Reward.adapt`, `Reward.factor` at first. evaluation: the last row of evaluations.csv.
     """
 
@@ -312,14 +312,14 @@ def generators(device: torch.device) -> dict[str, torch.Tensor]:
 
 
 def set_generators(states: Mapping[str, Any], device: torch.device) -> None:
-    """Restore what `generators` returned, except generators that this device does not use."""
+    """Restore a result of `generators`, except generators that this device does not use."""
     torch.set_rng_state(states["torch"])
     if device.type == "cuda" and "cuda" in states:
         torch.cuda.set_rng_state(states["cuda"], device)
 
 
 def keep_memory() -> None:
-    """Make glibc keep freed memory: otherwise it returns large blocks, which every update must page in again."""
+    """Make glibc keep freed memory: otherwise glibc returns large blocks, and updates must page them in."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
@@ -329,7 +329,7 @@ def keep_memory() -> None:
 
 
 def fastest_matmul(device: torch.device) -> str:
-    """Return the `matmul_precision` of the fastest updates: bfloat16, "medium", if the device has units for it.
+    """Return the precision for the fastest updates: "medium" (bfloat16) if the device has bfloat16 units.
 
     With AVX-512 alone, for networks of 128 to 256 units, rounding the factors costs as much time as the faster
     products save (benchmarks/results/speed.md).

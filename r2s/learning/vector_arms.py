@@ -19,17 +19,17 @@ class VectorArms:
     """`width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
     Every ms of a control period: command -> control law -> soft start, low-pass, clip, rate limit -> safety filter ->
-    delay and lag -> physics. Kinematics follow at its end. A `State` has true speeds and, separately, sensor noise.
+    delay and lag -> physics. Kinematics follow afterwards. A `State` has true speeds and, separately, sensor noise.
 
     Attributes:
         speeds: None, because true speeds need no smoothing.
 
     Args:
         robot, task: the arm, and the task with its controller.
-        dynamics: of `width` arms, or of one arm for all.
+        dynamics: dynamics of `width` arms, or of one arm for all arms.
         nthread: threads, 0: all cores.
         soft_start_s: s, fade-in of an episode's torque.
-        seed: of the sensor noise, which restarts whenever all arms are placed.
+        seed: seed of the sensor noise, which restarts whenever all arms are placed.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class VectorArms:
         return {"sim": self.sim.state()} | own | {"_rng": self._rng.bit_generator.state}
 
     def set_state(self, state: Mapping) -> None:
-        """Restore what `state` returned; the same commands then give the same states, bit for bit."""
+        """Restore a result of `state`; the same commands then lead to the same states, bit for bit."""
         self.sim.set_state(state["sim"])
         self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
         for name in NOISES:

@@ -25,7 +25,7 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
     Args:
         target: Nm, in this cycle. filtered, effort: Nm, of the previous cycle. cycle: number of this cycle, from 1.
         factor: gain of the low-pass. fade: duration of the soft start, cycles.
-        tau_max: Nm. step_max: Nm per cycle.
+        tau_max: Nm, largest effort. step_max: Nm, largest change of the effort per cycle.
     """
     faded = target
     if cycle < fade:
@@ -63,7 +63,7 @@ class Actuation:
         last: (m, n) Nm, the effort, after all four stages. filtered: (m, n) Nm, after the low-pass.
 
     Args:
-        robot: its torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
+        robot: sets torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
         soft_start_s: s, time over which the torque of a motion fades in; 0: no fade.
     """
 

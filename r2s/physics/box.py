@@ -1,4 +1,4 @@
-"""Pose of a box on a table, for the task that pushes it, for domain randomization and for twins."""
+"""Poses and properties of a box on a table, for the push task, domain randomization and twins."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -53,7 +53,7 @@ class TableFrame:
         return np.concatenate([centre, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1) @ self.axes], axis=-1)
 
     def moved(self, pose: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Return poses (m, 6), moved by (m, 3): x m, y m and yaw rad in this frame."""
+        """Return poses (m, 6), displaced by `by` (m, 3): x m, y m and yaw rad in this frame."""
         c, s = np.cos(by[:, 2:]), np.sin(by[:, 2:])
         first, up = pose[:, 3:], self.axes[2]
         turned = c * first + s * np.cross(up, first)  # `first` is perpendicular to `up`
@@ -75,7 +75,7 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
     """Return boxes that stand on a table.
 
     Args:
-        frame: of the table. planar: (..., 3), x m, y m and yaw rad in it. size: (3,) m, edges.
+        frame: frame of the table. planar: (..., 3), x m, y m, yaw rad in this frame. size: (3,) m, edges.
         law: mass, table, friction, stiffness, damping, bristle and exponent of `Surface`.
     """
     half = 0.5 * np.array(size, dtype=float)

@@ -1,8 +1,8 @@
 """Compiled collision check of many arms with themselves and the table.
 
 The bodies are the geoms of the robot's file. If the file lets some geoms collide, the others are visual and ignored.
-Planes and height fields are ignored as surroundings. A mesh counts as its convex hull, as in MuJoCo, and a signed
-distance field as its bounding sphere. These pairs are not checked:
+Planes and height fields are ignored as surroundings. Meshes are replaced by their convex hulls, as in MuJoCo,
+and signed distance fields by their bounding spheres. These pairs are not checked:
 
 - with the table: geoms of the base, and of links that only vertical joints move; their height never changes.
 - of two links: neighbours, which touch at their joint, and geoms closer than HOUSING_M at q_home. The latter are
@@ -27,12 +27,12 @@ from r2s.physics.robot import Robot
 
 TABLE_M = 0.0  # m, default height of the table in the base frame
 HOUSING_M = 0.045  # m, geoms closer than this at q_home are parts of one joint's housing
-LINK, LOCAL, WIDTH = BODY, BODY + 1, BODY + 1 + POSE  # columns of a body: its link (-1: the base), its pose in it
+LINK, LOCAL, WIDTH = BODY, BODY + 1, BODY + 1 + POSE  # columns of a body: link (-1: the base), pose in the link
 
 
 @dataclass(frozen=True)
 class CollisionPairs:
-    """The pairs of a model to check.
+    """The pairs of a model's geoms to check.
 
     Attributes:
         above: geoms to keep above the table. pairs: pairs of geoms to keep apart, obstacles first.
@@ -86,7 +86,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Bodies (G, WIDTH), hull vertices (V, 3), body rows of `above` (A,) and `pairs` (P, 2); table height, m."""
+    """Geometry: bodies (G, WIDTH), hull vertices (V, 3), body rows of `above` (A,), `pairs` (P, 2), table m."""
 
     bodies: np.ndarray
     vertices: np.ndarray
@@ -99,7 +99,7 @@ class CollisionCheck:
     """Collision check of many arms; called with q (m, n) rad, it returns (m,) bool.
 
     Attributes:
-        names: of the checked pairs, such as "link 'link5' and link 'link1'", in the order of `first_contact`.
+        names: the checked pairs, such as "link 'link5' and link 'link1'", in the order of `first_contact`.
         links, scene: arguments of the compiled functions below.
 
     Args:

@@ -10,10 +10,10 @@ Tangential force: bristles whose stiffness is proportional to the normal force F
 40(3), 1995). With z_s = `bristle`, the deflection z follows dz/dt = v - |v| z / z_s, in backward Euler. The force
 -mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; in sliding it is mu F.
 
-The unknowns are the joint velocities at the end of the step. About a guess, both forces are linear in them: their
-constant part adds to the driving torque, a matrix to the mass matrix. The stick-slip law solves this system, so that
-a joint at rest sees the contact. `start_guess` begins; `add_contact`, the solution and `next_guess` repeat until the
-guess is right, usually once; `finish_contact` ends the step.
+The unknowns are the joint velocities at the end of the step. Both forces are linearized in them about a guess: the
+constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law solves this system,
+so contact forces can start a joint at rest. `start_guess` makes the first guess; `add_contact`, the solution and
+`next_guess` repeat until the guess is accurate, usually once; `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -64,10 +64,10 @@ MARGIN = 1e-3  # m, a tip farther away cannot touch within a step: this would ta
 FAR = 0.02  # m, a tip farther away would need 20 m/s to touch within a step
 ROUNDS = 12  # largest number of guesses in a step
 TOLERANCE = 1e-4  # relative error of the normal force at which the guesses end
-LATE = 1e-2  # share of the normal force: allowed error of the tangential force, which uses the guessed load and speed
-BOX_LATE = 1e-3  # share of the table's friction: its allowed error, because it uses the guessed speed of the box
+LATE = 1e-2  # allowed error of the tangential force over the normal force; a guess of load and speed causes it
+BOX_LATE = 1e-3  # allowed relative error of table friction; the guessed speed of the box causes it
 NEGLIGIBLE = 1e-6  # N
-SHORT = 1e-6  # share of the depth; on a shorter path V(d1) - V(d0) is round-off, so the force at its middle is used
+SHORT = 1e-6  # share of the depth; on a shorter path V(d1) - V(d0) is round-off, so the force at mid-path is used
 
 
 @njit(cache=True, error_model="numpy")
@@ -265,7 +265,7 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
-    """Add the contact with a box; held: N, normal force and minus tangential force (3) if the box did not yield."""
+    """Add the contact with a box; held: N, normal force and minus tangential force (3) at unchanged box velocity."""
     n, at = contact[NORMAL : NORMAL + 3], np.empty(3)
     for k in range(3):
         at[k] = held[0] * n[k] - held[1 + k]
@@ -311,7 +311,7 @@ def next_guess(contact, jacobian, h, coming, guess):
 
 @njit(cache=True, error_model="numpy")
 def finish_contact(contact, h, guess):
-    """Write the force of a solved step and the deflection after it, and move the box."""
+    """Write the contact force and the bristle deflection of a solved step, and move the box."""
     spring, damper, force = guess[SPRING], guess[DAMPER], guess[LINEAR]
     _deflect(contact, guess[SLID : SLID + 3], guess[SPEED], h, (force, spring, damper))
     if contact[MASS] > 0.0:
@@ -320,7 +320,7 @@ def finish_contact(contact, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _deflect(contact, slide, speed, h, terms):
-    """Write the force by terms (normal force, spring, damper), and the deflection after h s at `slide` (3,) m/s."""
+    """Write the force from terms (normal force, spring, damper), and the deflection after h s at `slide` (3,) m/s."""
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0
     z = contact[DEFLECTION : DEFLECTION + 3]
@@ -334,7 +334,7 @@ def _deflect(contact, slide, speed, h, terms):
 
 @njit(cache=True, error_model="numpy")
 def explicit_contact(contact, jacobian, dq, h):
-    """Write force and deflection of an explicit step, which must be much shorter than the contact's oscillation."""
+    """Write force and deflection of an explicit step; h must be much shorter than the contact's oscillation."""
     tangent = np.empty(3)
     rate, speed = _velocity(jacobian, dq, tangent)
     if contact[MASS] > 0.0:

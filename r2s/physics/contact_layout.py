@@ -1,4 +1,4 @@
-"""Columns of the arrays `contact` and `guess` in contact.py and sliding.py; `contact` from a surface."""
+"""Column numbers of the arrays `contact` and `guess` (contact.py, sliding.py); a `Surface` as a `contact` array."""
 
 import numpy as np
 
@@ -7,31 +7,31 @@ from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 
-# Columns of a contact: surface (see `Surface`), tool, and what a step writes
+# Columns of `contact`: the surface (see `Surface`), the tool, and the results of a step
 K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
-# HALF: 0 for a plane. AXES: row by row. NORMAL: for a box, the surface normal at the tip
+# HALF: half edges, 0 for a plane. AXES: matrix, row by row. NORMAL: for a box, the surface normal at the tip
 HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
-# Of a box that moves on a table (sliding.py); MASS 0: the surface is fixed. WEIGHT: N. TABLE: friction coefficient.
-# REACH: m, moment over force of the table's friction. UP: normal of the table. VELOCITY, SPIN: of the centre, m/s,
-# and about UP, rad/s. STRAIN: elastic deflection on the table (4), m; the last one is REACH times an angle. ARM: from
-# the centre to the contact, m. LOAD: N, friction of the table in sliding.
+# Columns for a box that slides on a table (sliding.py). MASS: 0 for a fixed surface. WEIGHT: N. TABLE: friction
+# coefficient. REACH: m, moment over force of table friction. UP: table normal. VELOCITY (3): m/s, centre. SPIN:
+# rad/s, about UP. STRAIN (4): m, elastic deflection on the table; the fourth value is REACH times an angle. ARM (3):
+# m, vector from the centre to the contact. LOAD: N, table friction while the box slides.
 MASS, INERTIA, WEIGHT, TABLE, REACH, UP = range(DEPTH + 1, DEPTH + 7)
 VELOCITY, SPIN, STRAIN, ARM, LOAD = UP + 3, UP + 6, UP + 7, UP + 11, UP + 14
 COLUMNS = LOAD + 1
-ROWS = 4  # of the Jacobian: normal, and the tangential part of x, y and z
-# Columns of a guess. RATE and SLIDE (3): penetration rate and tangential velocity before the step. NEXT, SPEED: guess
-# of rate and sliding speed after it. BEGIN: m, depth d0. LINEAR, SLID (3): force and velocity of the solution.
+ROWS = 4  # rows of the Jacobian: normal direction, then the tangential parts of x, y and z
+# Columns of `guess`. RATE, SLIDE (3): penetration rate and tangential velocity before the step. NEXT, SPEED: guessed
+# rate, sliding speed after the step. BEGIN: m, depth d0. LINEAR, SLID (3): solved normal force, tangential velocity
 RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE = 0, 1, 4, 5, 6, 7, 8
 SPRING, DAMPER, LINEAR, SLID = 9, 10, 11, 12
-# With a box: tip velocity before the step (3), contact force if the tip keeps it (3) N, decrease of that force per
-# change of tip velocity (9) N s/m, velocity and spin of the box after the step (4), and the guess of its speed
+# With a box: tip velocity before the step (3), contact force at unchanged tip velocity (3) N, decrease of this force
+# per change of tip velocity (9) N s/m, velocity and spin of the box after the step (4), guessed speed of the box
 TIP_BEGIN, FORCE_BEGIN, RESISTANCE = SLID + 3, SLID + 6, SLID + 9
 BOX_END, BOX_SPEED = RESISTANCE + 9, RESISTANCE + 13
 GUESS = BOX_SPEED + 1
 
 
 def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
-    """Return the contact columns (..., COLUMNS) of a surface and the robot's tool, before the first step.
+    """Return the array `contact` (..., COLUMNS) for a surface and the robot's tool, before the first step.
 
     Raises:
         UserError: the robot has no tool, or a value of the surface is out of its range.
@@ -65,5 +65,5 @@ def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
 
 
 def box_pose(contact: np.ndarray) -> np.ndarray:
-    """Return the pose (..., 6), centre m and first axis, of the box in contacts (..., COLUMNS)."""
+    """Return the pose (..., 6) of the box, centre, m, and first axis; contact: (..., COLUMNS)."""
     return np.concatenate([contact[..., POINT : POINT + 3], contact[..., AXES : AXES + 9 : 3]], axis=-1)

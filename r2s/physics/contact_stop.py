@@ -1,17 +1,17 @@
-"""What the driver does with the contact force when it stops an arm whose tip presses: hold, release or retreat.
+"""Stop of an arm whose tip presses on a surface: the driver holds the contact force, releases it, or retreats.
 
-If a stop only removed the command, the surface would return its energy F^2 / 2k and throw the tip off by up to F / k,
-and joint friction would hold up to `hidden` of the force (push_limit.py). So a stop has a target torque:
+If a stop only removed the command, the surface would return its elastic energy F^2 / 2k and push the tip off by up to
+F / k, and joint friction would sustain a force of up to `hidden` (push_limit.py). So a stop commands a target torque:
 
 - hold: J^T R, with the force R that the push limit estimated when the stop began. Nothing moves.
-- release: the tip moves outwards at LEAVE until the force is gone. A velocity loop follows the joint speeds of least
-  kinetic energy, -LEAVE m M^-1 J^T. Resistance and joint friction are fed forward, and an integral adds up to the
-  same friction again, for an arm with more of it. The friction h of joints that move outwards pushes inwards, so R =
-  F - h. The motion ends at R = RELEASED - SLIDES h with the modelled h, that is at F <= RELEASED + (1 - SLIDES) h if
-  friction is at most h; if friction is only SLIDES h, the tip is then in the air.
-- retreat: as release, then RETREAT_M farther.
+- release: the tip moves outwards at the speed LEAVE until the force is gone. A velocity loop tracks the joint speeds
+  of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains R and the modelled joint friction; an integral
+  adds up to the same friction again, for an arm with more friction. While the joints move outwards, their friction h
+  pushes the tip inwards, so R = F - h. The motion ends at R = RELEASED - SLIDES h with the modelled h. Then F <=
+  RELEASED + (1 - SLIDES) h if the true friction is at most h, and F <= RELEASED if it is only SLIDES h.
+- retreat: the tip is released, then moves RETREAT_M farther outwards.
 
-The limits of push, speed and acceleration apply to every stop, which ends after LEAVES_S.
+Every stop obeys the limits of push, speed and acceleration, and all outward motion ends after LEAVES_S.
 """
 
 import numpy as np
@@ -22,22 +22,22 @@ from r2s.physics.push_limit import FELT, HEIGHT, HOLD, LEAVE, PHASE, PULL, RESIS
 from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
-RELEASED = 0.5  # N, a smaller force counts as released
-SLIDES = 0.25  # friction of slowly sliding joints over their breakaway level; 0.35 with conf/friction/paper
-RETREAT_M = 0.01  # m; the tip has come from `task.clearance` = 15 mm above the plane
-LEAVES_S = 0.4  # s; 0.1 s is left to brake, and 20 N on the softest surface of conf/dr/contact.yaml are 10 mm deep
-MOST = 0.25  # largest share of its allowed speed at which a joint moves the tip outwards
-GAIN = 0.5 * RATE  # 1/s, of the velocity loop: it leaves half of the latency budget to what resists
+RELEASED = 0.5  # N, a tip with a smaller contact force is released
+SLIDES = 0.25  # ratio of friction in slow sliding to breakaway friction; 0.35 with conf/friction/paper
+RETREAT_M = 0.01  # m; this space is free, as the tip came from `task.clearance` = 15 mm above the plane
+LEAVES_S = 0.4  # s; then 0.1 s is left to brake. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml
+MOST = 0.25  # largest share of a joint's allowed speed that the outward motion uses
+GAIN = 0.5 * RATE  # 1/s, gain of the velocity loop: half of the latency budget remains for the resistance
 BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
 
 @njit(cache=True, error_model="numpy")
 def stop_torque(limit, arm, kinematics, friction, limits, held, target):
-    """Write the target torque (n,) Nm in a cycle of a stop; return the share of the allowed speeds that it needs.
+    """Write the target torque (n,) Nm for a cycle of a stop; return the share of the allowed joint speeds it uses.
 
     Args:
         limit, arm, kinematics, friction: see `push_bound`. limits: see `filter_limits`.
-        held: (n,) Nm that an adapter adds to hold a load; R counts them as resistance of the surface.
+        held: (n,) Nm, torque by which an adapter holds a load; R contains it as resistance, so it is subtracted.
     """
     n = len(target)
     root, row, lever, ddq = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
@@ -46,7 +46,7 @@ def stop_torque(limit, arm, kinematics, friction, limits, held, target):
     unpack(arm.mass, 1.0, ddq, root)
     factor(root, root)
     solve(root, lever)
-    mobility, behind, share, kept = 0.0, 0.0, 0.0, 0.0  # behind: N, friction of the joints that move outwards
+    mobility, behind, share, kept = 0.0, 0.0, 0.0, 0.0  # behind: N, h of the module's docstring
     for j in range(n):
         mobility += row[j] * lever[j]
         kept += lever[j] * held[j]

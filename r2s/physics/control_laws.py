@@ -7,7 +7,7 @@ A control law is a compiled function
     q, dq       (n,) rad, rad/s, measured in this cycle
     command     (c,), set once per control period: the policy's action in SI units, then the setpoint of the task
     parameters  (p,), fixed for a motion
-    memory      (k,), the law's own state; zeros when a motion begins
+    memory      (k,), state of the law; zeros when a motion begins
     out         (n,) Nm, the target torque, without gravity
 
 The same function runs in MuJoCo's callback during training (mujoco_callback.py), in the driver of every arm
@@ -52,7 +52,7 @@ def torque_law(q, dq, command, parameters, memory, out):
 
 @njit(cache=True, error_model="numpy")
 def computed_torque_law(q, dq, command, parameters, memory, out):
-    """Write the computed torque: feedforward, and a critically damped PD law weighted with the mass matrix.
+    """Write the computed torque: feedforward plus a critically damped PD law, weighted with the mass matrix.
 
     tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)), updated every `hold` cycles.
 
@@ -127,7 +127,7 @@ def _run_built_in(number, q, dq, command, parameters, memory, out):
 
 
 def run_law(law: Callable, q: np.ndarray, dq: np.ndarray, command: np.ndarray, parameters: np.ndarray, memory: int):
-    """Return the torques (m, n) Nm of m arms in the first cycle of a motion: q, dq (m, n), command (m, c)."""
+    """Return the torques (m, n) Nm of m arms in the first cycle of a motion, for q, dq (m, n) and command (m, c)."""
     out = np.empty(q.shape)
     q, dq = np.ascontiguousarray(q), np.ascontiguousarray(dq)  # one type of arrays, so that numba compiles once
     if law in BUILT_IN:

@@ -1,8 +1,8 @@
-"""Distance of convex bodies, compiled: spheres, capsules, cylinders, boxes, ellipsoids and convex hulls.
+"""Compiled distance of two convex bodies: spheres, capsules, cylinders, boxes, ellipsoids and convex hulls.
 
 A body is a core, described by its support function, and a radius around it. The distance of two cores follows
 Gilbert, Johnson and Keerthi (IEEE J. Robot. Autom. 4(2), 1988), with the simplex cases of Ericson (Real-Time
-Collision Detection, 2005, ch. 5); it ends once a lower bound of the distance exceeds `enough`.
+Collision Detection, 2005, ch. 5). The iteration ends early if a lower bound of the distance exceeds `enough`.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from r2s.compiled import njit
 
 # Columns of a body: kind, radius around the core, half sizes of the core, first vertex and number of vertices, radius
-# of its bounding sphere.
+# of the bounding sphere.
 KIND, RADIUS, SIZE, FIRST, COUNT, BOUND, BODY = 0, 1, 2, 5, 6, 7, 8
 POINT, SEGMENT, CYLINDER, BOX, ELLIPSOID, HULL = range(6)
 CLOSE = 1e-7  # m, gap between upper and lower bound at which the iteration ends
@@ -98,9 +98,9 @@ def _segments(a, p, b, r):
 
 @njit(cache=True, error_model="numpy")
 def _nearest(s, count, t):
-    """Return the point nearest to the origin in a simplex s (4, 3) of `count` corners, and the number that span it.
+    """Return the point of a simplex that is nearest to the origin, and the number of corners that span this point.
 
-    The spanning corners move to the front of s. With 4 of them the origin is inside. t: (6, 3), any content.
+    s: (4, 3), `count` corners; the spanning ones move to the front. 4: the origin is inside. t: (6, 3), any content.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1

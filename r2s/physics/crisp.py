@@ -1,7 +1,7 @@
-"""Friction parameters for crisp_controllers: the YAML of a ROS 2 controller, with the paper's eq. (5).
+"""Export of friction parameters to the YAML of crisp_controllers (ROS 2), in the form of the paper's eq. (5).
 
 The controllers (github.com/utiasDSL/crisp_controllers) add fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
-fp3)) to each joint's torque. The sigmoid family is the same law; other families are approximated by it.
+fp3)) to each joint's torque. The sigmoid family is the same law; for other families, r2s fits this law.
 """
 
 from pathlib import Path
@@ -14,8 +14,8 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import SIGMOID
 from r2s.physics.robot import Robot
 
-SPEEDS, SLOWEST = 100, 0.01  # number of fitted speeds per direction, up to dq_max; the slowest one over dq_max
-STEEPEST = 100.0  # s/rad, fp2 at most: a steeper step is chatter for a controller that filters dq
+SPEEDS, SLOWEST = 100, 0.01  # number of fitted speeds per direction, from SLOWEST dq_max to dq_max
+STEEPEST = 100.0  # s/rad, largest fp2: a controller that filters dq chatters with a steeper step
 
 
 def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
@@ -25,11 +25,11 @@ def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
 
 
 def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return phi (n, 3) closest to an arm's friction, and the RMS error (n,) Nm over speeds up to dq_max."""
+    """Return phi (n, 3) that fits an arm's friction best, and the RMS error (n,) Nm over speeds up to dq_max."""
     share = np.geomspace(SLOWEST, 1.0, SPEEDS)
     dq = np.concatenate([-share[::-1], share])[:, None] * robot.dq_max
     true = dynamics.friction(dq, np.sign(dq))
-    if dynamics.family is SIGMOID and not dynamics.phi[:, 3:].any():  # no viscous friction beside it
+    if dynamics.family is SIGMOID and not dynamics.phi[:, 3:].any():  # without viscous friction: the same law
         return dynamics.phi[:, :3], np.zeros(robot.n)
     out = np.empty((robot.n, 3))
     for j in range(robot.n):
@@ -39,14 +39,14 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
         def error(x: np.ndarray, j: int = j) -> np.ndarray:
             return sigmoid_law(dq[:, j], x) - true[:, j]
 
-        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # like viscous, and like Coulomb friction
+        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # similar to viscous and to Coulomb friction
         fits = [least_squares(error, start, bounds=bounds, x_scale="jac") for start in starts]
         out[j] = min(fits, key=lambda fit: fit.cost).x
     return out, np.sqrt(np.mean((sigmoid_law(dq, out) - true) ** 2, axis=0))
 
 
 def write_crisp(path: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write the friction parameters of `ros__parameters`, with the error of the fit as a comment."""
+    """Write a YAML file with the friction in `ros__parameters`, and the fit's error as a comment."""
     phi, rms = fit_sigmoid(robot, dynamics)
     level = np.maximum(dynamics.family.level(dynamics.phi, robot.dq_max), 1e-9)
     errors = ", ".join(f"{e:.3g} ({100 * e / x:.0f} %)" for e, x in zip(rms, level, strict=True))

@@ -1,4 +1,4 @@
-"""Robot descriptions in three formats: MJCF, URDF and SDF with the same links, limits and friction.
+"""Writers of robot descriptions in MJCF, URDF and SDF, with the same links, limits and friction.
 
 Masses, centres of mass, inertia tensors, rotor inertias and friction are the identified ones; all other values are
 those of `robot`. In URDF and SDF a link's frame is its joint's frame at angle zero, so inertia tensors need
@@ -19,7 +19,7 @@ from r2s.physics.urdf import GEAR, ROTOR
 from r2s.physics.welds import Bodies, about, make_pose, rotation
 
 ENDLESS = 1e16  # rad, SDF's value for no limit
-HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` in URDF: DART gives a link without inertia 1 kg and 1 kg m^2
+HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` in URDF: without them, DART assumes 1 kg and 1 kg m^2
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class Link:
     Attributes:
         name, joint: names of the link and of its joint.
         origin: (4, 4) pose of the joint in the parent link's frame, at angle zero.
-        axis: (3,) in the joint's frame.
+        axis: (3,) joint axis, in the joint's frame.
         mass: kg. com: (3,) m, in the link's frame. inertia: (3, 3) kg m^2 about `com`, link axes.
-        damping: (3,) coefficients of MuJoCo's polynomial, first Nm s/rad. friction: Nm, Coulomb. armature: kg m^2.
-        stiffness: (3,) coefficients of a spring, the first Nm/rad; its torque is 0 at springref, rad.
+        damping: (3,) coefficients of a polynomial, the first in Nm s/rad. friction: Nm, Coulomb. armature: kg m^2.
+        stiffness: (3,) coefficients of the joint's spring, the first in Nm/rad. springref: rad, zero-torque angle.
     """
 
     name: str
@@ -54,7 +54,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
 
     Args:
         robot: the arm. dynamics: masses, centres of mass, inertia tensors, rotor inertias, friction.
-        friction: True approximates it by Coulomb and viscous terms that match it at 30 % and 100 % of dq_max.
+        friction: whether links get Coulomb and viscous terms, which match the friction at 30 % and 100 % of dq_max.
     """
     model = robot.model(gravity=True)
     bodies, moving = Bodies(model), model.jnt_bodyid
@@ -99,7 +99,7 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf; return a message for each format that cannot represent the arm.
 
-    An arm with armature gets no arm.sdf and no message about it: SDF has no rotors, and most arms have some.
+    SDF has no rotors, so an arm with armature gets no arm.sdf; as most arms have armature, there is no message.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
@@ -143,7 +143,7 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as URDF with a link `ee` at the end effector; armature becomes Drake's rotor inertia.
 
-    URDF itself has no armature: r2s and Drake read this element, other readers ignore it.
+    URDF itself has no armature. r2s and Drake read Drake's element; other readers ignore it.
 
     Raises:
         UserError: a joint has a spring or nonlinear damping, which URDF cannot represent.
@@ -168,7 +168,7 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
 
 
 def urdf(robot: Robot, links: list[Link]) -> ET.Element:
-    """Return the root element of a URDF with `links` (of `chain`) and the limits of `robot`."""
+    """Return the root element of a URDF with `links` from `chain` and the limits of `robot`."""
     root = ET.Element("robot", name=robot.name)
     ET.SubElement(root, "link", name="base")
     parent = "base"
@@ -219,9 +219,9 @@ def write_world(
 ) -> None:
     """Write the SDF world that r2s/engines/gazebo.py and gazebo_classic.py simulate.
 
-    Its steps take 1 ms, without a real-time limit. It has no gravity (libfranka's convention), no limits of velocity
-    or torque (the driver enforces them), and no friction (r2s applies it as a torque). SDF has no rotors, so a rotor
-    becomes the damping armature / 1 ms, whose torque the engines cancel.
+    A step is 1 ms, without a real-time limit. The world has no gravity (libfranka's convention), no limits of
+    velocity or torque (the driver enforces them), and no friction (r2s applies it as a torque). SDF has no rotors, so
+    each rotor becomes joint damping of armature / 1 ms, and r2s/engines cancels the torque of this damping.
 
     Args:
         path: file. robot, dynamics: the arm. plugin: the world's plugin element. version: version of SDF.
@@ -280,7 +280,7 @@ def _polynomial(coefficients: np.ndarray) -> str:
 
 
 def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
-    """Raise UserError for nonlinear damping or springs, and for linear springs if the format has none (`springs`)."""
+    """Raise UserError for nonlinear damping or springs; unless `springs`, also for linear springs."""
     for link in links:
         nonlinear = link.damping[1:].any() or link.stiffness[1:].any()
         if nonlinear or (link.stiffness.any() and not springs):
@@ -324,7 +324,7 @@ def pose_words(pose: np.ndarray) -> str:
 
 
 def words(values: np.ndarray) -> str:
-    """Return numbers as text from which the same floats can be read."""
+    """Return numbers as text that reads back as the same floats."""
     return " ".join(repr(float(v)) for v in values)
 
 

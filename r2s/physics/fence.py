@@ -1,13 +1,13 @@
-"""The driver's fence: it stops an arm before the arm touches itself or the table. Compiled, a few microseconds.
+"""The driver's fence stops an arm before it touches itself or the table; the compiled check takes microseconds.
 
-The fence predicts the posture in which the arm would come to rest if it braked now. There no pair of `CollisionCheck`
-may be nearer than FENCE_M, at full speed FENCE_M (1 + SPREAD), because links swing while they brake. The safety
-filter brakes along a ramp of BRAKE_S, which a joint follows LAG_S late. A joint with a smaller share of its allowed
-speed than the fastest one begins to brake when the ramp has fallen to that share. The predicted posture moves
-continuously with the arm, so it cannot pass through an obstacle between two cycles.
+The fence predicts the posture in which the arm would come to rest if it braked now. In this posture, no pair of
+`CollisionCheck` may be closer than FENCE_M; at full speed, than FENCE_M (1 + SPREAD), because links swing while they
+brake. A stop ramps the allowed speeds down within BRAKE_S, and joints follow the ramp LAG_S late. A joint that uses a
+smaller share of its allowed speed than the fastest joint starts to brake when the ramp has fallen to this share. The
+predicted posture moves continuously with the arm, so it cannot pass through an obstacle between two cycles.
 
-An arm that starts nearer may move away: the allowed distance of a pair is half of the pair's largest distance so far
-in the motion, at most FENCE_M. Pairs that overlap at the start are ignored until they are apart.
+An arm that starts closer may move away: the allowed distance of a pair is half of the pair's largest distance so far
+in the motion, at most FENCE_M. A pair that overlaps at the start is ignored until it is apart.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ LAG_S = 1 / RATE + LATENCY_S  # s, lag of a joint's speed behind the ramp
 
 
 class Fence(NamedTuple):
-    """Geometry for `breached`: links of `links_of`, and the scene of a `CollisionCheck`."""
+    """Geometry for `breached`: links from `links_of`, and the scene of a `CollisionCheck`."""
 
     links: np.ndarray
     scene: Scene
@@ -34,7 +34,7 @@ class Fence(NamedTuple):
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
     """Return the number (E,) of the pair for which the driver would stop each motion q, dq (E, T, n), -1 for none.
 
-    limits: (n, COLUMNS) of `filter_limits`.
+    limits: (n, COLUMNS) from `filter_limits`.
     """
     fence, out = Fence(check.links, check.scene), np.full(len(q), -1)
     for e in range(len(q)):
@@ -47,12 +47,12 @@ def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq:
 
 @njit(cache=True, error_model="numpy")
 def breached(fence, limits, q, dq, least):
-    """Return the number of the first pair that would come too near if the arm braked now, -1 for none.
+    """Return the number of the first pair that would come too close if the arm braked now, -1 for none.
 
     Args:
         fence: `Fence`. limits: (n, COLUMNS) of `filter_limits`.
         q, dq: (n,) rad, rad/s, finite.
-        least: (K,) m, allowed distance of each pair, -inf before the first cycle of a motion; updated.
+        least: (K,) m, smallest allowed distance of each pair, -inf before a motion's first cycle; updated.
     """
     if len(least) == 0:
         return -1

@@ -26,10 +26,10 @@ class Family:
 
     Attributes:
         name: shown in tables.
-        names, units: of the K parameters.
+        names, units: names and units of the K parameters.
         logarithmic: names of positive parameters that span decades; their search space is logarithmic.
-        bounds: (low, high) of each parameter; `identify.bounds` overrides them.
-        optional: names of the last parameters; each is 0 and not estimated unless `identify.terms` lists it.
+        bounds: (low, high), search range of each parameter; `identify.bounds` overrides it.
+        optional: the last of the `names`; such a parameter is 0 and not estimated unless `identify.terms` lists it.
         formula: the law in one line.
         law: (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n). `sign` is
             tanh(dq / 0.01), or the bristle deflection of a family with a memory, in [-1, 1].
@@ -107,7 +107,7 @@ class Family:
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
         """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of another family.
 
-        If both laws have a viscous parameter, it keeps its value.
+        If both laws have a viscous parameter, its value is copied.
         """
         if other == self:
             return phi
@@ -127,7 +127,7 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def _sigmoid_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    """Eq. (5) of the paper, and a viscous term."""
+    """Return the friction of the paper's eq. (5) plus a viscous term, Nm."""
     return p[0] * (sigmoid(p[1] * (dq + p[2])) - sigmoid(p[1] * p[2])) + p[3] * dq
 
 
@@ -243,7 +243,7 @@ STRIBECK = Family(
 
 @njit(cache=True)
 def _bristle_native(p, v, h, memory):
-    """Dahl 1968, or LuGre without damping: z with dz/dt = (v - |v| z) / presliding replaces the sign of v."""
+    """Return Dahl's friction (1968) with LuGre damping: z replaces sign(v), with dz/dt = (v - |v| z) / presliding."""
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
@@ -323,7 +323,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if `family` would import the name, read from a file, from a module that is not in `trust`."""
+    """Raise UserError if `family` would import `name`, which a file contains, from a module not in `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(
@@ -333,7 +333,7 @@ def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
 
 
 def family_path(one: Family) -> str:
-    """Return the string that `family` resolves to this family: its name or its dotted path."""
+    """Return the string for which `family` returns this family: its name or its dotted path."""
     return next((path for path, f in _imported.items() if f is one), one.name)
 
 

@@ -1,16 +1,16 @@
-"""Parts of the compiled impedance laws (impedance_laws.py), and the layout of their parameters and memory.
+"""Building blocks of the compiled impedance laws (impedance_laws.py); layout of their parameters and memory.
 
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
-The damping D = 2 zeta (M # K_q) is the geometric mean of mass matrix and joint stiffness K_q = J^T K J + N^T K_n N:
-M (M^-1 K_q)^(1/2) gives every mode of M and K_q the ratio zeta. It is the double diagonalization of Albu-Schaeffer,
-Ott, Frese and Hirzinger (ICRA 2003), without eigenvectors. N is dynamically consistent (Khatib, IEEE J. Robotics and
-Automation 1987). Every spring has a potential, also where its force is clipped, so its energy is known. An energy
-tank (Ferraguti, Secchi and Fantuzzi, ICRA 2013) pays for what a rising stiffness adds to that energy; damping refills
-it. The work of a moving target and of the null space is not in the tank (Dietrich, Ott and Stramigioli, RA-L 2016).
-Feedforward: errors of the arm's gravity compensation, and friction: that of bristles follows the measured angle, all
-other the reference speed dq_r. To cancel the bristles' stiffness k with a delay d adds damping at frequencies below
-pi / d, as k - k e^(-i w d) has the imaginary part k sin w d. Friction that is estimated too high drives the arm.
+Damping: with D = 2 zeta (M # K_q) and the geometric mean M # K_q = M (M^-1 K_q)^(1/2), every mode of mass matrix M
+and joint stiffness K_q = J^T K J + N^T K_n N has the damping ratio zeta. This is the double diagonalization of
+Albu-Schaeffer, Ott, Frese and Hirzinger (ICRA 2003), without eigenvectors. The null-space projector N is dynamically
+consistent (Khatib, IEEE J. Robotics and Automation 1987). Energy: every spring has a potential, even where its force
+is clipped. When a stiffness rises, an energy tank (Ferraguti, Secchi and Fantuzzi, ICRA 2013) must provide the energy
+that the springs gain; damping refills the tank. The tank ignores the work of moving targets and null space (Dietrich,
+Ott and Stramigioli, RA-L 2016). Feedforward: it cancels gravity-compensation errors and friction. Bristle friction
+follows the measured angle, other friction the reference speed dq_r. Cancelling a bristle stiffness k with a delay d
+adds damping at w < pi / d, as k - k e^(-i w d) has the imaginary part k sin w d. Excess friction drives the arm.
 """
 
 import numpy as np
@@ -26,48 +26,48 @@ from r2s.physics.newton_euler import (
     rotate,
 )
 
-# Parameters: cycles between two updates of D and N, 2 zeta, energies J at which force and moment saturate, first
-# level and size of the tank J, cycle s; places in the command (-1: none), size of the target, number of the task's
+# Parameters: cycles between two updates of D and N, 2 zeta, spring energies J at which force and moment saturate,
+# first level and size of the tank J, cycle s; indices in the command (-1: none), size of the target, number of task
 # axes (3 or 6); whether the law is hybrid, rate of its integrals 1/s, largest force and integral N. APPROACH: above 0
-# if a hybrid force is at most that of the spring to the target; 1: dq_r is the direction of friction only; SLIDES:
-# the target moves on the surface, which may be tilted
+# if the spring to the target bounds a hybrid force; 1: dq_r is only the direction of friction; SLIDES: the target
+# moves on the surface, which may be tilted
 HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
 DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
 K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
-TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip in the last link, that link's axes at home, m/s^2
+TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip m in the last link, axes of this link at home, gravity m/s^2
 APPROACH, HEAD = 43, 44
 SLIDES = 2  # a value of APPROACH
-# Rows of the joints behind the head: a row of `links_of`, rotor, errors of mass and first moment, offset, drag,
-# friction (NODES speeds of each direction), null-space or joint stiffness with its bounds, energy J at which it
-# saturates, home, presliding distance rad (0: no bristles), breakaway Nm in both directions, friction per load Nm/Nm
+# Behind HEAD, one row per joint: row of `links_of`, rotor inertia, errors of mass and first moment, offset, drag,
+# friction at NODES speeds per direction, null-space or joint stiffness and its bounds, energy J at which this spring
+# saturates, home, presliding distance rad (0: no bristles), breakaway Nm (-, +), load-dependent friction Nm/Nm
 ROTOR, MASS_ERROR, MOMENT_ERROR, OFFSET, DRAG, FRICTION = 28, 29, 30, 33, 34, 36
 K_JOINT, JOINT_LIMIT, HOME, PRESLIDING, EDGES, LOAD, ROW = 44, 47, 48, 49, 50, 52, 53
-# Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; of a sliding tip, the
-# integrals along the path and to its side (2) N and the slope of the surface (3); then the stiffnesses, and ROWS of
-# n: dq_r, the last damping torque, the last q, q behind a low-pass, that q at the last deflection, bristle deflection
-# in [-1, 1]; matrices D and N^T
+# Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; for a sliding tip, the
+# integrals N along the path and sideways (2), and the slope of the surface (3). Then the stiffnesses, ROWS rows (n,):
+# dq_r, last damping torque, last q, low-pass filtered q, its value at the last update of the bristles, bristle
+# deflection in [-1, 1]. Then the matrices D and N^T
 SINCE, BEGUN, LEVEL, INTEGRAL, ACROSS, SLOPE, STIFFNESS = 0, 1, 2, 3, 4, 6, 9
 DAMPED, BEFORE, MEAN, ANCHOR, DEFLECTION, ROWS = 1, 2, 3, 4, 5, 6
 SPRINGS = 4  # stiffnesses in the task's axes
-ROUNDS = 14  # iterations of the geometric mean: a ratio of 1e4 of squared frequencies converges to round-off
-FREE = 1.0  # rad/s: modes without a spring are damped as by this frequency
-NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice the speed of rest
-# s, low-pass of the angles for friction; it leaves a third of the noise of a Panda's encoders, 1.4e-5 rad. Bristles
-# deflect in steps of this share of their presliding distance, but of ENCODER rad at least, ten times that noise
+ROUNDS = 14  # iterations of the geometric mean: enough for squared frequencies with a ratio of 1e4
+FREE = 1.0  # rad/s, frequency that sets the damping of modes without a spring
+NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice REST_DQ
+# SETTLE_S: s, low-pass of the angles for friction; it cuts a Panda's encoder noise, 1.4e-5 rad, to a third. STEP:
+# bristles deflect in steps of this share of the presliding distance, at least ENCODER rad, ten times the cut noise
 SETTLE_S, STEP, ENCODER = 5e-3, 0.1, 5e-5
-# rad/s: speed below which a joint may rest, 3.5 times the noise of (q - MEAN) / SETTLE_S; reference speed that has a
-# direction, chosen with press.py on twins 0 and 1, where 0.003 to 0.01 do alike
+# rad/s. REST_DQ: speed below which a joint may rest, 3.5 times the noise of (q - MEAN) / SETTLE_S. DIRECTION_DQ:
+# width of friction's sign change over reference speed; press.py on twins 0 and 1: 0.003 to 0.01 perform alike
 REST_DQ, DIRECTION_DQ = 0.01, 0.003
-# 1/s, of the estimated slope: it settles while a path gains its speed, `ramp_s` of 0.4 s. m/s, below which a sliding
-# tip shows less of it: five times the noise of a tip's speed, 3e-3 rad/s (Panda) at levers of 0.5 m in seven joints
+# SLOPE_RATE: 1/s, of the slope estimate; it settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING: m/s, below
+# it the estimate adapts slower; five times the tip's speed noise: 3e-3 rad/s (Panda) at levers of 0.5 m in 7 joints
 SLOPE_RATE, SLIDING = 10.0, 0.02
-SMALLEST = 0.01  # share of a rise of the stiffness below which it stays
-MOBILITY = 1e-3  # 1/kg and 1/(kg m^2): directions with less, near a singularity, count as blocked
+SMALLEST = 0.01  # smaller shares of a requested stiffness rise are not applied
+MOBILITY = 1e-3  # 1/kg, 1/(kg m^2): directions with less mobility, near a singularity, are treated as blocked
 
 
 @njit(cache=True, error_model="numpy")
 def arm_pose(q, parameters, frames, jacobian, place):
-    """Write link poses (n, POSE), the tip's Jacobian (6, n), translation first, and its place (3,) m."""
+    """Write link poses (n, POSE), the tip's Jacobian (6, n), translation first, and the tip's position (3,) m."""
     n = len(q)
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     x, y, z = 0.0, 0.0, 0.0
@@ -86,7 +86,7 @@ def arm_pose(q, parameters, frames, jacobian, place):
 
 @njit(cache=True, error_model="numpy")
 def arm_tips(q, parameters):
-    """Return place (m, 3) m and Jacobian (m, 3, n) of the tip at q (m, n) rad; parameters of an impedance."""
+    """Return position (m, 3) m and Jacobian (m, 3, n) of the tip at q (m, n) rad; parameters: of an impedance law."""
     m, n = q.shape
     places, out = np.empty((m, 3)), np.empty((m, 3, n))
     frames, jacobian = np.empty((n, POSE)), np.empty((6, n))
@@ -140,10 +140,10 @@ def invert(matrix, n):
 
 @njit(cache=True, error_model="numpy")
 def geometric_mean(K, mobility, out):
-    """Write K # M = M (M^-1 K)^(1/2) (n, n) of K and M = mobility^-1, all symmetric positive definite.
+    """Write the geometric mean K # M = M (M^-1 K)^(1/2), (n, n); K, M = mobility^-1 are symmetric positive definite.
 
-    Denman and Beavers' iteration (Higham, Functions of Matrices, 2008, eq. 6.28), multiplied by M so that all
-    iterates stay symmetric: P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2 from P = K, Q = M^-1.
+    It uses Denman and Beavers' iteration (Higham, Functions of Matrices, 2008, eq. 6.28), multiplied by M so that
+    all iterates stay symmetric: P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2 from P = K, Q = M^-1.
     """
     n = len(K)
     scale = 0.0  # mean squared frequency
@@ -171,10 +171,10 @@ def geometric_mean(K, mobility, out):
 
 @njit(cache=True, error_model="numpy")
 def spring(s, limit):
-    """Return energy, J, and factor of the force of a spring with s = e^T K e / 2, which saturates at s = limit, J.
+    """Return a spring's energy, J, and the factor on its force K e; it saturates where s = e^T K e / 2 is `limit` J.
 
-    U = s up to the limit, then 2 sqrt(s limit) - limit. U depends on s alone, so the force has a potential for every
-    K; it rises with K, and the force stays below sqrt(2 K limit): limit = clip^2 / (2 K_high).
+    The energy U is s up to the limit, then 2 sqrt(s limit) - limit. U depends on s alone, so the force has a
+    potential for every K. U rises with K; the force is at most sqrt(2 K limit), so limit = clip^2 / (2 K_high).
     """
     if s <= limit:
         return s, 1.0
@@ -184,14 +184,14 @@ def spring(s, limit):
 
 @njit(cache=True, error_model="numpy")
 def task_energy(K, error, tilt, parameters):
-    """Return the energy, J, of the springs K (4,): error (3,) m, and tilt = 1 - cos of the rotation error."""
+    """Return the energy, J, of the springs K (4,); error: (3,) m; tilt: 1 - cosine of the rotation error."""
     s = 0.5 * (K[0] * error[0] ** 2 + K[1] * error[1] ** 2 + K[2] * error[2] ** 2)
     return spring(s, parameters[FORCE_LIMIT])[0] + spring(K[3] * tilt, parameters[MOMENT_LIMIT])[0]
 
 
 @njit(cache=True, error_model="numpy")
 def refill(q, n, parameters, memory, at):
-    """Add to the tank what the last damping torque took from the arm since the last cycle, J; at: place of dq_r."""
+    """Add the energy, J, that damping took from the arm since the last cycle to the tank; at: index of dq_r."""
     if memory[BEGUN] == 0.0:
         memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
         for j in range(n):
@@ -206,9 +206,9 @@ def refill(q, n, parameters, memory, at):
 
 @njit(cache=True, error_model="numpy")
 def friction_at(v, row, load):
-    """Return friction, Nm, at v rad/s under a load-dependent part of `load` Nm.
+    """Return a joint's friction, Nm, at v rad/s, including load-dependent friction of `load` Nm.
 
-    It is linear between the speeds FIRST_DQ 4^k of a joint's row, and beyond.
+    Friction is linear in speed between the nodes FIRST_DQ 4^k of the joint's row, and is extrapolated beyond.
     """
     side, k = FRICTION if v >= 0.0 else FRICTION + NODES, 0
     sign = 1.0 if v >= 0.0 else -1.0
@@ -221,12 +221,12 @@ def friction_at(v, row, load):
 
 @njit(cache=True, error_model="numpy")
 def friction_ahead(v, q, j, load, parameters, memory, at):
-    """Return the friction, Nm, that joint j at q rad has to overcome; v: its reference speed, rad/s.
+    """Return the friction feedforward, Nm, of joint j at q rad; v: reference speed of the joint, rad/s.
 
-    Bristles: their deflection z follows the measured angle, dz = (dq - |dq| z) / presliding (Dahl 1968), and their
-    level is the lower one of reference and measured speed. Otherwise the direction is that of v, and a joint at rest
-    needs its breakaway torque. If a target approaches a surface, v is only the direction in which joints will creep,
-    and friction is that at v. load: Nm, load-dependent friction. at: place of dq_r.
+    With bristles, the deflection z follows the measured angle, dz = (dq - |dq| z) / presliding (Dahl 1968), and the
+    level is the smaller of those at reference and measured speed. Without bristles, friction has the direction of v,
+    and is the breakaway torque at rest. While a target approaches a surface, v is only the direction in which joints
+    will creep, and the result is the friction at v. load: Nm, load-dependent friction. at: index of dq_r in memory.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
@@ -250,7 +250,7 @@ def friction_ahead(v, q, j, load, parameters, memory, at):
 
 @njit(cache=True, error_model="numpy")
 def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
-    """Return the torque, Nm, of gravity about joint j on a mass, kg, with the first moment x, y, z, kg m."""
+    """Return the gravity torque, Nm, about joint j on a body of mass `mass`, kg, and first moment x, y, z, kg m."""
     x, y, z = x - mass * frames[j, 0], y - mass * frames[j, 1], z - mass * frames[j, 2]
     a, b, c = parameters[GRAVITY], parameters[GRAVITY + 1], parameters[GRAVITY + 2]
     a, b, c = y * c - z * b, z * a - x * c, x * b - y * a
@@ -259,10 +259,10 @@ def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def feedforward(q, parameters, frames, jacobian, memory, at, out):
-    """Add friction, and errors of the gravity compensation, offset and drag, to `out`; at: place of dq_r."""
+    """Add torques that cancel friction, gravity errors, offset and drag to `out`; at: index of dq_r in memory."""
     n = len(q)
-    m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all that a joint carries
-    M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # the mass and the first moment
+    m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all links beyond a joint
+    M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # mass and first moment of these links
     for j in range(n - 1, -1, -1):
         row, R = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], pose_axes(frames[j])
         u, v, w = rotate(R, row[MOMENT_ERROR], row[MOMENT_ERROR + 1], row[MOMENT_ERROR + 2])

@@ -1,4 +1,4 @@
-"""Compiled impedance laws: `joint_impedance`, `cartesian_impedance`, `hybrid`; see control_laws.py, impedance.py."""
+"""Compiled laws of `control=joint_impedance`, `cartesian_impedance` and `hybrid`; impedance.py has their parts."""
 
 import numpy as np
 
@@ -61,10 +61,10 @@ from r2s.physics.newton_euler import product, rotate_about
 
 @njit(cache=True, error_model="numpy")
 def joint_impedance_law(q, dq, command, parameters, memory, out):
-    """Joint impedance: `control=joint_impedance`.
+    """Write the torque of `control=joint_impedance`: K (q_t - q) - D (dq - dq_r) + feedforward.
 
-    tau = K (q_t - q) - D (dq - dq_r) + feedforward. command: displacement of the target (n) rad and stiffness (n)
-    Nm/rad where the action has them, then q_r, dq_r (n each) of a task with a trajectory; without one q_r is home.
+    command: displacement q_t - q_r of the target (n) rad and stiffness (n) Nm/rad, if the action contains them; then
+    q_r, dq_r (n each), if the task has a trajectory. Without a trajectory, q_r is home and dq_r is 0.
     """
     n, begins = len(q), memory[BEGUN] == 0.0
     K, at = memory[STIFFNESS : STIFFNESS + n], STIFFNESS + n
@@ -137,8 +137,8 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
 def rotation_error(R, command, parameters, error):
     """Write the rotation error (3,): axis times sine of the angle to the target; return 1 - cosine of the angle.
 
-    (Luh, Walker and Paul, IEEE TAC 1980, eq. 22.) The target is the home orientation,
-    rotated by action plus target (rotation vectors).
+    The target is the home orientation, rotated by the sum of the rotation vectors of action and task target (error:
+    Luh, Walker and Paul, IEEE TAC 1980, eq. 22).
     """
     x, y, z = 0.0, 0.0, 0.0
     if parameters[DISPLACED] >= 0.0:
@@ -164,7 +164,7 @@ def rotation_error(R, command, parameters, error):
 
 @njit(cache=True, error_model="numpy")
 def update(velocity, parameters, frames, jacobian, memory):
-    """Write dq_r (n,) rad/s of the target's velocity (3,) m/s, D and N^T (n, n) of this posture into memory."""
+    """Write D, N^T (n, n) for this posture, and dq_r (n,) rad/s for the target's velocity (3,) m/s, into memory."""
     n, a, at = len(frames), int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     K = memory[STIFFNESS : STIFFNESS + SPRINGS]
     D = memory[at + ROWS * n : at + ROWS * n + n * n].reshape((n, n))
@@ -213,8 +213,8 @@ def update(velocity, parameters, frames, jacobian, memory):
 def normal_force(command, shift, parameters, memory):
     """Return the force, N, that the tip shall exert against the normal, with the integral of the force error.
 
-    The command has normal (3,), reference N, measured force N, and whether it is measured. A displacement against the
-    normal adds its stiffness times as much. The integral stops where it or the force saturates (clamping).
+    The command contains: normal (3,), reference N, measured force N, whether it is measured. A displacement against
+    the normal adds stiffness times displacement. The integral stops while it or the force saturates (clamping).
     """
     at = int(parameters[TARGET_AT]) + int(parameters[TARGET_SIZE])
     asked = command[at + 3]
@@ -234,11 +234,11 @@ def normal_force(command, shift, parameters, memory):
 
 @njit(cache=True, error_model="numpy")
 def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
-    """Learn what a tip meets that slides on a surface; write the force (3,) N that holds it on the path.
+    """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's path.
 
-    Adds the rate at which the surface rises to the target's velocity (3,) m/s. The slope g of the surface is the
-    least squares of the tip's speed along the normal = g velocity, with the gradient method (Widrow and Hoff, 1960).
-    The force is the integral of the error along the path, as friction acts, and to its side, each clamped.
+    The slope g is the least-squares fit of: tip's speed along the normal = g velocity, by the gradient method (Widrow
+    and Hoff, 1960). The rate at which the surface rises is added to the target's velocity (3,) m/s. The force is the
+    integral of the position error along the path, where friction acts, and to the path's side, each clamped.
     """
     up, rises, fast = 0.0, 0.0, SLIDING * SLIDING
     for k in range(3):
@@ -269,13 +269,13 @@ def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
 
 @njit(cache=True, error_model="numpy")
 def cartesian_impedance_law(q, dq, command, parameters, memory, out):
-    """Impedance of the tip: `control=cartesian_impedance`, and with a force along a normal `control=hybrid`.
+    """Write the torque of a tip impedance, `control=cartesian_impedance`; with a normal force, `control=hybrid`.
 
-    command: displacement of the target (3) m and, with six axes, (3) rad as a rotation vector, then stiffness (3) N/m
-    and, with six axes, (1) Nm/rad, where the action has them. Then the task's target: position (3), and where it has
-    them velocity (3) m/s and rotation vector from home (3) rad. For hybrid: see `normal_force`; with APPROACH the
-    force grows with the distance to a target that moves into a surface, until it is the requested one. A target that
-    SLIDES is that of the middle of a period, and behind the contact the command has what pulls at the tip (3) N.
+    command, from the action if it has them: displacement of the target (3) m, with six axes also a rotation (3) rad;
+    stiffness (3) N/m, with six axes also (1) Nm/rad. Then the task's target: position (3) m, optionally velocity (3)
+    m/s and rotation vector from home (3) rad. Then, for hybrid, the contact: see `normal_force`. With APPROACH the
+    force grows with the distance to a target inside the surface, up to the requested force. With SLIDES the target is
+    valid for the middle of a control period, and the command ends with a feedforward force on the tip (3) N.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     frames, jacobian, place, velocity = np.empty((n, POSE)), np.empty((6, n)), np.empty(3), np.zeros(3)
@@ -288,7 +288,7 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     normal, along, slides = target + int(parameters[TARGET_SIZE]), 0.0, parameters[APPROACH] == SLIDES
     if parameters[TARGET_SIZE] >= 6.0:
         velocity[:] = command[target + 3 : target + 6]
-    if slides:  # a sliding target moves on within a period
+    if slides:  # a sliding target moves within a control period
         error += parameters[CYCLE_S] * (memory[SINCE] - 0.5 * parameters[HOLD]) * velocity
     if parameters[HYBRID] > 0.0:
         along = error[0] * command[normal] + error[1] * command[normal + 1] + error[2] * command[normal + 2]

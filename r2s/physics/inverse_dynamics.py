@@ -33,7 +33,7 @@ class InverseDynamics:
     def rigid(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the torque (m, n) Nm of links and rotors at q, dq, ddq (m, n) rad, rad/s, rad/s^2.
 
-        This is M ddq + C dq + g, minus g of the nominal links, which the arm compensates.
+        The torque is M ddq + C dq + g, minus the g of the nominal links, which the arm compensates.
         """
         own, nominal = self._links
         out = np.empty_like(q)
@@ -48,7 +48,7 @@ class InverseDynamics:
         return out
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
-        """Return the command (m, n) Nm, without gravity; sliding: (m, n) rad/s, speeds for friction."""
+        """Return the command (m, n) Nm, without gravity, for a motion; sliding: (m, n) rad/s, speeds for friction."""
         d = self.dynamics
         out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
         if d.drag.any():

@@ -1,4 +1,4 @@
-"""Forward kinematics of a serial arm, compiled, and inverse kinematics along a curve of end-effector positions."""
+"""Compiled forward kinematics of a serial arm, and inverse kinematics along a curve of end-effector positions."""
 
 import numpy as np
 
@@ -34,8 +34,8 @@ class HandKinematics:
     def follow(self, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
         """Return postures (T, n) rad with the end effector at points (T, 3) m, and the largest position error, m.
 
-        The solver starts each posture from the previous one, the first from `start` (n,). In the null space it moves
-        towards home. It ignores position limits.
+        The solver starts each posture from the previous one, the first from `start` (n,). In the null space the arm
+        moves towards home. The solver ignores position limits.
         """
         out = np.empty((len(points), len(start)))
         return out, _follow(self.links, self._tip, self._home, start, np.ascontiguousarray(points), out)

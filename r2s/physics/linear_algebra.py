@@ -31,7 +31,7 @@ def unpack(packed, scale, diagonal, out):
 def factor(matrix, root, active=None):
     """Write the root of a matrix (n, n), given by its lower triangle; `root` may be `matrix` itself.
 
-    active: (n,); only rows and columns where it is not 0 take part. None: all.
+    active: (n,), 0 for the rows and columns to leave out. None: all are used.
     """
     for i in range(len(root)):
         if active is not None and active[i] == 0.0:
@@ -52,7 +52,7 @@ def factor(matrix, root, active=None):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def solve(root, x, active=None):
-    """Replace x (n,) by the solution y of A y = x; y is 0 where `active` (n,), see `factor`, is 0."""
+    """Replace x (n,) by the solution y of A y = x; active: as for `factor`, and y is 0 in the left-out rows."""
     n = len(x)
     for i in range(n):
         s = 0.0

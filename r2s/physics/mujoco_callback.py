@@ -1,10 +1,10 @@
-"""Friction, control law, safety filter and motors inside MuJoCo's physics step: one compiled callback.
+"""The compiled callback that adds friction, control law, safety filter and motors to MuJoCo's physics step.
 
 `install()` registers a native control callback that reads `jnt_user`. `mujoco.batch.Batch` can then simulate a
 different arm in each row at full speed. The callback contains the friction laws (friction.py), and with
 `Simulator.drive` also the control law (control_laws.py), the safety filter (safety_filter.py) and the delay of the
 motors (actuation.py), which need feedback every millisecond. Stiction (stick_slip.py) and contact (contact.py) depend
-on all other forces, so this is the control callback, which MuJoCo calls last before it computes accelerations.
+on all other forces. So r2s uses the control callback, which MuJoCo calls last before it computes accelerations.
 
 The friction force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity, the callback adds D v -
 tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. This is exact to first order,
@@ -42,28 +42,28 @@ from r2s.physics.stick_slip import TINY, JointForces, any_reversal, coming_veloc
 # Columns of jnt_user. MARK identifies our models: the callback is global in a process and must leave others alone.
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
-DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether the next twelve are used
+DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether masses are summed up
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
-NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds. REST: friction as sliding begins
+NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: use stick_slip.py. REST: friction when sliding begins
 GRAVITY = REST_POS + 1  # 3 wide
-DELAY, LAG, LEVEL = range(GRAVITY + 3, GRAVITY + 6)  # LEVEL: of friction, for the safety filter
-LIMITS = LEVEL + 1  # of the safety filter, COLUMNS wide; 0: no filter
-# The path of a command: number of the control law (NO_CONTROL: `rollout` gives efforts), cycles of the soft start,
+DELAY, LAG, LEVEL = range(GRAVITY + 3, GRAVITY + 6)  # LEVEL: friction level for the safety filter
+LIMITS = LEVEL + 1  # limits of the safety filter, COLUMNS wide; 0: no filter
+# The path of a command: number of the control law (NO_CONTROL: `rollout` sets efforts), cycles of the soft start,
 # factor of the low-pass, largest target Nm, and the sizes of command, memory and parameters of the law in `userdata`
 CONTROL, FADE, LOW_PASS, TARGET_MAX, COMMANDS, MEMORIES, PARAMETERS = range(LIMITS + COLUMNS, LIMITS + COLUMNS + 7)
-# Where the contact (contact.py) and the limit of pushes (push_limit.py) begin in `userdata`; 0: without
+# First index in `userdata` of the contact (contact.py) and of the push limit (push_limit.py); 0: none
 CONTACT, PUSH = PARAMETERS + 1, PARAMETERS + 2
 WIDTH = PUSH + 1
 NO_CONTROL = -1.0
 MARKER = 7_202_020.0
-# Rows of `joint`, which a step computes. REST and EDGES have two each, of the negative and the positive direction.
+# Rows of `joint`, computed in each step. REST and EDGES have two rows each: negative and positive direction.
 SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES, ROWS = 0, 1, 2, 3, 4, 5, 7, 9
-# Rows of n in `userdata`: bristles, last command, motor state, cycle count (one number), number of cycles that the
-# safety filter changed (one number), low-pass state, effort, noise of the measured speeds, and SLOTS of commands.
-# Behind them: command, memory and parameters of the control law; of a robot with a tool its push limit and contact.
+# Rows (n,) in `userdata`: bristle deflection, last command, motor state, cycle number (one value), number of cycles
+# changed by the safety filter (one value), low-pass state, effort, noise of the measured speeds, last SLOTS commands.
+# After these rows: command, memory and parameters of the control law; with a tool, also push limit and contact.
 BRISTLE, SENT, MOTOR, CYCLE, LIMITED, FILTERED, EFFORT, NOISE, LINE = range(9)
 KEPT = LINE + SLOTS
-USUAL = 7  # joints that the driver's part is compiled for; others run slower
+USUAL = 7  # number of joints for which `_drive` is compiled; other arms run slower
 
 # the index of a law is its number in `jnt_user`
 _BUILT_IN = (*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None))
@@ -86,7 +86,7 @@ def install() -> None:
 
 
 def _either(number: int, own: Callable, others: Callable) -> Callable:
-    """Return the compiled function that calls `own` for its number, else `others`."""
+    """Return the compiled function that calls `own` if asked for `number`, else `others`."""
     own = own if is_jitted(own) else njit(own)
 
     @njit(inline="always")
@@ -132,7 +132,7 @@ def _stack(typingctx, count):  # NumPy's own arrays cost a step a tenth of its t
 
 @njit(inline="always")
 def _weight(mass, hx, hy, hz, anchor, axis, gravity):
-    """Return Nm of gravity about a joint: axis . ((h - mass anchor) x gravity), with first moments h kg m."""
+    """Return the gravity torque, Nm, about a joint: axis . ((h - mass anchor) x gravity), h: first moment, kg m."""
     x, y, z = hx - mass * anchor[0], hy - mass * anchor[1], hz - mass * anchor[2]
     level = gravity[0] * (axis[1] * z - axis[2] * y) + gravity[1] * (axis[2] * x - axis[0] * z)
     return level + gravity[2] * (axis[0] * y - axis[1] * x)
@@ -140,7 +140,7 @@ def _weight(mass, hx, hy, hz, anchor, axis, gravity):
 
 @njit(inline="always")
 def _first_moment(mass, xpos, xmat, h):
-    """Return the first moment (3) kg m in the world of a body with mass kg and h (3) kg m in its frame."""
+    """Return a body's first moment (3) kg m in the world frame; mass: kg; h: (3) kg m, in the body's frame."""
     x = mass * xpos[0] + xmat[0] * h[0] + xmat[1] * h[1] + xmat[2] * h[2]
     y = mass * xpos[1] + xmat[3] * h[0] + xmat[4] * h[1] + xmat[5] * h[2]
     z = mass * xpos[2] + xmat[6] * h[0] + xmat[7] * h[1] + xmat[8] * h[2]
@@ -150,7 +150,7 @@ def _first_moment(mass, xpos, xmat, h):
 @njit(inline="always")
 def _direction(v, net, z, user):
     """Return the direction of load-dependent friction in [-1, 1], and its slope s/rad; z: bristle deflection."""
-    if user[FAMILY] == BRISTLES:  # during the coming step, without their damping
+    if user[FAMILY] == BRISTLES:  # in the coming step, without bristle damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
     if net:
@@ -161,7 +161,7 @@ def _direction(v, net, z, user):
 
 @cache
 def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) -> Any:
-    """Compile the force with these friction and control laws, in the order of their numbers, and install it."""
+    """Compile the callback with these friction and control laws, in the order of their numbers, and install it."""
     force = _force_at(struct_offsets(WIDTH, KEPT))
     names = dict(globals())
     if own := laws[len(_BUILT_IN) :]:
@@ -224,7 +224,7 @@ def _friction(sizes, user, q, dq, forces, places):
     """Add friction, offsets and errors of the gravity compensation to the passive force of a step.
 
     Args:
-        sizes: numbers of joints and bodies. user: (n, WIDTH), jnt_user. forces and places: addresses in MuJoCo.
+        sizes: numbers of joints and bodies. user: (n, WIDTH), jnt_user. forces, places: addresses of arrays.
         forces: damping, applied, passive, bias, M, userdata. places: xpos, xmat, xanchor, xaxis.
     """
     n, nbody = sizes
@@ -234,11 +234,11 @@ def _friction(sizes, user, q, dq, forces, places):
     mass, memory = carray(_as_doubles(forces[4]), (n * (n + 1) // 2,)), carray(_as_doubles(forces[5]), (n,))
     xpos, xmat = carray(_as_doubles(places[0]), (nbody, 3)), carray(_as_doubles(places[1]), (nbody, 9))
     anchor, axis = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))
-    net, slow = user[0, NET] != 0.0, False  # net: stick_slip.py holds, all joints of an arm or none
+    net, slow = user[0, NET] != 0.0, False  # net: stick_slip.py is used, for all joints or none
     at = int(user[0, CONTACT])
     touch = at != 0
     joint = carray(_stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
-    # mass and first moment of everything beyond a joint: errors of the compensation, and nominal
+    # mass and first moment of all links beyond a joint: errors of gravity compensation (e), nominal (l)
     em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(n - 1, -1, -1):
         if user[j, MARK] != MARKER:
@@ -260,8 +260,8 @@ def _friction(sizes, user, q, dq, forces, places):
             sign, steep = _direction(v, net, memory[j], user[j])
             friction += loaded * sign
             slope += loaded * steep
-        slope = max(slope, 0.0)  # an implicit falling branch would remove inertia
-        # mj_passive has already subtracted dof_damping * v with the slope of the step before: correct it
+        slope = max(slope, 0.0)  # an implicit negative slope would remove inertia
+        # mj_passive has already subtracted dof_damping * v with the slope of the previous step: correct it
         force = (damping[j] - user[j, DAMPING]) * v - friction
         damping[j] = user[j, DAMPING] + slope
         drive = applied[j] + pull
@@ -289,7 +289,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by the law's. n is a variable: a constant one would compile for a minute."""
+    """Replace the applied torques by the control law's; n is a variable, as a constant n compiles for a minute."""
     user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
     applied, kept = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[5]), (KEPT, n))
@@ -303,7 +303,7 @@ def _control(n, user, fields):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _drive(n, user, fields, places):
-    """Replace the applied torques by those behind conditioning, safety filter and motors.
+    """Replace the applied torques by those after conditioning, safety filter, delay and lag.
 
     numba compiles a constant n into the code: loops unroll, and the filter takes half the time (benchmarks/law.py).
 
@@ -358,12 +358,12 @@ def _hold(forces, dq, user, joint, work, touch, touches):
     Args:
         forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), output of
             `_friction`. work: (2 n + 6, n), any content.
-        touch: contact and Jacobian of `near`. touches: what it returned.
+        touch: contact and Jacobian of `near`. touches: the value that `near` returned.
     """
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]
     coming, rest, edges = joint[COMING], joint[REST : REST + 2], joint[EDGES : EDGES + 2]
-    if user[0, NET] == 0.0:  # friction is part of the force, and no joint has edges
+    if user[0, NET] == 0.0:  # friction is part of the force, and there is no stiction
         joint[FRICTION], joint[REST : EDGES + 2] = 0.0, 0.0
     for j in range(n if user[0, NET] != 0.0 else 0):
         joint[FORCE, j] += joint[FRICTION, j]

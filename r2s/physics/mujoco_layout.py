@@ -1,4 +1,4 @@
-"""Byte offsets in mjModel and mjData of the fields that the compiled callback reads, found in live structs."""
+"""Byte offsets of the mjModel and mjData fields that the compiled callback reads, found in a live model."""
 
 import ctypes
 from typing import Any
@@ -14,12 +14,12 @@ DATA_FIELDS = (  # in the order of mujoco_callback.py
 
 
 def struct_offsets(width: int, kept: int) -> dict[str, int]:
-    """Return byte offsets within mjModel and mjData, found in live structs.
+    """Return the byte offsets of MODEL_FIELDS in mjModel and DATA_FIELDS in mjData, found in a live model.
 
     Pointers are found by the address of their NumPy view, sizes by their index in mjModel's introspection.
 
     Args:
-        width: columns of `jnt_user` in the probed model. kept: rows of its `userdata` (kept, n).
+        width: columns of `jnt_user` in the probed model. kept: rows of `userdata` (kept, n).
     """
     joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
     spec = mujoco.MjSpec.from_string(
@@ -34,7 +34,7 @@ def struct_offsets(width: int, kept: int) -> dict[str, int]:
         word = ctypes.cast(struct._address, ctypes.POINTER(ctypes.c_int64))
         missing = {getattr(struct, name).ctypes.data: name for name in names}
         k = 0
-        while missing:  # ends: every array's address is in its struct
+        while missing:  # it ends: the struct contains every array's address
             if name := missing.pop(word[k], None):
                 offsets[name] = 8 * k
             k += 1

@@ -15,13 +15,13 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 
 # Columns of `links`: position and rotation in the parent link at angle zero, axis, mass, centre of mass, tensor about
-# it in link axes.
+# this centre in link axes.
 PLACE, FRAME, AXIS, MASS, COM, TENSOR, LINK = 0, 3, 12, 15, 16, 19, 28
 WORK = 22  # columns of the work array of `equations`
 
 
 def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return rows (n, LINK) for masses (n,) kg, centres (n, 3) m and tensors about them (n, 3, 3) kg m^2."""
+    """Return `links` (n, LINK) from masses (n,) kg, centres of mass (n, 3) m, tensors about them (n, 3, 3) kg m^2."""
     own = replace(Dynamics.of(robot, np.zeros((robot.n, 3))), mass=mass, com=com, inertia=inertia)
     rows = [
         [*link.origin[:3, 3], *link.origin[:3, :3].flat, *link.axis, link.mass, *link.com, *link.inertia.flat]
@@ -32,7 +32,7 @@ def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarra
 
 @njit(cache=True, error_model="numpy")
 def equations(links, gravity, q, dq, mass, bias, work):
-    """Write the mass matrix (n, n) kg m^2 and the bias torque (n,) Nm of: mass ddq + bias = joint torque.
+    """Write the mass matrix (n, n) kg m^2 and the bias torque (n,) Nm, with mass ddq + bias = joint torque.
 
     Args:
         links: output of `links_of`. gravity: (3,) m/s^2 in the base frame.

@@ -1,4 +1,4 @@
-"""Boxes around an arm that the links must not touch."""
+"""Obstacles: boxes around an arm that its links must not touch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class Box:
 
 
 def boxes(where: str, given: Sequence[Mapping[str, Any]]) -> list[Box]:
-    """Return the boxes of a setting, [{center: [x, y, z], size: [x, y, z], yaw: rad}, ...].
+    """Return the boxes that a setting describes, [{center: [x, y, z], size: [x, y, z], yaw: rad}, ...].
 
     Raises:
         UserError: an unknown or missing key, or values that are no numbers.

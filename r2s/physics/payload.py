@@ -22,7 +22,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
 
 Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centres (..., n, 3) m, tensors (..., n, 3, 3)
-USUAL = 0.5  # share of its largest payload mass and distance that an arm usually carries
+USUAL = 0.5  # usual payload mass and distance, as a share of the largest ones
 WATER = 1000.0  # kg/m^3
 
 
@@ -114,9 +114,9 @@ def _of_file(name: str, path: Path) -> Any:
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
-    """Return the tensor (3, 3) kg m^2 from 3 moments or 6 elements; None: that of a sphere of water.
+    """Return the tensor (3, 3) kg m^2 from 3 moments or 6 elements; None: the tensor of a sphere of water.
 
-    The largest moment allowed is that of the largest mass at twice the largest distance of a centre.
+    The largest allowed moment is that of the largest payload mass at twice the largest distance.
     """
     if value is None:
         return sphere_inertia(np.array(mass))
@@ -183,7 +183,7 @@ def with_payload(robot: Robot, payload: Payload | None, links: Links) -> Links:
 def dynamics_with_payload(
     robot: Robot, dynamics: Dynamics, payload: Payload | None, declared: Payload | None = None
 ) -> Dynamics:
-    """Return the dynamics of an arm with this payload attached; its times do not matter.
+    """Return the dynamics of an arm with this payload attached; on_s and off_s are ignored.
 
     declared: the payload declared to the arm's gravity compensation (libfranka's setLoad), right or wrong.
     """
@@ -192,7 +192,7 @@ def dynamics_with_payload(
 
 
 def mass_and_moment(robot: Robot, payload: Payload | None) -> np.ndarray:
-    """Return (..., 4): mass, kg, and first moment in the last link's frame, kg m."""
+    """Return (..., 4): the payload's mass, kg, and its first moment in the last link's frame, kg m."""
     if payload is None:
         return np.zeros(4)
     place, axes = ee_pose(robot)
@@ -214,7 +214,7 @@ class LoadTorque:
         """Return (n,) Nm at q (n,) rad.
 
         Args:
-            load: (4,) kg, kg m, of `mass_and_moment`. gravity: (3,) m/s^2 in the base frame; None: the robot's.
+            load: (4,) kg, kg m, from `mass_and_moment`. gravity: (3,) m/s^2 in the base frame; None: the robot's.
         """
         if not load.any():
             return np.zeros(len(q))

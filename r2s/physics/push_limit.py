@@ -49,10 +49,10 @@ STOP, PHASE, FELT, HEIGHT, PULL = range(BEGUN + 1, BEGUN + 6)
 COLUMNS = PULL + 1
 HOLD, RELEASE, RETREAT = 1, 2, 3  # values of STOP
 STOPS = {"hold": HOLD, "release": RELEASE, "retreat": RETREAT}
-LEAVE = 0.05  # m/s, outward speed of a tip in a stop: covers the depth of 20 N on 2e3 N/m in half of LEAVES_S
+LEAVE = 0.05  # m/s, outward tip speed in a stop: 20 N on 2e3 N/m are released in half of LEAVES_S
 WORK = 3  # rows of `work` in addition to n
 ROUNDS = 16  # largest number of trials of f
-CLOSE = 1e-2  # m/s^2, the found torque may push by up to this less than allowed
+CLOSE = 1e-2  # m/s^2, tolerance: inward acceleration may stay below its bound by up to this
 OVERSHOOT = 1.5  # largest closing speed over v_max: the tip brakes only as fast as the latency allows
 STIFF = 1e5  # N/m, stiffest surface of conf/dr/contact.yaml
 NEAR_M = 0.3  # m, distance from the surface beyond which the limit does nothing
@@ -60,12 +60,12 @@ NEAR_M = 0.3  # m, distance from the surface beyond which the limit does nothing
 
 @dataclass(frozen=True)
 class PushLimit:
-    """Settings of the push limit at a plane whose place is roughly known; see the module.
+    """Settings of the push limit at a plane that is known roughly; the module's docstring defines them.
 
     Attributes:
-        force_max: N. speed_near: m/s. point, normal: (3,) of the plane in the base frame, m.
-        place, tilt: m and rad, by which the true plane may differ from it.
-        stop: what a stop does with a contact force, a key of STOPS.
+        force_max: N. speed_near: m/s. point, normal: (3,) m and (3,), nominal plane in the base frame.
+        place, tilt: m and rad, largest deviations of the true plane from the nominal plane.
+        stop: how a stop treats a contact force, a key of STOPS.
     """
 
     force_max: float
@@ -97,7 +97,7 @@ class PushLimit:
     def bound(self, robot: Robot, q: np.ndarray, stiffness: float, friction: float = 0.0) -> float:
         """Return the largest force, N, on a surface of `stiffness`, N/m, and Coulomb `friction` at q (n,) rad.
 
-        Infinite where the surface's friction can push a sliding tip inwards without limit.
+        The bound is infinite where the surface's friction can push a sliding tip inwards without limit.
         """
         jacobian = Tip(robot)(q)[1]
         moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, by a force on the tip
@@ -118,8 +118,8 @@ def push_limit(
     """Return the push limit of the settings `safety.force_max` and `safety.speed_near`; None if both are null.
 
     Args:
-        robot: with a tool. friction: (n,) Nm, level of each joint's friction.
-        force_max: N. speed_near: m/s; null: the speed at which a surface of 1e5 N/m adds force_max.
+        robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
+        force_max: N. speed_near: m/s; None: the speed at which a surface of 1e5 N/m adds force_max.
         plane: point and normal; None: a table below the tip at home. asked: N, largest force of the task.
         stop: a key of STOPS; None: release (contact_stop.py).
 
@@ -233,7 +233,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     """Limit the push of torques `out` (n,) Nm, and joint accelerations with the contact force as a load.
 
-    Args as for `push_bound`, and share and limits as for `filter_torque`. Returns whether `out` changed.
+    The arguments are those of `push_bound`; share, limits: see `filter_torque`. Return whether `out` changed.
     """
     n = len(out)
     own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()

@@ -47,7 +47,7 @@ def tensor_elements(tensor: np.ndarray) -> np.ndarray:
 def regressor(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return (T, n, n, 10): derivative of each joint's torque by each link's standard parameters.
+    """Return the regressor (T, n, n, 10): derivatives of each joint's torque by each link's standard parameters.
 
     Args:
         robot: the arm's kinematics.
@@ -85,7 +85,7 @@ def regressor(
         rotated = np.einsum("cij,tj->tci", basis, own_alpha)
         rotated += np.cross(own_omega[:, None], np.einsum("cij,tj->tci", basis, own_omega))
         moment[:, 4:] = np.einsum("tij,tcj->tci", R, rotated)
-        for j in range(k + 1):  # every joint before a link carries it
+        for j in range(k + 1):  # joints 0 to k carry link k
             about = moment + np.cross((place[:, k] - anchor[:, j])[:, None], force)
             out[:, j, k] = np.einsum("ti,tci->tc", axis[:, j], about)
     return out
@@ -124,7 +124,7 @@ def nominal_torque(
 ) -> np.ndarray:
     """Return the torque (T, n) Nm of the nominal links and rotors, without the soft springs of joint limits.
 
-    q, dq, ddq: (T, n) rad, rad/s, rad/s^2. gravity: the robot's, none (False), or (3,) m/s^2.
+    q, dq, ddq: (T, n) rad, rad/s, rad/s^2. gravity: True (the robot's), False (none), or (3,) m/s^2.
     """
     model = robot.model(gravity=bool(np.any(gravity)))
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
@@ -167,7 +167,7 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def set_links(
     model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
 ) -> None:
-    """Set mass (n,) kg, centre (n, 3) m, tensor about it (n, 3, 3) and rotor inertia (n,) kg m^2 of a model."""
+    """Set a model's link masses (n,) kg, centres (n, 3) m, tensors about these (n, 3, 3), rotors (n,) kg m^2."""
     at = model.jnt_bodyid
     model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com
@@ -192,7 +192,7 @@ class Kinematics:
 
 
 class InverseInertia:
-    """Inverse mass matrix of m nominal arms; 1 / diagonal: a joint's inertia while the other joints are free."""
+    """Inverse mass matrix of m nominal arms; 1 / diagonal is the inertia of a joint while the others are free."""
 
     def __init__(self, robot: Robot, m: int = 1):
         model = robot.model(gravity=False)

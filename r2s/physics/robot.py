@@ -1,9 +1,9 @@
-"""The arm: kinematics, inertia and gravity from an MJCF or URDF file, limits from the file or the config.
+"""Load a `Robot`: kinematics, inertia and gravity from an MJCF or URDF file, limits from the file or the config.
 
-r2s commands joint torques, so it uses a file's joints and links, and drops actuators, sensors, keyframes, free
-objects, gravity compensation and contacts. The file's damping and frictionloss are nominal values of the friction law
-(dynamics.py), so `Robot.model` sets both to 0 except nonlinear damping; its armature is the nominal rotor inertia.
-Any serial arm of hinge joints works: `robot.mjcf=FILE`.
+r2s commands joint torques, so its model contains the file's joints and links, but no actuators, sensors, keyframes,
+free objects, gravity compensation or contacts. The file's damping and frictionloss are nominal values of the friction
+law (dynamics.py), so `Robot.model` sets both to 0, except nonlinear damping. The file's armature is the nominal rotor
+inertia. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,8 +28,8 @@ PANDA = "r2s:models/panda.xml"
 RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of this size
-# Payload limits of an arm that publishes none, with a Panda's ratios (3 kg, 0.15 m, 87 Nm): payload weight times
-# reach over the largest torque limit, and distance over reach.
+# Default payload limits, from a Panda's ratios (3 kg, 0.15 m, 87 Nm): payload weight times reach over the largest
+# torque limit, and distance of the payload's centre over reach.
 PAYLOAD_SHARE, PAYLOAD_FAR = 0.33, 0.15
 OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot that tasks use, not `load_robot`
 
@@ -42,8 +42,8 @@ class Robot:
         name: the model's name.
         mjcf: the model's file, MJCF or URDF.
         q_min, q_max: (n,) rad, position limits; -inf and inf for a continuous joint.
-        dq_max: (n,) rad/s. ddq_max: (n,) rad/s^2.
-        tau_max: (n,) Nm. dtau_max: (n,) Nm/s.
+        dq_max, ddq_max: (n,) rad/s and rad/s^2, velocity and acceleration limits.
+        tau_max, dtau_max: (n,) Nm and Nm/s, limits of torque and torque rate.
         q_home: (n,) rad, start of episodes and excitations.
         ee_site: the site of `model` that is the end effector.
         gravity: (3,) m/s^2 in the base frame.
@@ -51,11 +51,11 @@ class Robot:
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
         damping: (n,) Nm s/rad and frictionloss: (n,) Nm from the file; 0 where the file has none.
-        velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit, sqrt(2
-            deceleration distance + offset^2) - offset at a distance from the position limit; None: no such limit.
+        velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit sqrt(2
+            deceleration distance + offset^2) - offset; distance: to the position limit. None: no limit of this kind.
         tool: the spherical tip that touches surfaces; None: no tool.
         lock: {joint: rad or m}, welded joints and their positions.
-        payload_max: (2,) kg and m, largest payload, and largest distance of its centre from the end effector.
+        payload_max: (2,) largest payload mass, kg, and largest distance, m, from end effector to payload centre.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Robot:
 
     @property
     def q_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """(low, high), (n,) rad: the position limits, but at most pi from home for a range above 2 pi."""
+        """(low, high), (n,) rad: the position limits; a range above 2 pi is cut to pi on either side of home."""
         more = self.q_max - self.q_min > 2 * np.pi
         low = np.where(more, np.maximum(self.q_min, self.q_home - np.pi), self.q_min)
         return low, np.where(more, np.minimum(self.q_max, self.q_home + np.pi), self.q_max)
@@ -178,8 +178,8 @@ def load_robot(
     Args:
         mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; None: the Panda.
         ee: site, body or link of the end effector; None: the only site, or the last link of a URDF.
-        q_home, q_min, q_max: rad. dq_max: rad/s. ddq_max: rad/s^2. tau_max: Nm. dtau_max: Nm/s.
-        gravity: (3,) m/s^2 in the base frame; None: the file's; for a URDF, that of an upright base.
+        q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; None: from the file or a default.
+        gravity: (3,) m/s^2 in the base frame; None: the file's gravity; for a URDF, gravity of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
         lock: {joint: rad or m}, joints to weld at these positions, such as a gripper's; None: none.
@@ -262,7 +262,7 @@ def _limits(
 def _payload_max(
     model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
 ) -> tuple[float, float]:
-    """Return `Robot.payload_max`: given values, or estimates from torque limits and reach from the second joint."""
+    """Return `Robot.payload_max`: the given values, or estimates from torque limits and the reach beyond joint 2."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     sites = [model.site(i).name for i in range(model.nsite)]

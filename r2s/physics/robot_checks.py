@@ -11,9 +11,9 @@ LIGHTEST = 1 / 500  # least link mass / moving mass: real wrists have 1/170 (UR1
 HEAVIEST = 2.0  # largest link mass / mass of all other links: up to 0.8 for the upper arm of a real arm
 DEGREES_FROM = 30.0  # limits between 30 rad and 360 rad are taken for degrees
 VIRTUAL = 0.01  # m: a link with joints closer than this is part of a universal joint and needs no mass
-WEIGHT = 2.0  # in tau_max: torque that an arm may need to hold its own weight in the worst posture
-POSTURES = 200  # number of postures in which this torque is compared
-WIDEST = 2.0  # in arm lengths: no link's mass lies farther from its centre
+WEIGHT = 2.0  # over tau_max: largest plausible gravity torque in the worst posture
+POSTURES = 200  # number of random postures in which gravity torque is computed
+WIDEST = 2.0  # arm lengths: no part of a link lies farther from its centre of mass
 DENSEST = 2e4  # kg/m^3, tungsten: no link has smaller moments than a tungsten ball of its mass
 
 
@@ -81,7 +81,7 @@ def gravity_of(model: mujoco.MjModel, path: Path) -> np.ndarray:
     """Return the file's gravity (3,) m/s^2, even if a flag of the simulation disables it.
 
     Raises:
-        UserError: it is zero.
+        UserError: the file's gravity is zero.
     """
     if not model.opt.gravity.any():
         raise UserError(
@@ -103,7 +103,7 @@ def check_limits(
     """Raise UserError unless position and torque limits are complete and q_home lies within them.
 
     Args:
-        model, path: of the file. low, high, home: (n,) rad. torque: (n,) Nm.
+        model, path: the arm and its file. low, high: (n,) rad, limits. home: (n,) rad. torque: (n,) Nm, limits.
         unset: joints whose limits in the file are 0 to 0.
     """
     if unset:
@@ -195,7 +195,7 @@ def _weight(model: mujoco.MjModel, gravity: np.ndarray, home: np.ndarray) -> np.
 
 
 def torque_limits(model: mujoco.MjModel) -> np.ndarray:
-    """Return the torque limits (n,) Nm of the joints' actuatorfrcrange or of their motors; nan: none in the file."""
+    """Return the torque limits (n,) Nm from the joints' actuatorfrcrange or their motors; nan: the file has none."""
     limit = np.where(model.jnt_actfrclimited.astype(bool), np.abs(model.jnt_actfrcrange).min(1), np.nan)
     for i in range(model.nu):
         joint = model.actuator_trnid[i, 0]

@@ -1,4 +1,4 @@
-"""Reader of the arm in an MJCF or URDF file: it drops what only a simulation needs, and welds locked joints.
+"""Reader for the arm in an MJCF or URDF file: it drops elements of the simulation and welds locked joints.
 
 Objects on free joints, as in the file of a scene, are dropped. A gripper's fingers are welded at the positions in
 `robot.lock` and become part of the link that carries them.
@@ -27,7 +27,7 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
         lock: {joint: rad or m}: joints that are welded at a position, such as a gripper's or a rail's.
 
     Raises:
-        UserError: the file is not valid, or has no such joint.
+        UserError: the file is not valid, or does not contain a joint of `lock`.
     """
     if is_urdf(path):
         return read_urdf(path, lock)
@@ -48,9 +48,9 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
 
 
 def strip(spec: mujoco.MjSpec) -> None:
-    """Remove what describes a simulation and not the arm: motors, sensors, keyframes, physics switches.
+    """Remove elements that describe the simulation, not the arm: motors, sensors, keyframes, physics switches.
 
-    A motor's damping is added to its joint; for its rotor see `rotors`. The file must have passed `check_arm`.
+    A motor's damping is added to its joint; `rotors` reads the rotor inertia. The file must have passed `check_arm`.
     """
     for actuator in spec.actuators:
         joint = spec.joint(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
@@ -91,7 +91,7 @@ def _remove(spec: mujoco.MjSpec, loose: list[mujoco.MjsBody]) -> None:
 
 
 def _forget(spec: mujoco.MjSpec, names: set[str]) -> None:
-    """Delete sensors, and the equalities, tendons and actuators that name one of these elements."""
+    """Delete all sensors, and the equalities, tendons and actuators that refer to one of `names`."""
     for sensor in spec.sensors:
         spec.delete(sensor)
     for tendon in spec.tendons:
@@ -143,7 +143,7 @@ def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
 
 
 def _lump(spec: mujoco.MjSpec, welded: set[str | int]) -> None:
-    """Add the inertia of welded bodies, and of all that they carry, to the moving links that carry them."""
+    """Add the inertia of welded bodies, and of bodies fixed to them, to the moving links that carry them."""
     model = spec.compile()
     bodies, of = Bodies(model), {body.id: body for body in spec.bodies}
     carriers = {int(model.body_weldid[body.id]) for body in of.values() if (body.name or body.id) in welded}

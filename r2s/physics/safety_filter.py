@@ -29,8 +29,8 @@ from r2s.physics.robot import Robot
 
 # Latency budget, s: delays up to 8 ms and lags up to 3 ms on real arms, and one cycle.
 LATENCY_S = 0.012
-# 1/s. A first-order loop with delay d does not overshoot for rate * d <= 1/e: at equality s + rate exp(-s d) = 0 has
-# a double real root.
+# 1/s, rate of rule 2. A first-order loop with delay d does not overshoot for rate * d <= 1/e: at equality
+# s + rate exp(-s d) = 0 has a double real root.
 RATE = round(1 / (math.e * LATENCY_S))
 APPROACH = 0.25 * RATE  # 1/s, allowed speed per distance from a position limit: critical damping of the loop
 ALLOWED = 0.66  # share of dq_max that the filter allows; unmodelled friction adds to it (docs/explanation/safety.md)
@@ -46,7 +46,7 @@ TOLERANCE = 1e-9  # rad/s^2, tolerance of the acceleration bounds
 PIVOTS = 5  # block pivoting rounds before single pivots, which always terminate (Murty 1974)
 ROUNDS = 100
 FRICTION_WIDTH = 0.05  # rad/s, width of the sign change of friction
-FRICTION_SHARE = 0.5  # share of the friction estimate that widens the bounds; only of joints with added inertia
+FRICTION_SHARE = 0.5  # share of the friction estimate that widens the bounds; only for joints with added inertia
 DELAY_PHASE = 1.25  # rad, phase lag that the delay may cause in a loop; pi / 2 is the stability limit
 
 # Columns of the limits (n, COLUMNS), one row per joint.
@@ -69,7 +69,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return the limits (n, COLUMNS) of `filter_torque`.
 
     Light joints get added inertia (column ADDED), just enough that a full action of this joint or of a coupled one
-    passes the filter at rest. Added inertia makes the joint's loop faster than RATE, so DELAY_PHASE bounds it.
+    passes the filter at rest. Added inertia makes the joint's loop faster than RATE; DELAY_PHASE bounds the inertia.
 
     Args:
         robot: position, velocity, torque and rate limits, and the mass matrix at home.
@@ -204,7 +204,7 @@ def limit_rate(last, limits, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _torque_share(q, dq, limits):
-    """Return the share of the policy's torque that remains near a limit: rule 1."""
+    """Return the factor on the policy's torque near a limit, from 1 to 0 (rule 1)."""
     near = 0.0
     for j in range(len(q)):
         near = max(near, (abs(dq[j]) / limits[j, DQ_MAX] - ALLOWED) / (FADED - ALLOWED))

@@ -34,15 +34,15 @@ from r2s.physics.robot import SIM_DT, Robot
 
 
 class Simulator:
-    """`nsim` arms stepped together on `nthread` threads (0: all), each with its own Dynamics.
+    """Batch of `nsim` simulated arms, each with its own `Dynamics`, on `nthread` threads (0: all).
 
     Results are bit-identical at any thread count.
 
     Args:
-        robot, dynamics: the arm; dynamics of one arm or of `nsim`. nsim: arms. nthread: threads.
-            With `robot.tool`, each arm may have a surface (`Dynamics.surface`).
-        dt: s, of a physics step.
-        control: law that maps commands to torques; None: `rollout` takes torques.
+        robot: the arm; with `robot.tool`, each simulated arm may have a surface (`Dynamics.surface`).
+        dynamics: one for all arms, or a batch of `nsim`. nsim, nthread: numbers of arms and threads.
+        dt: s, duration of a physics step.
+        control: law that maps commands to torques; None: the caller passes torques to `rollout`.
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class Simulator:
         self._bodies = self.model.jnt_bodyid
         self._site = self.model.site(robot.ee_site).id
         self._user = self.batch.expand("jnt_user")
-        self._damping = self.batch.expand("dof_damping")  # the friction law writes it: must not be shared by threads
+        self._damping = self.batch.expand("dof_damping")  # one array per arm, because the friction law writes it
         self._armature = self.batch.expand("dof_armature")
         self._inertia = self.batch.expand("body_inertia")
         self._iquat = self.batch.expand("body_iquat")
         self._mass, self._com = self.batch.expand("body_mass"), self.batch.expand("body_ipos")
-        self._offset = np.zeros((nsim, robot.n))  # of the dynamics, without the torques of `push`
+        self._offset = np.zeros((nsim, robot.n))  # offsets of the dynamics, without the torques of `push`
         self.q = self.batch.bind("qpos")
         self.dq = self.batch.bind("qvel")
         self._memory = self.batch.bind("userdata")
@@ -122,13 +122,13 @@ class Simulator:
         soft_start_s: float = 0.0,
         push_limit: PushLimit | None = None,
     ) -> None:
-        """Put control law, low-pass and limits, safety filter, delay and lag between `rollout` and the joints.
+        """Insert control law, low-pass and limits, safety filter, delay and lag between `rollout` and the joints.
 
         Without a control law the torques of `rollout` are efforts: they enter the safety filter directly.
 
         Args:
             limits: (n, COLUMNS), see `r2s.physics.safety_filter.filter_limits`.
-            torque_limit: (n,) Nm, largest target. cutoff_hz: low-pass on it. soft_start_s: s, in each episode.
+            torque_limit: (n,) Nm, largest target. cutoff_hz: Hz, low-pass. soft_start_s: s, fade-in of an episode.
             push_limit: limit for a robot with a tool; None: pushes are not limited.
         """
         u = native
@@ -181,7 +181,7 @@ class Simulator:
         return {name: array.copy() for name, array in self._arrays().items()}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore what `state` returned; the same torques then give the same motion, bit for bit."""
+        """Restore an output of `state`; the same torques then cause the same motion, bit for bit."""
         for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com", "_offset", "_surfaces"):
             self._arrays()[name][:] = state[name]
         self.batch.set_const()
@@ -222,12 +222,12 @@ class Simulator:
 
     @property
     def contact_force(self) -> np.ndarray:
-        """(nsim, 3) N on the tool in the base frame, mean of the last step; only of a robot with a tool."""
+        """(nsim, 3) N, force on the tool in the base frame, mean over the last step; requires a tool."""
         return self._contact[:, FORCE : FORCE + 3]
 
     @property
     def box(self) -> np.ndarray:
-        """(nsim, 6), centre m and first axis of the box that the tool pushes; only of a robot with a tool."""
+        """(nsim, 6), pose of the box that the tool pushes: centre, m, and first axis; requires a tool."""
         return box_pose(self._contact)
 
     @property
@@ -236,7 +236,7 @@ class Simulator:
         return self._contact[:, DEPTH]
 
     def contact_torque(self) -> np.ndarray:
-        """Return (nsim, n) Nm, the joint torques of `contact_force`; only of a robot with a tool."""
+        """Return (nsim, n) Nm, the joint torques of `contact_force`; requires a tool."""
         c, last = self._contact, self._bodies[-1]
         axes = self._xmat[:, last].reshape(-1, 3, 3)
         point = self._xpos[:, last] + (axes @ c[:, TIP : TIP + 3, None])[..., 0]

@@ -1,20 +1,20 @@
-"""A box that slides on a table when a tip pushes it; it adds three velocities to the implicit contact of contact.py.
+"""Dynamics of a box that a tip pushes on a table: three more velocities in the implicit contact of contact.py.
 
 Table friction: the limit surface is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
 Tanie, IROS 1992). With the velocity v of the centre, the spin w, the normal force N and u = (v, r w), the generalized
-force on u is -mu N u / |u|. The ratio r of moment to force is the mean distance of the base's points from the centre
+friction on u is -mu N u / |u|. The ratio r of moment to force is the base points' mean distance from the centre
 (uniform pressure). Friction of a resting box is elastic up to the same limit: the deflection z follows dz/dt = u -
 |u| z / `RIGID`, with backward Euler, and the force is -mu N z / RIGID. In sliding both laws agree.
 
-MuJoCo's solver does not simulate this body, so that one compiled law serves training, twins and engines, one solution
-contains joint friction and box, and arms without a box do not change. The box stays on its base: it neither
-tilts nor lifts (`check_size` in box.py). The vertical force of the tip only loads the base, and the tip does not
-touch the table.
+The box is not a body of MuJoCo. So training, twins and engines share one compiled law, one solution contains joint
+friction and box, and simulations without a box do not change. The box stays on its base: it neither tilts nor lifts
+(`check_size` in box.py). The vertical force of the tip only changes the load on the base, and the tip does not touch
+the table.
 
 In a step the force F on the tip is linear in the velocities of tip and box: F = F0 - K d, where d is the change of
 the tip's velocity relative to the box. The box's velocity after the step is linear in F, with the mobility h W at the
 contact. So the box is eliminated: F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is the change of the tip's
-velocity and d_0 that of the box's velocity without F. The joints meet this softer contact.
+velocity and d_0 that of the box's velocity without F. The joint equations contain this softer contact.
 """
 
 import numpy as np
@@ -46,7 +46,7 @@ from r2s.physics.contact_layout import (
 )
 
 RIGID = 1e-6  # m, largest elastic deflection of a box on its table
-STILL = 1e-6  # m/s, below which an untouched box is at rest: its friction stops it within 1 ms from 4e-3 m/s
+STILL = 1e-6  # m/s, an untouched slower box is at rest: table friction stops a box from 4e-3 m/s within 1 ms
 ROUNDS = 30  # largest number of guesses of the box's speed
 CLOSE = 1e-4  # relative error of the speed at which the guesses end
 
@@ -79,14 +79,14 @@ def contact_point_velocity(contact, motion, out):
 
 @njit(cache=True, error_model="numpy")
 def _grip(contact, speed, h):
-    """Return spring, N/m, and damper, N s/m, of table friction -(spring z + damper u'), with u' after the step."""
+    """Return spring, N/m, and damper, N s/m, of table friction -(spring z + damper u'); u': u after the step."""
     stiff = contact[LOAD] / RIGID / (1.0 + h * speed / RIGID)
     return stiff, h * stiff
 
 
 @njit(cache=True, error_model="numpy")
 def _free_change(contact, speed, h, out):
-    """Write the box's change of motion (4,) in a step without tip; return mobilities times h, s/kg, s/(kg m^2)."""
+    """Write the change of the box's motion (4,) without tip force; return h times mobilities, s/kg, s/(kg m^2)."""
     spring, damper = _grip(contact, speed, h)
     reach, strain = contact[REACH], contact[STRAIN : STRAIN + 4]
     along = h / (contact[MASS] + h * damper)
@@ -99,7 +99,7 @@ def _free_change(contact, speed, h, out):
 
 @njit(cache=True, error_model="numpy")
 def _pushed(contact, force, change, along, about, out):
-    """Write the box's motion (4,) after a step in which the force (3,) N acts on the tip, and minus it on the box."""
+    """Write the box's motion (4,) after a step with the contact `force` (3,) N on the tip and -force on the box."""
     up, lever = contact[UP : UP + 3], np.empty(3)
     _cross(up, contact[ARM : ARM + 3], lever)
     upwards, moment = 0.0, 0.0
@@ -119,7 +119,7 @@ def _speed(contact, motion):
 
 @njit(cache=True, error_model="numpy")
 def _next_speed(contact, old, found, h):
-    """Return the next guess. On a line, found = free old / (old + h load / mass), free: speed without friction."""
+    """Return the next guess. In straight motion found = free old / (old + h load / mass), free: frictionless."""
     if old <= 0.0:
         return found
     slowing = h * contact[LOAD] / contact[MASS]
@@ -136,7 +136,7 @@ def start_box(contact, guess):
 def yielding(contact, force, h, guess):
     """Write FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m of the contact with a box that yields.
 
-    force: (3,) N, on the tip if the tip's velocity relative to the box did not change.
+    force: (3,) N, force on the tip for an unchanged velocity of the tip relative to the box.
     """
     change, lever, point = np.empty(4), np.empty(3), np.empty(3)
     along, about = _free_change(contact, guess[BOX_SPEED], h, change)
@@ -181,9 +181,9 @@ def _divide(a, vector, matrix):
 
 @njit(cache=True, error_model="numpy")
 def yielded(contact, tip, h, guess, point):
-    """Write the box's velocity at the contact to `point` for the tip's (3,) m/s, after the step; return an error.
+    """Write the box's velocity at the contact to `point`; return the relative error of table friction.
 
-    The error is that of table friction due to the guessed speed of the box, as a share of the friction.
+    tip: (3,) m/s, tip velocity; both velocities are those after the step. The guessed box speed causes the error.
     """
     force, change = np.empty(3), np.empty(4)
     for i in range(3):
@@ -201,7 +201,7 @@ def yielded(contact, tip, h, guess, point):
 
 @njit(cache=True, error_model="numpy")
 def move_box(contact, motion, h):
-    """Move the box for h s with its motion (4,) after the step; write this motion and the elastic deflection."""
+    """Move the box for h s with `motion` (4,), its motion after the step; store motion and elastic deflection."""
     share, length = 1.0 / (1.0 + h * _speed(contact, motion) / RIGID), 0.0
     for k in range(4):
         rate = motion[k] if k < 3 else contact[REACH] * motion[3]
@@ -227,7 +227,7 @@ def move_box(contact, motion, h):
 
 @njit(cache=True, error_model="numpy")
 def slide(contact, h):
-    """Move the box for a step in which the force of the contact is known."""
+    """Move the box for a step of h s under the contact force in `contact`."""
     force, motion, change = contact[FORCE : FORCE + 3], np.empty(4), np.empty(4)
     touched = force[0] != 0.0 or force[1] != 0.0 or force[2] != 0.0
     speed = _speed(contact, contact[VELOCITY : VELOCITY + 4])

@@ -7,7 +7,7 @@ located exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynam
 Time stepping would apply the friction at the end of a step to the whole step: at each reversal, an error of up to h
 times that friction.
 
-Joint limits are MuJoCo's own: their force adds to the result of this module.
+MuJoCo simulates the joint limits; their force is added to the result of this module.
 """
 
 from typing import NamedTuple
@@ -25,8 +25,8 @@ class JointForces(NamedTuple):
     """Velocities and torques of n joints at the beginning of a step.
 
     dq: (n,) rad/s. drive: (n,) Nm, all torques but friction. friction: (n,) Nm at dq. rest: (2, n) Nm, kinetic
-    friction at zero speed in the negative and the positive direction. edges: (2, n) Nm, breakaway, at least `rest`;
-    edges of 0: no stiction.
+    friction at zero speed in the negative and the positive direction. edges: (2, n) Nm, breakaway, at or
+    beyond `rest`; 0: no stiction.
     """
 
     dq: np.ndarray

@@ -26,7 +26,7 @@ class Tool:
 
     Attributes:
         tip: (3,) m, centre of the sphere in the frame of the end effector's site.
-        radius: m. mass: kg, at the centre; its inertia counts if it is a payload as well (r2s/physics/payload.py).
+        radius: m. mass: kg, at the centre; r2s simulates it only if it is also a payload (r2s/physics/payload.py).
     """
 
     tip: np.ndarray
@@ -36,7 +36,7 @@ class Tool:
 
 @dataclass(frozen=True)
 class Surface:
-    """A compliant plane or box in the base frame; for many arms at once, each field with any batch shape.
+    """A compliant plane or box in the base frame; fields may have batch axes, for many arms at once.
 
     Attributes:
         point: (3,) m, on the plane, or the centre of the box.
@@ -44,7 +44,7 @@ class Surface:
         stiffness: N/m, k, force per depth at 1 mm. exponent: e, 1 (linear) to 1.5 (Hertz).
         damping: s/m, c. friction: mu. bristle: m, tangential deflection at which friction reaches mu F; 0: rigid.
         half: (3,) m, half edges of a box; None: a plane. axes: (3, 3), its axes in columns.
-        mass: kg, of a box that slides on a table when it is pushed (sliding.py); None: the surface is fixed.
+        mass: kg, mass of a box that slides on a table if pushed (sliding.py); None: the surface is fixed.
         table: friction coefficient between that box and its table.
     """
 

@@ -6,7 +6,7 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.robot import Robot
 
-BELOW = 0.15  # gap from tip to nominal surface over the end effector's distance from the base, at home
+BELOW = 0.15  # gap between tip and nominal surface at home, over the end effector's distance from the base
 POSTURE = 1e-3  # m^2, damping of the steps of inverse kinematics
 MARGIN = 0.1  # rad, distance of inverse kinematics from the position limits
 CLOSE = 1e-4  # m, position error at which inverse kinematics ends
@@ -68,7 +68,7 @@ def default_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nominal_plane(robot: Robot, point: object = None, normal: object = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return point (3,) m and unit normal (3,) of a plane; None: the value of `default_plane`."""
+    """Return point (3,) m and unit normal (3,) of a plane; `default_plane` replaces None."""
     default = default_plane(robot)
     values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), default, strict=True)]
     for name, value in zip(("point", "normal"), values, strict=True):

@@ -1,7 +1,7 @@
 """URDF reader: links, joints, limits, rotor inertia and primitive shapes.
 
 Meshes, materials and elements for simulators are ignored. The base and links fixed to it do not move, so their
-inertia does not count. A link fixed to a moving one becomes part of it.
+inertia is ignored, too. A link that is fixed to a moving link becomes part of the moving link.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,7 +19,7 @@ ROUNDED = 1e-9  # tolerated round-off of a tensor in the file, as a share of its
 DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements; URDF itself has none
 ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
 ET.register_namespace("drake", DRAKE)
-NO_RANGE = "limits 0 to 0"  # `info` of a joint with this range
+NO_RANGE = "limits 0 to 0"  # marks such a joint in `info`
 COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers in an attribute; 1 in all others
 
 
@@ -37,7 +37,7 @@ def is_urdf(path: Path) -> bool:
 def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
-    Bodies and joints keep their names, joints their damping and friction. The joints in `lock` ({name: rad or m})
+    Names of bodies and joints, damping and friction are those of the file. The joints in `lock` ({name: rad or m})
     become fixed at these positions, and so do joints that mimic them.
 
     Raises:
@@ -108,7 +108,7 @@ class _Reader:
         return out
 
     def _lock(self, at: dict[str, float]) -> None:
-        """Fix joints at positions, rad or m, and with them the joints that mimic them."""
+        """Fix joints, and joints that mimic them, at positions, rad or m."""
         for name in at:
             if name not in self.joints:
                 joints = choices(self.joints)
@@ -137,7 +137,7 @@ class _Reader:
                 joint.remove(mimic)
 
     def _axis(self, joint: ET.Element) -> np.ndarray:
-        """Return the unit axis (3,) of a joint, in its frame."""
+        """Return the unit axis (3,) of a joint, in the joint's frame."""
         axis = joint.find("axis")
         along = np.array([1.0, 0.0, 0.0]) if axis is None else self._numbers(axis, "xyz", "1 0 0", _what(joint))
         if np.linalg.norm(along) < 1e-6:
@@ -249,7 +249,7 @@ class _Reader:
         return combined(parts)
 
     def _inertial(self, name: str) -> Inertia | None:
-        """Return a link's own inertia in its frame, None if it has no mass."""
+        """Return the inertia of a link alone, in the link's frame; None if the link has no mass."""
         what, element = f"link '{name}'", self.links[name].find("inertial")
         if element is None:
             return None

@@ -1,4 +1,4 @@
-"""Poses, and the masses, centres of mass and tensors of bodies that are welded to moving ones."""
+"""Inertia of moving bodies together with the bodies welded to them, and helpers for poses."""
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ def combined(parts: list[Inertia]) -> Inertia:
 
 
 class Bodies:
-    """Masses, centres of mass and tensors of all bodies, and the poses of welded bodies in the moving ones."""
+    """Masses, centres of mass and tensors of all bodies, and the poses of welded bodies in moving ones."""
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model

@@ -5,16 +5,16 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.recordings.recording import Recording
 
-LEAST = 0.02  # rad RMS, least motion about a linear trend that determines a factor
-UNEXPLAINED = 0.03  # largest share of that motion's mean square that the factor may leave unexplained
-WRONG = 0.1  # a factor this far from 1 is an error; filters of dq and elastic gears change it by 1 to 2 %
-ALIKE = 0.05  # largest relative spread of the joints' factors if the clock is their cause
+LEAST = 0.02  # rad RMS about a linear trend; a joint that moves less has no speed factor
+UNEXPLAINED = 0.03  # a speed factor is valid if it explains all but this share of the joint's mean square motion
+WRONG = 0.1  # a speed factor this far from 1 is an error; filters of dq and elastic gears change it by 1 to 2 %
+ALIKE = 0.05  # if the joints' speed factors spread less than this (relative), the clock or the unit of dq is wrong
 
 
 def speed_factors(recording: Recording) -> np.ndarray:
-    """Return the ratio (n,) of the change of q to the integral of dq; nan where motion does not determine it.
+    """Return each joint's ratio (n,) of the change of q to the integral of dq; nan if motion does not determine it.
 
-    A linear trend is removed from both in each trajectory, so that a bias of dq has no effect.
+    A linear trend is removed from q and from the integral in each trajectory, so that a bias of dq has no effect.
     """
     square, cross, own = np.zeros((3, recording.n_joints))
     for s in recording.stretches:
@@ -22,7 +22,7 @@ def speed_factors(recording: Recording) -> np.ndarray:
         if len(t) < 3:
             continue
         trend = np.linalg.qr(np.column_stack([np.ones(len(t)), t - t.mean()]))[0]
-        for j in range(recording.n_joints):  # one joint at a time: an hour of a log is large
+        for j in range(recording.n_joints):  # one joint at a time saves memory: an hour of a log is large
             q, dq = recording.q[s, j], recording.dq[s, j]
             area = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(t) * (dq[1:] + dq[:-1]))])
             x, y = (v - trend @ (trend.T @ v) for v in (area, q - q[0]))
@@ -34,10 +34,10 @@ def speed_factors(recording: Recording) -> np.ndarray:
 
 
 def check_clock(recording: Recording) -> np.ndarray:
-    """Return `speed_factors` (n,), all near 1 or nan.
+    """Return `speed_factors` (n,) after a check that each of them is near 1 or nan.
 
     Raises:
-        UserError: t runs too fast or too slow for the speeds, or dq of a joint has another scale than q.
+        UserError: t is too fast or too slow for the velocities, or a joint's dq has another scale than its q.
     """
     factor = speed_factors(recording)
     seen = np.flatnonzero(np.isfinite(factor))

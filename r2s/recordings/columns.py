@@ -1,4 +1,4 @@
-"""Find the columns of t, q, dq, tau and trajectory in a file: by default names, numbers or joint names."""
+"""Find the columns of t, q, dq, tau and trajectory in a file, by default names, numbered names or joint names."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,18 +10,18 @@ from r2s.recordings.csv_table import bare_name
 from r2s.recordings.robot_logs import Table, choose_joints
 
 Spec = str | list[str] | None
-DEFAULT_COLUMNS = {  # of these names, the first that the file has counts
+DEFAULT_COLUMNS = {  # field -> default column names; the first one in the file is used
     "t": ("t",),
     "q": ("q",),
     "dq": ("dq",),
     "tau": ("tau",),
     "trajectory": ("segment", "trajectory"),
 }
-TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # tried before a column tau
-NAMES = ("joint_names", "joints", "names", "name")  # possible names of an array of joint names, as in .npz or HDF5
-CURRENT = ("current", "i")  # read instead of torque if there is a torque constant
+TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # kind of torque -> column name
+NAMES = ("joint_names", "joints", "names", "name")  # names that an array of joint names may have in .npz or HDF5
+CURRENT = ("current", "i")  # columns of motor current, read instead of torque if the user sets a torque constant
 OPTIONAL = ("dq", "trajectory")
-WORDS = {  # for a field, in a column name that also has the name of a joint
+WORDS = {  # field -> words for it in a column name that also contains the name of a joint
     "q": ("q", "position", "positions", "pos", "angle"),
     "dq": ("dq", "qd", "velocity", "velocities", "vel", "speed"),
     "tau": ("tau", "effort", "efforts", "torque"),
@@ -29,7 +29,7 @@ WORDS = {  # for a field, in a column name that also has the name of a joint
 
 
 def specs_of(columns: Mapping[str, Spec]) -> dict[str, Spec]:
-    """Return the column names that the user gives for each field; None for a field without."""
+    """Return {field: the user's column names without units, or None} for each field in `DEFAULT_COLUMNS`."""
     for key in columns:
         if key not in DEFAULT_COLUMNS:
             raise UserError(f"unknown key '{key}' in data.columns; {instead_of(key, DEFAULT_COLUMNS)}")
@@ -37,14 +37,14 @@ def specs_of(columns: Mapping[str, Spec]) -> dict[str, Spec]:
 
 
 def _bare(spec: Spec) -> Spec:
-    """Return names without their units, as they are in the table."""
+    """Return the user's column names without units, because the names in the table have none."""
     if spec is None or isinstance(spec, str):
         return None if spec is None else bare_name(spec)[0]
     return [bare_name(str(name))[0] for name in spec]
 
 
 def _is_current(name: str) -> bool:
-    """Return whether a column's name denotes a current, which must not be read as a torque."""
+    """Return whether a column name denotes a current, which must not be read as torque."""
     base = name.rsplit("/", 1)[-1].lower()
     return "current" in base or re.fullmatch(r"i(_?(\d+|\{[ij]\})|\[\d+\])?", base) is not None
 
@@ -57,9 +57,9 @@ def find_columns(
     constant: np.ndarray | None = None,
     robot_joints: Sequence[str] | None = None,
 ) -> list[str]:
-    """Return the names of a field's columns; [] if an optional field has none.
+    """Return the names of a field's columns; [] if the field is optional and the file lacks it.
 
-    robot_joints: names of the robot's joints. Columns that are named after joints are returned in this order.
+    Columns that are named after joints are returned in the order of `robot_joints`, the names of the robot's joints.
     """
     candidates = DEFAULT_COLUMNS[field]
     if field == "tau":
@@ -89,7 +89,7 @@ def find_columns(
 
 
 def _match(table: Table, field: str, name: str) -> list[str]:
-    """Return the columns that a name denotes: one, or numbered ones."""
+    """Return the columns that `name` denotes: the column with this name, or its numbered columns."""
     if field in ("t", "trajectory"):
         return [name] if name in table else []
     if name in table and table[name].ndim > 1:
@@ -104,7 +104,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
-    """Return the index of the joint that a column is named after, or -1, and the rest of its name in lower case."""
+    """Return the index of the joint in a column's name (-1: none) and the rest of the name in lower case."""
     lower = column.lower()
     cores = [re.sub(r"^joint_|_joint$", "", joint.lower()) for joint in robot_joints]
     for k in sorted(range(len(cores)), key=lambda k: -len(cores[k])):
@@ -115,7 +115,7 @@ def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
 
 
 def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -> list[str]:
-    """Return one column per joint of the robot, named after the joint and one of `words`; [] if one is missing."""
+    """Return a column per joint, named after the joint and the same one of `words`; [] if a joint has no column."""
     found: dict[str, dict[int, str]] = {}
     for column in table:
         joint, rest = _joint_of(column, robot_joints)
@@ -129,7 +129,7 @@ def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -
 
 
 def _check_order(names: list[str], field: str, robot_joints: Sequence[str]) -> None:
-    """Raise UserError if the user's list names the robot's joints in another order."""
+    """Raise UserError if the user's columns are named after all joints of the robot, but in another order."""
     joints = [_joint_of(name, robot_joints)[0] for name in names]
     every = list(range(len(robot_joints)))
     if every and joints != every and sorted(joints) == every:
@@ -141,11 +141,11 @@ def _check_order(names: list[str], field: str, robot_joints: Sequence[str]) -> N
 
 
 def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[str] | None, n: int | None) -> Table:
-    """Return the table with the robot's joints in each (T, m) array, in the robot's order, as found by name.
+    """Return the table with each (T, m) array reduced to the robot's joints, in the robot's order, found by name.
 
     Args:
-        table: columns of the file. The joint names (m,) are the first text array with a name in NAMES.
-        user: data.joints. robot_joints, n: names and number of the robot's joints.
+        table: columns of the file. The first text array with a name in NAMES contains the file's joint names (m,).
+        user: the user's joint names, data.joints. robot_joints, n: names and number of the robot's joints.
 
     Raises:
         UserError: the user names joints, but the file does not, or a joint is missing.
@@ -167,7 +167,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return the columns with numbers at {} in `pattern`, from `first` (None: 0 if present, else 1) without a gap."""
+    """Return the columns named `pattern` with {} = first, first + 1, ... (first None: 0 if present, else 1)."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)
@@ -181,7 +181,7 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Return the error for a missing column; it does not suggest another kind of torque as if it were a typo."""
+    """Return the error for a missing column; a column with another kind of torque is not suggested as a typo."""
     if field == "tau" and _match(table, "q", "ddq"):
         return UserError(
             "no torque, but ddq: this is a planned motion; let the arm follow it, and give the arm's own log"
@@ -201,6 +201,6 @@ def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError
 
 
 def listed(names: Iterable[str], limit: int = 40) -> str:
-    """Return at most `limit` names for an error message."""
+    """Return names as text for an error message, at most `limit` of them."""
     names = list(names)
     return choices(names[:limit]) + (f", ... ({len(names)} in all)" if len(names) > limit else "")

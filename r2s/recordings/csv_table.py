@@ -1,4 +1,4 @@
-"""Read CSV files of spreadsheets, NumPy, ROS and vendors: separators, comments, units, decimal commas."""
+"""Read CSV files of spreadsheets, NumPy, ROS and vendors, with any separators, comments, units, decimal commas."""
 
 import csv
 import re
@@ -9,8 +9,8 @@ import pandas as pd
 
 from r2s.errors import UserError
 
-HEAD = 1 << 16  # bytes at the start of a file, in which the header must be
-MARKS = "#%"  # begin a comment line, or the header (NumPy, rostopic echo -p)
+HEAD = 1 << 16  # bytes; the header must be within this length from the start of the file
+MARKS = "#%"  # characters that begin a comment line, or the header (NumPy, rostopic echo -p)
 UNITS = {
     "rad": 1.0, "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180, "mrad": 1e-3,
     "rad/s": 1.0, "deg/s": np.pi / 180, "°/s": np.pi / 180, "mrad/s": 1e-3, "rpm": np.pi / 30,
@@ -59,13 +59,13 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     )  # fmt: skip
     table: dict[str, np.ndarray] = {}
     for k, name in enumerate(x.strip() for x in names):
-        if name:  # of columns with one name, only the first keeps it
+        if name:  # a repeated name gets a number
             table[name if name not in table else f"{name}.{k}"] = _numbers(frame[k]).to_numpy()
     return table
 
 
 def _numbers(column: pd.Series) -> pd.Series:
-    """Return a column as numbers if it is text only because its last number is cut off, such as "-" or "1.2e"."""
+    """Return a column of text as numbers if only its last number is cut off, such as "-" or "1.2e"."""
     text = column.dtype.kind not in "iufb" and len(column) > 1
     if not text or not re.fullmatch(r"[+-]?[\d.]*(e[+-]?)?", str(column.iloc[-1])):
         return column
@@ -84,7 +84,7 @@ def without_units(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def bare_name(name: str) -> tuple[str, float]:
-    """Return a column's name without a unit in brackets at its end, and the factor to SI units."""
+    """Return a column's name without the bracketed unit at its end, and the factor from this unit to SI units."""
     found = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name)
     unit = found[2].strip().lower() if found else ""
     if not found or unit not in UNITS or (unit in ("a", "ma") and not found[1].lower().startswith(("i", "current"))):

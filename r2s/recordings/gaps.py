@@ -1,19 +1,19 @@
-"""The longest step in time within a trajectory: a longer one is a pause in the log."""
+"""Find pauses in a log: `longest_step` is the longest time step that is not a pause."""
 
 import numpy as np
 
 from r2s.errors import UserError
 
-LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; shorter pauses (lost frames) separate no trajectories
-SLOWEST_S = 0.2  # s, longest median step of a clock in seconds: below 5 Hz unit_checks.py checks nothing
+LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; a pause is longer than both, a shorter gap only lacks frames
+SLOWEST_S = 0.2  # s; a longer median step means that t is not in seconds; below 5 Hz unit_checks.py checks nothing
 SLACK = 1e-6  # relative tolerance for round-off: steps of a 20 Hz clock are not exactly 0.05 s
 
 
 def longest_step(steps: np.ndarray, max_gap_s: float | None = None) -> float:
-    """Return the longest step that does not count as a pause, s, with a tolerance of SLACK.
+    """Return the longest time step that is not a pause, s, increased by the relative tolerance SLACK.
 
     Args:
-        steps: (T,) s, of a log. max_gap_s: the user's; None: five times the median step, and at least 0.05 s.
+        steps: (T,) s, time steps of a log. max_gap_s: the user's limit; None: five median steps, at least 0.05 s.
 
     Raises:
         UserError: the median step exceeds `max_gap_s` (None: 0.2 s), so t is probably not in seconds.

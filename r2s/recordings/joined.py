@@ -1,4 +1,4 @@
-"""Join recordings of one arm and one kind of torque into one; each keeps its clock and its trajectories."""
+"""Join recordings of one arm, with the same kind of torque, into one; clocks and trajectories do not change."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,14 +8,14 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.recordings.recording import FIELDS, Recording
 
-SAME_RATE = 0.01  # largest relative difference of rates that count as equal
+SAME_RATE = 0.01  # largest relative difference of rates that are treated as equal
 DT = 1e-3  # s, common grid of recordings with different rates; r2s filters every recording on this grid
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
-    """Return one recording of all rows; if rates or command periods differ, each part is resampled to 1 kHz first.
+    """Return one recording of all rows. If rates or command periods differ, resample each recording to 1 kHz first.
 
-    Signals that not all recordings have are dropped. So is the period; `Recording.in_phase` finds a common one.
+    Signals that some recordings lack are dropped. Periods are dropped, too; `Recording.in_phase` finds a common one.
 
     Raises:
         UserError: the recordings differ in kind of torque or number of joints.

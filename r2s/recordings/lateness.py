@@ -1,4 +1,4 @@
-"""Lateness: the delay of the logged dq of a recording relative to its q."""
+"""Estimate and correct lateness: the delay of a recording's logged dq relative to its q."""
 
 from dataclasses import dataclass, replace
 
@@ -8,11 +8,11 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-COMPARED_S = 60.0  # s of a recording in which dq is compared with q
-EDGE = 100  # ms, dropped at both ends of a trajectory, where the filter has transients
-BLOCK = 500  # ms, length of blocks whose errors count as independent
+COMPARED_S = 60.0  # s, total length of the parts of a recording in which dq is compared with q
+EDGE = 100  # ms that are ignored at both ends of a trajectory, where the filter has transients
+BLOCK = 500  # ms, length of blocks whose errors are treated as independent
 LATE_S, SURE = 5e-4, 3.0  # s (half a step) and standard deviations; lateness below either is not corrected
-OFF = 0.05  # share of the speed; a dq whose remaining RMS error is larger is another signal
+OFF = 0.05  # share of the RMS speed; if the error of corrected dq is larger, dq is another signal
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class Lateness:
     """Lateness of dq against the derivative of q.
 
     Attributes:
-        s: (n,) s; nan: dq is not the derivative of q, or the joint does not move. sigma: (n,) s, its standard
-        deviation. filtered: whether s is the time constant of a first-order filter of dq; otherwise it is a delay.
+        s: (n,) lateness in s; nan: dq is not the derivative of q, or the joint does not move. sigma: (n,) s, standard
+        deviation of `s`. filtered: whether `s` is the time constant of a first-order filter of dq, or else a delay.
     """
 
     s: np.ndarray
@@ -36,11 +36,11 @@ class Lateness:
 
     @property
     def as_logged(self) -> "Lateness":
-        """Lateness that leaves dq as logged, except where `s` is nan: there, q still replaces dq."""
+        """Lateness of 0, so that dq is not corrected; where `s` is nan, the derivative of q still replaces dq."""
         return replace(self, s=0.0 * self.s)
 
     def corrected(self, smooth: Recording) -> np.ndarray:
-        """Return the velocity (T, n) rad/s without the lateness: from dq, or from q where the lateness is nan."""
+        """Return the corrected velocity (T, n) rad/s: from dq or, where the lateness is nan, from q."""
         return _corrected(smooth, self.sure, self.filtered)
 
 
@@ -50,10 +50,10 @@ def from_q(joints: int) -> Lateness:
 
 
 def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
-    """Return the lateness of dq, by least squares on motion below `cutoff_hz`, where a filter acts like a delay.
+    """Estimate the lateness of dq by least squares on motion below `cutoff_hz`, where a filter acts like a delay.
 
-    dq is often smoother than the derivative of q, so correcting its lateness is better than differentiating q. The
-    correction inverts a filter or a delay, whichever fits better.
+    dq is often smoother than the derivative of q, so correcting dq is better than differentiating q. The correction
+    inverts a first-order filter or a delay, whichever fits better.
     """
     smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
     slope, ddq, n = smooth.derivative(smooth.q), smooth.derivative(smooth.dq), recording.n_joints
@@ -80,7 +80,7 @@ def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
 
 
 def _corrected(smooth: Recording, late: np.ndarray, filtered: bool) -> np.ndarray:
-    """Return dq (T, n) rad/s without a filter or delay of `late` (n,) s; where that is nan, the derivative of q."""
+    """Return dq (T, n) rad/s without a filter or delay of `late` (n,) s, or the derivative of q if `late` is nan."""
     if filtered:
         out = smooth.dq + np.nan_to_num(late) * smooth.derivative(smooth.dq)
     else:

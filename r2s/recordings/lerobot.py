@@ -1,7 +1,7 @@
-"""Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet beside meta/info.json.
+"""Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet files and meta/info.json.
 
-Torque is unusual in such datasets. `write_dataset` stores commands as `action`, other torque as `observation.effort`.
-`lerobot_table` finds angles, velocities and torques by words in the names of features and of their elements.
+`write_dataset` stores commanded torque as `action`, other torque as `observation.effort`. In other datasets torque is
+rare; `lerobot_table` finds angles, velocities and torques by words in the names of features and their elements.
 """
 
 import json
@@ -24,10 +24,10 @@ from r2s.recordings.robot_logs import Table
 INFO = "meta/info.json"
 VERSION = "v3.0"
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
-QUANTILES = (1, 10, 50, 90, 99)  # %, of lerobot's stats.json
-CLOCK_TOLERANCE = 1e-4  # s, lerobot's own tolerance between a timestamp (float32) and frame_index / fps
+QUANTILES = (1, 10, 50, 90, 99)  # %, quantiles in lerobot's stats.json
+CLOCK_TOLERANCE = 1e-4  # s, lerobot's tolerance between a timestamp (float32) and frame_index / fps
 FILE = "chunk-000/file-000.parquet"
-WORDS = {  # word in the name of a feature or of its element -> field
+WORDS = {  # word in the name of a feature or of one of its elements -> field
     **dict.fromkeys(("effort", "efforts", "torque", "torques", "tau"), "tau"),
     **dict.fromkeys(("current", "currents"), "current"),
     **dict.fromkeys(("vel", "velocity", "velocities", "speed", "dq", "qd", "qvel"), "dq"),
@@ -44,15 +44,15 @@ def is_dataset(path: Path) -> bool:
 
 
 def dataset_files(folder: Path) -> list[Path]:
-    """Return the files of a dataset that a recording is read from."""
+    """Return the files of a dataset that `lerobot_table` reads."""
     return [folder / INFO, *sorted((folder / "data").glob("*/*.parquet"))]
 
 
 def lerobot_table(folder: Path) -> Table:
-    """Return t (T,) s, trajectory (T,), q, dq, tau, tau_J_d or current (T, m), and the names of their joints.
+    """Return t (T,) s, trajectory (T,), joint_names (m,) and, if stored, q, dq, tau, tau_J_d, current (T, m).
 
-    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode. Torque in an action
-    becomes tau_J_d. Features of a gripper, hand or pose are left out. The scalar `reader_note` names the sources.
+    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. Torque in an action
+    becomes tau_J_d. Features of a gripper, hand or pose are ignored. `reader_note` names the clock and features used.
 
     Raises:
         UserError: no torque in the dataset, another version, or a damaged file.
@@ -62,7 +62,7 @@ def lerobot_table(folder: Path) -> Table:
     channels = _channels(features)
     found: dict[str, dict[str, tuple[str, int, float]]] = {}
     for field, joint, place in channels:
-        found.setdefault(field, {}).setdefault(joint, place)  # of several features with this value, the first counts
+        found.setdefault(field, {}).setdefault(joint, place)  # the first feature with this field and joint is used
     torques = [field for field in ("tau", "tau_J_d", "current") if field in found]
     joints = [j for j in found.get("q", {}) if any(j in found[field] for field in torques)]
     if not joints:
@@ -93,7 +93,7 @@ def lerobot_table(folder: Path) -> Table:
 
 
 def _info(folder: Path) -> dict[str, Any]:
-    """Return the content of meta/info.json, checked."""
+    """Return the content of meta/info.json after checking it."""
     try:
         info = json.loads((folder / INFO).read_text())
         version, fps = str(info["codebase_version"]), info["fps"]
@@ -111,7 +111,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, int, float]]]:
-    """Return (field, joint, (feature, element's index, factor to SI units)) of each element that is of a joint."""
+    """Return (field, joint, (feature, element index, factor to SI units)) for each element of an arm joint."""
     out = []
     for feature, spec in features.items():
         shape = spec["shape"]
@@ -120,7 +120,7 @@ def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, in
         of = re.findall(r"[a-z]+", feature.lower())
         for k, element in enumerate(_elements(spec.get("names"), shape[0])):
             words = re.findall(r"[a-z]+", element.lower())
-            # the feature's own words go first: a feature of effort may have elements such as `elbow.pos`
+            # words of the feature have priority: a feature of effort may have elements such as `elbow.pos`
             field = next((WORDS[w] for w in [*reversed(of), *reversed(words)] if w in WORDS), None)
             field, action = field or ("q" if "state" in of else None), "action" in of
             if field is None or set(OTHERS) & {*words, *of} or (action and field != "tau"):
@@ -132,7 +132,7 @@ def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, in
 
 
 def _elements(names: Any, size: int) -> list[str]:
-    """Return the names of a feature's elements, from a list or a mapping to a list; else joint1, joint2 ..."""
+    """Return the element names of a feature from `names`, a list or {key: list}; without names: joint1, joint2 ..."""
     if isinstance(names, Mapping):
         names = next((x for x in names.values() if isinstance(x, list)), None)
     if isinstance(names, list) and len(names) == size:
@@ -141,7 +141,7 @@ def _elements(names: Any, size: int) -> list[str]:
 
 
 def _joint(element: str) -> str:
-    """Return an element's name without words for field and unit: `elbow` of `elbow.pos`, `joint2` of `tau_2`."""
+    """Return an element's name without words for field and unit: `elbow` for `elbow.pos`, `joint2` for `tau_2`."""
     known = {*WORDS, *DEGREES, "rad", "nm"}
     numbered = re.fullmatch(r"([a-z]+)[._ -]?(\d+)", element.lower())
     if numbered and numbered[1] in known:
@@ -155,7 +155,7 @@ def _joint(element: str) -> str:
 
 
 def _frames(folder: Path, columns: Sequence[str], total: int) -> pd.DataFrame:
-    """Return these columns of all files in data/, in order of episode and frame."""
+    """Return the given columns of all files in data/, sorted by episode and frame."""
     files = dataset_files(folder)[1:]
     if not files:
         raise UserError("no data/*/*.parquet: the dataset was not downloaded whole")
@@ -178,14 +178,14 @@ def write_dataset(
     more: Mapping[str, np.ndarray] | None = None,
     task: str = "recording",
 ) -> list[str]:
-    """Write a new folder that `lerobot` opens: an episode per trajectory, float32, with statistics.
+    """Write a recording as a new folder for `lerobot`: one episode per trajectory, in float32, with statistics.
 
-    The dataset's clock is frame_index / fps. A recording on another clock is resampled onto it; a returned line says
-    so.
+    The dataset's clock is frame_index / fps. A recording with another clock is resampled, and a line in the returned
+    list states this.
 
     Args:
-        joints: names of the n joints. robot: name of the arm. more: {feature: (T, k)} beside state and torque; it
-            is never resampled. task: text that describes the task of every episode.
+        joints: names of the n joints. robot: name of the arm. more: {feature: (T, k)}, further features; they are
+            never resampled. task: text that describes the task of every episode.
 
     Raises:
         UserError: the folder exists, or `more` is given and the recording must be resampled.
@@ -232,7 +232,7 @@ def write_dataset(
 
 
 def _write_files(folder: Path, info: Mapping[str, Any], data: Mapping[str, np.ndarray], task: str) -> None:
-    """Write the files of a dataset; `data` holds every feature as (T, k)."""
+    """Write the files of a dataset; `data` is {feature: (T, k)}, `info` the content of meta/info.json."""
     for place in ("data", "meta/episodes"):
         (folder / place / FILE).parent.mkdir(parents=True)
     columns = {
@@ -257,7 +257,7 @@ def _write_files(folder: Path, info: Mapping[str, Any], data: Mapping[str, np.nd
 
 
 def _statistics(x: np.ndarray) -> dict[str, list[float]]:
-    """Return lerobot's statistics of values (T, k)."""
+    """Return the statistics that lerobot stores for values (T, k)."""
     out = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0, dtype=float), "std": x.std(0, dtype=float)}
     out |= {f"q{p:02d}": np.percentile(x, p, axis=0) for p in QUANTILES}
     return {**{k: v.tolist() for k, v in out.items()}, "count": [len(x)]}

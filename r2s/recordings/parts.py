@@ -1,4 +1,4 @@
-"""Parts of a long recording: all of it piece by piece, or some of it spread over the whole."""
+"""Process a long recording in parts: in successive pieces, or in stretches spread over the recording."""
 
 import ctypes
 import sys
@@ -11,24 +11,24 @@ import numpy as np
 from r2s.recordings.recording import Recording
 
 LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of MB
-MANY = 9  # pieces of a minute; the arrays of more take hundreds of MB, too
+MANY = 9  # number of one-minute pieces; the arrays of more pieces take hundreds of MB, too
 
 
 def trim() -> None:
-    """Return freed memory to the system; glibc would keep blocks of up to 32 MB."""
+    """Return freed memory to the operating system; otherwise glibc may retain blocks of up to 32 MB."""
     free = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None  # musl has none
     if free is not None:
         free(0)
 
 
 def give_back(recording: Recording) -> None:
-    """Return freed memory to the system after work on a long recording."""
+    """Return freed memory to the operating system if the recording is longer than LONG_S."""
     if recording.duration > LONG_S:
         trim()
 
 
 def concatenated(parts: Sequence[Any], name: str) -> np.ndarray:
-    """Return an array attribute of consecutive parts as one array; the parts lose it, so that one copy is kept."""
+    """Join the array attribute `name` of consecutive parts, and delete it from the parts to save memory."""
     out = np.concatenate([vars(part).pop(name) for part in parts])
     if len(parts) > MANY:
         trim()
@@ -36,9 +36,9 @@ def concatenated(parts: Sequence[Any], name: str) -> np.ndarray:
 
 
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:
-    """Yield pieces of about `seconds` in the order of the log; neighbours in one trajectory share `overlap_s`.
+    """Yield pieces of about `seconds` s in the order of the log; in a trajectory, they overlap by `overlap_s` s.
 
-    A remainder is appended to the last piece, because alone it may be too short to be filtered.
+    A remainder is appended to the last piece, because it may be too short to be filtered alone.
     """
     if recording.duration <= 1.5 * seconds:
         yield recording
@@ -63,9 +63,9 @@ def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iter
 
 
 def spread(recording: Recording, seconds: float, each_s: float = 10.0) -> Recording:
-    """Return stretches of `each_s`, evenly spread over the recording, that last `seconds` in total.
+    """Return stretches of `each_s` s, evenly spread over the recording, with a total length of `seconds` s.
 
-    A recording of at most `seconds` is returned unchanged.
+    A recording of at most `seconds` s is returned unchanged.
     """
     if recording.duration <= seconds:
         return recording

@@ -1,4 +1,4 @@
-"""Detection of repeated motion, so that a train/validation split does not leak.
+"""Find repeated motion in recordings, so that training and validation share no motion.
 
 Two pieces of motion are compared at every lag at once (correlation by FFT). Their squared distance is |a|^2 + |b|^2 -
 2 a b, summed over the rows that both contain.
@@ -11,19 +11,19 @@ import numpy as np
 
 STEP = 0.02  # s, grid of the comparison
 TOLERANCE = 0.01  # rad RMS, tracking difference between two repetitions of one motion
-MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances: about ten peak to peak
+MIN_MOTION = 3.0  # TOLERANCEs; least standard deviation of a joint's motion, about ten peak to peak
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
-MAX_COMPARED = 60  # most tracks that a track is compared with, and most pieces of `overlap`; limits computing time
+MAX_COMPARED = 60  # limit on the tracks compared with one track and on the pieces in `overlap`, for speed
 PIECE_S, PIECE_MOTION = 1.0, 2.0  # least duration (s) and range (standard deviations of the motion) of a piece
 TRACKING = 0.02  # rad RMS, tracking error of a slow or soft arm
-# smallest and largest tolerance, in standard deviations; at 0.2 single joints of other Fourier motions would pass
+# smallest and largest tolerance of `overlap`, in standard deviations; at 0.2 single joints of unrelated motion match
 SIMILAR = 0.04, 0.12
-STILL = 0.25  # of the largest joint's deviation: lower bound on the deviation of a joint that hardly moves
+STILL = 0.25  # lower bound on a joint's standard deviation, relative to the largest of all joints
 
 
 class Track:
-    """Motion between two restarts of the clock, resampled at STEP; NaN in gaps of the log."""
+    """Motion between two restarts of the clock, resampled to time steps of STEP; q is NaN in gaps of the log."""
 
     def __init__(self, t: np.ndarray, q: np.ndarray, stretches: Sequence[slice]):
         """Resample q (T, n) rad, logged at t (T,) s, over `stretches` of rows with increasing t."""
@@ -42,7 +42,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return a track per stretch if `each`, else per run of the clock t (T,) s; drop tracks below OVERLAP_S."""
+    """Return a track per stretch if `each`, else per run of the clock t (T,) s; omit tracks below OVERLAP_S."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -57,7 +57,7 @@ def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
 def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
     """Return the period of the motion, s, and the shift (K,) s that aligns the clock of each of K tracks.
 
-    With these shifts, the same motion has the same phase in all tracks. The period is None if nothing repeats. If
+    With these shifts, equal motion has the same phase in all tracks. The period is None if no motion repeats. If
     motion repeats only between tracks, the period spans all aligned tracks, so no phase occurs twice in a track.
     """
     shift, found, period = np.zeros(len(tracks)), False, None
@@ -78,8 +78,8 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
 
-    A piece of motion occurs there if each joint's RMS distance is below its tolerance. The tolerance is TRACKING,
-    limited to SIMILAR times the standard deviation of the joint in `other`.
+    A piece of motion occurs in `training` if each joint's RMS distance is below the joint's tolerance. The tolerance
+    is TRACKING, clipped to the range SIMILAR times the joint's standard deviation in `other`.
     """
     deviation = np.nanstd(np.concatenate([track.q for track in other]), axis=0) if other else np.zeros(1)
     tolerance = np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -96,7 +96,7 @@ def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
 
 
 def _pieces(q: np.ndarray, motion: float) -> list[np.ndarray]:
-    """Cut q (S, n) rad, NaN in gaps, into gap-free pieces that last at least PIECE_S and move `motion` rad."""
+    """Cut q (S, n) rad, NaN in gaps, into gap-free pieces that last PIECE_S or more and move by over `motion` rad."""
     pieces, start, shortest = [], 0, round(PIECE_S / STEP)
     low = high = q[0]
     for k, x in enumerate(q):
@@ -138,7 +138,7 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the RMS distance over rows and joints (L,) rad, and the number of common rows (L,), at every lag.
+    """Return at every lag the RMS distance over rows and joints (L,) rad, and the number of common rows (L,).
 
     The distance is inf where the common part is shorter than OVERLAP_S or no joint moves by MIN_MOTION.
     """
@@ -160,7 +160,7 @@ def _own_lag(track: Track) -> int | None:
 
 
 def _lag(a: Track, b: Track) -> int | None:
-    """Return the lag, in rows, at which b repeats a, or None; of several, the one with the most common rows."""
+    """Return the lag, in rows, at which b repeats a, or None; of several lags, that with the most common rows."""
     error, count = _errors(a.q, b.q)
     runs = _runs(error < TOLERANCE)
     if not runs:
@@ -170,6 +170,6 @@ def _lag(a: Track, b: Track) -> int | None:
 
 
 def _runs(mask: np.ndarray) -> list[slice]:
-    """Return the unbroken runs of a mask (L,) bool."""
+    """Return a slice for each uninterrupted run of True in a mask (L,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,4 +1,4 @@
-"""Recorded torque ramps of the breakaway protocol, with joint, direction and posture of each."""
+"""Read and save recorded torque ramps of the breakaway protocol, each with joint, direction and posture."""
 
 import os
 from collections.abc import Mapping
@@ -15,9 +15,9 @@ from r2s.recordings.readers import Options, scalar
 from r2s.recordings.recording import FIELDS, Recording, save_npz
 from r2s.recordings.robot_logs import Table
 
-OWN = {*FIELDS, "torque", "name", "joint", "sign", "pose"}  # the arrays of `Ramps.save`
-MIN_RISE = 1e-3  # Nm, a smaller change of the command does not begin a ramp
-BREAKAWAY = 2e-3  # rad, a joint that has moved this far has broken away or is about to
+OWN = {*FIELDS, "torque", "name", "joint", "sign", "pose"}  # arrays that `Ramps.save` writes
+MIN_RISE = 1e-3  # Nm; a command that changes by less is treated as constant
+BREAKAWAY = 2e-3  # rad; a joint that has moved this far has broken away or is about to
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,8 @@ class Ramps:
     """K recorded ramps, one per trajectory of the recording.
 
     Attributes:
-        recording: with commanded torque; identification uses t, and q and tau of the ramped joint.
-        joint: the ramped joint, from 0. sign: direction, 1 or -1. pose: posture, from 0. Each is (K,) or one for all.
+        recording: recording with commanded torque; identification uses t, and q and tau of the ramped joint.
+        joint, sign, pose: ramped joint (from 0), direction (1 or -1), posture (from 0); (K,) or one value for all.
 
     Raises:
         UserError: the torque is not commanded, or joint, sign or pose does not fit the recording.
@@ -69,15 +69,15 @@ def read_ramps(
 ) -> Ramps:
     """Read ramps from a file of `Ramps.save`, or from a log in any format of `readers.read`.
 
-    A log has the columns of a commanded recording (t s, q rad, dq rad/s or none, tau_J_d or tau Nm), and `joint`
-    (from 1) and `sign` (1 or -1) per row or per ramp. A new ramp begins where joint, sign or a column trajectory or
-    segment changes from one row to the next, where t restarts, and after a gap.
+    A log needs columns of commanded torque and motion (t s, q rad, tau_J_d or tau Nm, optionally dq rad/s), and
+    columns `joint` (from 1) and `sign` (1 or -1) with a value per row or per ramp. A new ramp begins where `joint`,
+    `sign`, `trajectory` or `segment` changes from one row to the next, where t restarts, and after a gap.
 
     Args:
         path: the file.
-        columns: names in the file, see `readers.read`.
+        columns: column names in the file, see `readers.read`.
         n_joints: expected number of joints.
-        max_gap_s: a longer pause in time separates ramps; None: see `longest_step`.
+        max_gap_s: s; a longer time step separates ramps; None: see `longest_step`.
 
     Raises:
         UserError: no such file, a file without ramps, or a joint or sign that contradicts the command.
@@ -93,7 +93,7 @@ def read_ramps(
 
 
 def _saved(table: Table) -> Ramps:
-    """Return the ramps of `Ramps.save`."""
+    """Return the ramps that `Ramps.save` wrote."""
     t, q, dq, tau, trajectory = (table[k] for k in FIELDS)
     motion = Recording(t, q, dq, tau, str(table["torque"]), trajectory, name=str(table["name"]))
     return Ramps(motion, table["joint"], table["sign"], table["pose"])
@@ -142,7 +142,7 @@ def _from_columns(
 
 
 def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
-    """Return (T,) values, one per row, from values per row or per ramp; `ramp` (T,) is the ramp index of each row."""
+    """Return one value per row (T,), from `values` per row or per ramp; `ramp` (T,) is the ramp index of each row."""
     count = ramp[-1] + 1 if len(ramp) else 0
     if values.dtype.kind not in "iuf":
         raise UserError(f"column '{field}': expected numbers, got type {values.dtype}")
@@ -152,14 +152,14 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError if commands change, but that of the ramped joint not mainly in the direction of `sign`."""
+    """Raise UserError unless the ramped joint's command changes mainly in direction `sign`, or none changes."""
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY
         until = int(moved.argmax()) + 1 if moved.any() else len(moved)  # after breakaway the arm may brake
         change = r.tau[rows][:until] - r.tau[rows.start]
         up, down = (sign * change).max(0), (-sign * change).max(0)
-        if up[j] > down[j] or np.maximum(up, down).max() < MIN_RISE:  # no change: it moved before the ramp
+        if up[j] > down[j] or np.maximum(up, down).max() < MIN_RISE:  # no change: the joint moved before the ramp
             continue
         other = int(np.maximum(up, down).argmax())
         got = "the opposite" if other == j else f"a change of joint {other + 1}"

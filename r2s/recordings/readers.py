@@ -1,4 +1,4 @@
-"""Read a `Recording` from .csv, .npz, .parquet, HDF5, a LeRobotDataset or a robot's log, by names of columns."""
+"""Read a `Recording` from .csv, .npz, .parquet, HDF5, a LeRobotDataset or a robot's log, by its column names."""
 
 import os
 import zipfile
@@ -23,7 +23,7 @@ from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_
 HDF5 = (".h5", ".hdf5")
 SUFFIXES = (".csv", ".npz", ".parquet", *HDF5, *BAGS)
 NO_BAG = dict.fromkeys(("topic", "joints", "model_joints", "n_joints"))
-RESTART_S = 0.1  # s, a clock that jumps back to within this time of its first value has restarted
+RESTART_S = 0.1  # s; a clock has restarted if it jumps back to within this time of its first value
 
 
 @dataclass(frozen=True)
@@ -58,31 +58,31 @@ def read(
     torque_constant: ArrayLike | None = None,
     limits: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Recording:
-    """Read the recording in `path`, with one kind of torque; logs of a Franka arm contain several kinds.
+    """Read the recording in `path` with the torque of kind `torque`; logs of a Franka arm contain several kinds.
 
     Args:
         path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
             LeRobotDataset.
         torque: "measured", "commanded" or "motor", see `Recording`; None only if the file declares it.
-        columns: the file's names for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
+        columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
             DEFAULT_COLUMNS; for tau, the column in TAU is tried first. A name for q, dq or tau denotes a (T, n)
             array, or numbered columns q1 q2 ..., q_1 q_2 ... or q[1] q[2] ..., from 1 or 0. In a name, `{j}` (from
             1) or `{i}` (from 0) stands for the joint number. A list has one name per joint. In HDF5 a name is a
             path: robot/q.
         n_joints: expected number of joints.
-        max_gap_s: a longer pause in time begins a new trajectory; None: see `longest_step`; inf: no splitting.
+        max_gap_s: s; a longer time step begins a new trajectory; None: see `longest_step`; inf: no splitting.
         period: s, see `Recording`.
-        name: of the recording; None: the name of the file without its suffix.
-        topic: of a bag, see `bag_table`.
+        name: name of the recording; None: the file name without its suffix.
+        topic: topic of a bag, see `bag_table`.
         joints, model_joints: the robot's joint names in the file and in the robot description; they select and
             order the file's joints, see `by_names` and `choose_joints`.
         torque_constant: Nm/A at the joint, gear ratio included, (n,) or one for all; tau is then a motor current.
-        limits: lowest and highest q of the robot, (n,) rad; angles outside are shifted into them by revolutions.
+        limits: lowest and highest q of the robot, (n,) rad each; angles outside are shifted inside by revolutions.
 
-    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories; without
-    a column trajectory, so does a clock that goes back to its start (not in a bag). Faults with only one remedy are
-    repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file of `Recording.save` is
-    restored unchanged.
+    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. Without a
+    column trajectory, a clock that jumps back to its start also begins a new one (not in a bag). Faults with only one
+    remedy are repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file that
+    `Recording.save` wrote is restored unchanged.
 
     Raises:
         UserError: the file or a column is missing or damaged, or its values are no valid recording.
@@ -90,7 +90,7 @@ def read(
     constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
     table = load_table(path, {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints})
-    restarts = not is_bag(path)  # a bag may mix the messages of two starts
+    restarts = not is_bag(path)  # a bag may interleave messages from two starts
     how = Options(torque, columns or {}, n_joints, max_gap_s, period, name or path.stem, constant, restarts)
     how = replace(how, robot_joints=model_joints, limits=limits)
     try:
@@ -102,7 +102,7 @@ def read(
 
 
 def from_table(table: Table, how: Options) -> Recording:
-    """Return the recording in the columns of a file; error messages do not name the file."""
+    """Return a recording from the columns of a file; error messages do not name the file."""
     notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars of `Recording.save` or of a reader
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(how.torque, notes.get("torque"))
@@ -150,7 +150,7 @@ def from_table(table: Table, how: Options) -> Recording:
 
 
 def _without_holds(recording: Recording) -> Recording:
-    """Drop the rows that only repeat values, if the log has more rows than the arm sent values (see `held`)."""
+    """Drop the rows that repeat earlier values, if the log's rate exceeds that of the values (see `held`)."""
     rows = held(recording.t, recording.q, recording.dq, recording.stretches)
     if rows is None:
         return recording
@@ -162,7 +162,7 @@ def _without_holds(recording: Recording) -> Recording:
 def restart_index(t: np.ndarray) -> np.ndarray | None:
     """Return the trajectory index (T,) of each row if the clock t (T,) s restarts, else None.
 
-    A restart goes back to about the first value. `Recording` reports any other step back as an error in the log.
+    At a restart, the clock jumps back to about its first value. `Recording` reports any other step back as an error.
     """
     if t.ndim != 1 or not len(back := np.flatnonzero(np.diff(t) < 0) + 1):
         return None
@@ -173,7 +173,7 @@ def restart_index(t: np.ndarray) -> np.ndarray | None:
 
 
 def _agreed_torque(declared: str | None, stored) -> str:
-    """Return the kind of torque; the user's declaration must agree with the file's."""
+    """Return the declared kind of torque; raise UserError if the user and the file declare different kinds."""
     if not isinstance(stored, str):
         return declared_torque(declared)
     if declared not in (None, "", "???", declared_torque(stored)):
@@ -235,7 +235,7 @@ def _numbers(table: Table, name: str) -> np.ndarray:
 
 
 def files_of(path: str | os.PathLike) -> list[Path]:
-    """Return the files that make up a recording: one, or all that are read of a ROS 2 bag or a LeRobotDataset."""
+    """Return the files of a recording: `path` itself, or the files in it if it is a ROS 2 bag or LeRobotDataset."""
     path = Path(path).expanduser()
     if is_dataset(path):
         return dataset_files(path)
@@ -243,7 +243,7 @@ def files_of(path: str | os.PathLike) -> list[Path]:
 
 
 def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
-    """Return all columns of the file; errors name the file. `bag` holds the arguments of `bag_table`."""
+    """Return all columns of the file `path`; errors name the file. `bag` is {argument of `bag_table`: value}."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")
@@ -300,7 +300,7 @@ def _load_npz(path: Path) -> Table:
 
 
 def _load_hdf5(path: Path) -> Table:
-    """Return all datasets of at most two dimensions, keyed by their paths."""
+    """Return {path: dataset} for all datasets of at most two dimensions."""
     h5py = optional_import("h5py", "reading this file", "recordings")
     table: Table = {}
 

@@ -1,4 +1,4 @@
-"""A recording of an arm: joint motion and torque on the clock of the log."""
+"""Define `Recording`: joint motion and torque of an arm over the time of its log."""
 
 import os
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ from r2s.recordings.periodicity import find_period, overlap, tracks_of
 
 TORQUES = ("measured", "commanded", "motor")
 MIN_ROWS = 10
-SPLIT_GUARD_S = 0.1  # s; rows this close to a validation row are almost copies of it, so neither side gets them
+SPLIT_GUARD_S = 0.1  # s; `split` drops training rows this close to a validation row, because they almost repeat it
 FIELDS = ("t", "q", "dq", "tau", "trajectory")
-SIGNALS = (  # what an arm may measure or estimate besides its motion, named as in libfranka; see `ArmState`
+SIGNALS = (  # further values that an arm may measure or estimate, with libfranka's names; see `ArmState`
     "tau_ext_hat_filtered", "O_F_ext_hat_K", "joint_contact", "cartesian_contact", "joint_collision",
     "cartesian_collision", "control_command_success_rate", "O_T_EE", "m_ee", "m_load",
 )  # fmt: skip
@@ -26,20 +26,20 @@ SIGNALS = (  # what an arm may measure or estimate besides its motion, named as 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Motion and torque of n joints in T rows, checked on construction; the arrays are read-only.
+    """Joint motion and torque: T rows of n joints. The constructor checks the arrays and makes them read-only.
 
-    Every operation returns a new recording. No difference, filter or window spans two trajectories.
+    Methods return new recordings. A difference, filter or window never includes rows of two trajectories.
 
     Attributes:
-        t: (T,) s, as logged. It increases within a trajectory, with any steps, and may restart in the next one.
-        q, dq, tau: (T, n) rad, rad/s, Nm.
-        torque: "measured" by a link-side sensor, with gravity; "commanded", without gravity; or "motor", the motor
-            torque times the gear ratio, which contains gravity, all friction and rotor inertia.
-        signals: {name in `SIGNALS`: (T,) or (T, k)}, further values that the arm reported in each row; None: none.
-        trajectory: (T,) index of the continuous stretch to which each row belongs; None: all rows are one stretch.
-        period: s, period with which the excitation repeats itself in `t` (see `split`); None: it does not repeat.
-        notes: one line per repair or remark of the reader.
-        command_period: s, for which the arm holds each command; None: until the next row.
+        t: (T,) s, logged time. It increases within a trajectory, perhaps unevenly, and may restart in the next one.
+        q, dq, tau: (T, n) joint angles in rad, velocities in rad/s and torques in Nm.
+        torque: kind of `tau`: "measured" (by a link-side sensor, with gravity), "commanded" (without gravity) or
+            "motor" (motor torque times gear ratio; it contains gravity, all friction and rotor inertia).
+        signals: {name from `SIGNALS`: (T,) or (T, k)}, further values that the arm reported; None becomes {}.
+        trajectory: (T,) index of each row's trajectory, an uninterrupted part of the log; None: one trajectory.
+        period: s, time after which the motion repeats on the clock `t` (see `split`); None: no repetition is known.
+        notes: one line per repair or other remark of the file reader.
+        command_period: s, time for which the arm applies each command; None: until the next row.
     """
 
     t: np.ndarray
@@ -122,7 +122,7 @@ class Recording:
 
     @property
     def stretches(self) -> list[slice]:
-        """Rows of each trajectory, in the order of the log."""
+        """Slices of rows, one per trajectory, in the order of the log."""
         edges = [0, *(np.flatnonzero(self.trajectory[1:] != self.trajectory[:-1]) + 1).tolist(), len(self.t)]
         return [slice(start, stop) for start, stop in pairwise(edges)]
 
@@ -133,7 +133,7 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """Rate of the log, Hz: one over the median time step within trajectories."""
+        """Rate of the log in Hz: the inverse of the median time step within trajectories."""
         steps = self._steps()
         if not len(steps):
             raise UserError("every trajectory is a single row: the recording has no rate")
@@ -143,7 +143,7 @@ class Recording:
         return np.diff(self.t)[np.diff(self.trajectory) == 0]
 
     def select(self, mask: np.ndarray) -> "Recording":
-        """Keep the rows where `mask` (T,) is true; each unbroken run of rows becomes a trajectory."""
+        """Select the rows where `mask` (T,) is True; each uninterrupted run of these rows becomes a trajectory."""
         mask = np.asarray(mask)
         if mask.dtype != bool or mask.shape != self.t.shape:
             raise UserError(f"expected a mask of shape {self.t.shape} bool, got {mask.shape} {mask.dtype}")
@@ -152,7 +152,7 @@ class Recording:
         return self.rows(rows, np.concatenate([[0], np.cumsum(cut)])[: len(rows)])
 
     def split_at_gaps(self, max_gap_s: float | None = None) -> "Recording":
-        """Start a new trajectory after each pause (see `longest_step`); drop single rows between two pauses."""
+        """Begin a new trajectory after each pause, defined by `longest_step`; drop single rows between two pauses."""
         if max_gap_s is not None:
             _positive("max_gap_s", max_gap_s, "s")
         steps = self._steps()
@@ -166,9 +166,9 @@ class Recording:
     def resample(self, dt: float) -> "Recording":
         """Interpolate each trajectory linearly onto a uniform grid of `dt` s from its first logged time.
 
-        Commanded torque is averaged over each grid step instead, because a command acts until the next one.
+        Commanded torque is averaged over each grid step instead, because each command acts until the next one.
         There is no anti-aliasing filter: to lower the rate, resample at the logged rate, `smooth`, then resample
-        again. Signals take their last logged value, because flags and poses cannot be interpolated.
+        again. Each of the `signals` takes its last logged value, because flags and poses cannot be interpolated.
         Trajectories shorter than `dt` are dropped.
         """
         _positive("dt", dt, "s")
@@ -193,9 +193,9 @@ class Recording:
         return replace(self, signals=signals, **{f: np.concatenate(parts) for f, parts in columns.items()})  # type: ignore[arg-type]
 
     def _held(self, s: slice, grid: np.ndarray, dt: float) -> np.ndarray:
-        """Return the mean command (G, n) Nm over each step [grid, grid + dt) of rows `s`.
+        """Return the commands (G, n) Nm of the rows `s`, averaged over steps from `grid` to `grid + dt`.
 
-        A command holds until the next one. Between rows several command periods apart, commands are interpolated.
+        Each command acts until the next one. Where the log skips command periods, commands are interpolated.
         """
         t, tau, period = self.t[s], self.tau[s], self.command_period or 1.0 / self.rate_hz
         if len(grid) == len(t) and np.abs(grid - t).max() < 1e-6 * dt and period > 0.9 * dt:
@@ -215,7 +215,7 @@ class Recording:
     def smooth(self, cutoff_hz: float) -> "Recording":
         """Low-pass q, dq and tau with a zero-phase filter: a Butterworth of order 4, run forwards and backwards.
 
-        The two passes have a gain of -6 dB at the cutoff. The time steps must be uniform (`resample`).
+        The two passes together have a gain of -6 dB at the cutoff. The time steps must be uniform; see `resample`.
         """
         _positive("cutoff_hz", cutoff_hz, "Hz")
         steps, rate = self._steps(), self.rate_hz
@@ -232,7 +232,7 @@ class Recording:
         return replace(self, **filtered)  # type: ignore[arg-type]
 
     def derivative(self, x: np.ndarray) -> np.ndarray:
-        """Return the central difference of `x` (T, n) over the logged time, without delay."""
+        """Return the time derivative of `x` (T, n) by central differences over the logged time, without delay."""
         out = np.empty_like(x)
         for s in self.stretches:
             if s.stop - s.start < 2:
@@ -241,21 +241,21 @@ class Recording:
         return out
 
     def acceleration(self) -> np.ndarray:
-        """Return the acceleration (T, n) rad/s^2, the `derivative` of dq; `resample` and `smooth` raw data first."""
+        """Return the acceleration (T, n) rad/s^2, the `derivative` of dq. Raw data need `resample` and `smooth`."""
         return self.derivative(self.dq)
 
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        Motion repeats if, at some lag, at least 0.5 s of it recur within 0.01 rad RMS over the joints, and a joint
-        moves about ten times as far. If the clock restarts, one trajectory may repeat another: see `in_phase`.
+        The motion repeats if at least 0.5 s of it recur after some lag, with an RMS difference below 0.01 rad over
+        the joints, while a joint moves by about 0.1 rad. `in_phase` also aligns repetitions after a clock restart.
         """
         return self._period_and_clock()[0]
 
     def in_phase(self) -> "Recording":
-        """Return the recording with its period set, and clocks shifted so that equal motion has equal phase.
+        """Return the recording with `period` set, and `t` shifted so that equal motion has equal phase.
 
-        A recording without a repetition is returned unchanged.
+        If the motion does not repeat, the recording is returned unchanged.
         """
         period, t = self._period_and_clock()
         return self if period is None else replace(self, t=t, period=period)
@@ -267,7 +267,7 @@ class Recording:
             period, shift = find_period(tracks)
             if period is None:
                 continue
-            # trajectories that were started by hand may not keep a period found on the log's clock
+            # trajectories that were started by hand may not match a period found on the log's clock
             if best is None or np.abs((shift + 0.5 * best) % best - 0.5 * best).max() > SPLIT_GUARD_S / 2:
                 best, clock = period, self.t.copy()
                 for track, late in zip(tracks, shift, strict=True):
@@ -278,21 +278,21 @@ class Recording:
     def overlap(self, training: "Recording") -> float:
         """Return the share (0 to 1) of this motion that also occurs in `training`; see `periodicity.overlap`.
 
-        Only pieces with enough motion count. It does not matter at which time a motion occurs.
+        Pieces with too little motion are ignored. The times at which the motion occurs do not matter.
         """
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
         """Return (train, validation), which share no motion; validation has about `validation_fraction` of the rows.
 
-        1. With a period (argument or attribute), validation is the end of every repetition: the largest phases, `t`
-           modulo the period. A chronological split would put repeated motion on both sides: gaz2019 has a period
-           of 13.33 s, and its segment 1 partly repeats segment 0.
+        1. With a period (argument or attribute), validation is the end of every repetition: the rows with the largest
+           phase, `t` modulo period. A chronological split would put repeated motion on both sides: the recording
+           gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
         2. With several trajectories, validation consists of the last trajectories.
         3. Otherwise validation is the end of the recording.
 
-        In cases 1 and 3, rows within 0.1 s of validation rows are dropped from training. Single rows between two
-        cuts are dropped from both sides.
+        In cases 1 and 3, rows within 0.1 s of validation rows are dropped from training. Trajectories of a single
+        row are dropped from both sides.
         """
         if not 0 < validation_fraction < 1:
             raise UserError(f"validation_fraction: expected a number in (0, 1), got {validation_fraction}")
@@ -326,15 +326,15 @@ class Recording:
         save_npz(path, self.arrays())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays that `save` writes, by name."""
+        """Return {name: array} for all arrays that `save` writes."""
         period = {k: np.asarray(v) for k in ("period", "command_period") if (v := getattr(self, k)) is not None}
         own = {field: np.asarray(getattr(self, field)) for field in (*FIELDS, "torque", "name")}
         return {**own, **period, **self.signals}
 
     def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
-        """Return a recording of these rows (K,) with this trajectory index (K,).
+        """Return a recording of the rows with indices `rows` (K,) and the new trajectory indices `trajectory` (K,).
 
-        drop_lone removes trajectories of one row. Consecutive rows are views, because an hour of a log is large.
+        drop_lone: whether to drop trajectories of a single row. Consecutive rows become views, to save memory.
         """
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1
@@ -345,7 +345,7 @@ class Recording:
         return replace(self, trajectory=trajectory, signals=signals, **arrays)
 
     def _without_lone_rows(self) -> "Recording":
-        if all(s.stop - s.start > 1 for s in self.stretches):  # as almost always; `select` has numbered them densely
+        if all(s.stop - s.start > 1 for s in self.stretches):  # almost always; `select` numbered them without gaps
             return self
         dense = np.unique(self.trajectory, return_inverse=True)[1]
         return self.rows(np.arange(len(self.t)), dense, drop_lone=True)
@@ -361,7 +361,7 @@ def save_npz(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def declared_torque(torque: str | None) -> str:
-    """Return `torque`, or raise a UserError that explains `TORQUES` if it is none of them."""
+    """Return `torque` if it is one of `TORQUES`; otherwise raise a UserError that explains them."""
     if torque in TORQUES:
         return str(torque)
     meaning = (
@@ -377,7 +377,7 @@ def declared_torque(torque: str | None) -> str:
 def _floats(field: str, value) -> np.ndarray:
     own = np.int64 if field == "trajectory" else np.float64
     if isinstance(value, np.ndarray) and value.dtype == own and not value.flags.writeable:
-        return np.ascontiguousarray(value)  # an array of another recording, or of a reader, needs no copy
+        return np.ascontiguousarray(value)  # a read-only array comes from a recording or reader and needs no copy
     try:
         return np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):

@@ -1,7 +1,7 @@
-"""Repair faults of logs with only one remedy: swapped or repeated rows, zero stamps, wrapped angles, held values.
+"""Repair log faults that have only one remedy: swapped or repeated rows, zero stamps, wrapped angles, held values.
 
-Each repair also returns a line that describes it, for the notes of the recording. A fault with several possible
-remedies is not repaired; `Recording` or the checks of an identification report it.
+Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired;
+`Recording` or the checks of an identification report it.
 """
 
 from itertools import pairwise
@@ -10,19 +10,19 @@ import numpy as np
 
 Arrays = dict[str, np.ndarray]  # t (T,), trajectory (T,), q, dq, tau (T, n)
 
-MOST_SWAPPED = 10  # most rows by which a row may be out of place; more indicate two interleaved logs
-JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: a step beyond all three, and back, is no motion
-AWAY, MOST_FAILED = 10, 0.01  # most successive rows, and share of all rows, in which reading q may fail
-FIRST_STEP = 100  # median steps: the first real stamp is farther than this from 0
-REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad: a wrapped angle jumps by a revolution plus or minus its motion, below NEAR
-SLACK = 0.05  # rad, by which logs of arms at their limits may exceed them
-LEAST_HELD = 2.0  # least number of rows for which a value is held
-REGULAR = 0.8  # least share of holds with equal length (give or take a row); a coarse encoder's vary with speed
-MOVES = 0.2  # rad, least motion over which holds are judged
+MOST_SWAPPED = 10  # rows; a row that is farther out of place indicates two interleaved logs
+JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: q is misread if it steps by more than all, and back
+AWAY, MOST_FAILED = 10, 0.01  # largest number of successive rows, and share of all rows, with misread q
+FIRST_STEP = 100  # median steps; the first valid stamp is farther than this from 0
+REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad: at a wrap, q jumps by a revolution give or take its motion, below NEAR
+SLACK = 0.05  # rad by which a logged angle may exceed a joint limit
+LEAST_HELD = 2.0  # rows, least median length of a hold: a run of rows with equal values
+REGULAR = 0.8  # least share of equal holds (give or take a row); with a coarse encoder they vary with speed
+MOVES = 0.2  # rad, least motion of a log in which holds are removed
 
 
 def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
-    """Return the rows sorted by time, without zero stamps, repeated, failed or incomplete rows; a line per repair."""
+    """Sort rows by time and drop zero stamps, repeated, misread and incomplete rows; add a line per repair."""
     notes: list[str] = []
     whole = all(x.dtype.kind in "iuf" and len(x) == len(arrays["t"]) for x in arrays.values())
     if not whole or arrays["t"].ndim != 1 or len(arrays["t"]) < 3:
@@ -52,7 +52,7 @@ def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
 
 
 def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of the rows whose q was misread: a joint jumps away, and back within AWAY rows."""
+    """Return a mask (T,) of the rows with misread q: a joint's angle jumps away, and back within AWAY rows."""
     out, fast = np.zeros(len(q), dtype=bool), FASTEST * np.maximum(np.diff(t), 0.0)
     for x in q.T:  # one joint at a time: an hour of a log is large
         step = np.abs(np.diff(x))
@@ -65,7 +65,7 @@ def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _order(arrays: Arrays) -> np.ndarray | None:
-    """Return the order (T,) that sorts each trajectory by time; None if it is sorted or a row is too far off."""
+    """Return row indices (T,) that sort each trajectory by time; None if sorted or if a row is too far off."""
     t, index = arrays["t"], arrays.get("trajectory", np.zeros(len(arrays["t"])))
     run = np.concatenate([[0], np.cumsum(np.diff(index) != 0)])
     if not np.any((np.diff(t) < 0) & (np.diff(run) == 0)):
@@ -75,9 +75,9 @@ def _order(arrays: Arrays) -> np.ndarray | None:
 
 
 def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Arrays, list[str]]:
-    """Return the arrays with q continued across jumps by a revolution, per trajectory, and a line per repair.
+    """Remove jumps of q by a revolution within a trajectory; return the arrays and a line per repair.
 
-    limits: (low, high) (n,) rad each. A trajectory of a joint beyond them is shifted if revolutions bring it inside.
+    limits: (low, high), (n,) rad each. Angles beyond them are shifted by revolutions, if this brings them inside.
     """
     q, index = arrays["q"], arrays.get("trajectory")
     if q.ndim != 2 or q.dtype.kind not in "iuf" or len(q) != len(arrays["t"]):
@@ -121,9 +121,9 @@ def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -
 
 
 def held(t: np.ndarray, q: np.ndarray, dq: np.ndarray, stretches: list[slice]) -> np.ndarray | None:
-    """Return a mask (T,) of the rows with new values if the log holds each value over several rows, else None.
+    """Return a mask (T,) of the rows with new values if the log repeats each value over several rows, else None.
 
-    A log at 1 kHz may repeat values that arrive at 30 Hz. While the arm moves, holds are equally long at any speed.
+    A log at 1 kHz may repeat values that arrive at 30 Hz; while the arm moves, all values fill equally many rows.
     """
     new = np.ones(len(t), dtype=bool)
     lengths, moved = [], 0.0

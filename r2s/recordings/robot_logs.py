@@ -1,4 +1,4 @@
-"""Robot logs as tables of t, q, dq and tau for `readers.read`: bags, MCAP, and the CSV of libfranka and rostopic."""
+"""Convert robot logs (ROS bags, MCAP, CSV of libfranka or rostopic) to tables of t, q, dq and tau for `readers`."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -26,13 +26,13 @@ def is_bag(path: Path) -> bool:
 def libfranka_table(table: Table) -> Table:
     """Add t (T,) s and q, dq, tau_J, tau_J_d (T, 7) to a log of `franka::logToCSV`; return other tables unchanged.
 
-    In such a log (libfranka, src/log.cpp) `time` is in whole ms, `state.tau_J` is measured, and a row holds the state
-    of cycle k + 1 beside the command `cmd.tau_J_d` of cycle k: see `shift_command`.
+    In such a log (libfranka, src/log.cpp) `time` is in whole ms, and `state.tau_J` is measured torque. Each row has
+    the state of cycle k + 1, but the command `cmd.tau_J_d` of cycle k; `shift_command` corrects this.
     """
     if not {"time", "success_rate", "state.q[0]"} <= table.keys():
         return table
     time = table["time"]
-    numeric = time.dtype.kind in "iuf"  # text stays as it is: `readers` reports its column by name
+    numeric = time.dtype.kind in "iuf"  # text is not converted: `readers` reports it with the column's name
     t = time * CYCLE if numeric else time
     found = {"t": t}
     for field, name in (("q", "state.q"), ("dq", "state.dq"), ("tau_J", "state.tau_J"), ("tau_J_d", "cmd.tau_J_d")):
@@ -47,7 +47,7 @@ def libfranka_table(table: Table) -> Table:
 def rostopic_table(table: Table) -> Table:
     """Add t, q, dq, tau and joint_names to a JointState log of `rostopic echo -p`; return other tables unchanged.
 
-    The stamps of such a log are in ns. The columns `field.name0` ... contain the joint names; some drivers sort them.
+    The log's stamps are in ns. The columns `field.name0` ... contain the joint names, which some drivers sort.
     """
     fields = {"q": "field.position", "dq": "field.velocity", "tau": "field.effort"}
     stamp = table.get("field.header.stamp")
@@ -72,14 +72,14 @@ def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
     """Return the command (T, n) Nm that was sent in response to the state of each row, from the logged tau_J_d.
 
     A Franka state at t (T,) s contains the command of the previous cycle. A `Recording` (`r2s.arm.recorder`) pairs a
-    state with the command that follows it. So the result is tau_J_d of one cycle later, interpolated if the log is
-    slower than the arm. The last row keeps its own command, because no later one is known.
+    state with the command that follows it. So the result is tau_J_d one cycle later, interpolated if the log is
+    slower than the arm. The command of the last row is not shifted, because no later one is known.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
 
 
 class Sample(NamedTuple):
-    """A message: header time and bag time in ns, joint names (() if its type has none), values (n,) by field."""
+    """A message: header stamp and bag time, ns; joint names (() if its type has none); {field: values (n,)}."""
 
     stamp: int
     received: int
@@ -95,15 +95,15 @@ def bag_table(
     model_joints: Sequence[str] | None = None,
     n_joints: int | None = None,
 ) -> Table:
-    """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) of one topic of a bag.
+    """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) from one topic of a bag.
 
-    t starts at the first message. It comes from header stamps, or from bag time if all stamps are zero. Messages
-    without all joints (of a gripper on the same topic) are ignored, late ones sorted, repeated ones dropped. The
-    scalar `reader_note` counts left-out messages: those with stamp 0, and those at the start without values.
+    t is 0 at the first message. It comes from the header stamps, or from bag time if all stamps are 0. Messages that
+    lack joints of the robot (as from a gripper) are ignored, late messages are sorted, repeated ones are dropped.
+    `reader_note` states how many messages were left out because of stamp 0, or of missing values at the start.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap, or the folder of a ROS 2 bag.
-        topic: its type is sensor_msgs/JointState, franka_msgs/FrankaState or FrankaRobotState; None: the only one.
+        topic: of type sensor_msgs/JointState, franka_msgs/FrankaState or FrankaRobotState; None: the bag's only one.
         joints, model_joints, n_joints: see `choose_joints`.
 
     Raises:
@@ -140,9 +140,9 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    Messages may order joints differently: some ROS 2 drivers sort the names, others do not. The first rule that
-    applies counts: `joints` as given; `model_joints`, if each occurs once (perhaps with a prefix: panda_joint1); n
-    names that differ in one number, sorted by it; the first n names, if n is 1 or there are no `model_joints`.
+    The order in a log may differ, because some ROS 2 drivers sort the names. The first applicable rule decides: (1)
+    `joints` as given; (2) `model_joints`, if each occurs once (perhaps with a prefix: panda_joint1); (3) n names that
+    differ in one number, sorted by this number; (4) the first n names, if n is 1 or there are no `model_joints`.
 
     Args:
         logged: names in the messages.
@@ -257,7 +257,7 @@ def _joint_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
-    """Return names and values of a Franka message (franka_ros or franka_ros2)."""
+    """Return the joint names and {field: values} of a Franka message (franka_ros or franka_ros2)."""
     if hasattr(message, "measured_joint_state"):
         names, values = _joint_state(message.measured_joint_state)
         desired = message.desired_joint_state
@@ -272,7 +272,7 @@ def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _pick_joints(topic: str, samples: list[Sample], joints, model_joints, n_joints) -> tuple[list[Sample], Layouts]:
-    """Return the messages with all joints of the robot, and {names in a message: indices of these joints}."""
+    """Return the messages that have all joints of the robot, and {names in a message: indices of these joints}."""
     layouts = dict.fromkeys(s.names for s in samples)
     logged = list(dict.fromkeys(name for names in layouts for name in names))
     if not logged:
@@ -291,7 +291,7 @@ def _pick_joints(topic: str, samples: list[Sample], joints, model_joints, n_join
 
 
 def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.ndarray:
-    """Return a field as (T, n), or an empty array if no message has it."""
+    """Return the values of a field as (T, n), or an empty array if no message has them."""
     if not any(s.values[field].size for s in samples):
         return np.empty(0)
     rows = []
@@ -307,7 +307,7 @@ def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.n
 
 
 def _in_order(stamp: np.ndarray, table: Table) -> tuple[np.ndarray, Table]:
-    """Sort late messages and drop repeated ones; leave a restarted clock as it is, for `Recording` to report."""
+    """Sort late messages and drop repeated ones; do neither after a clock restart, which `Recording` reports."""
     if len(stamp) < 2 or np.diff(stamp).min() < -MAX_LATENESS_NS:
         return stamp, table
     order = np.argsort(stamp, kind="stable")

@@ -1,4 +1,4 @@
-"""Write a `Recording` as an MCAP file of ROS 2, with a layout file for Foxglove beside it."""
+"""Write a `Recording` as a ROS 2 bag in MCAP format, together with a layout file for Foxglove."""
 
 import json
 import shutil
@@ -17,8 +17,8 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-START_NS = 10**9  # ns, stamp of the first row: readers take a stamp of 0 for a missing one
-PAUSE_NS = 10**9  # ns, between trajectories: longer than any data.max_gap_s in use
+START_NS = 10**9  # ns, stamp of the first row: readers interpret a stamp of 0 as missing
+PAUSE_NS = 10**9  # ns, pause between trajectories: longer than any data.max_gap_s in use
 TF_PERIOD = 0.02  # s, period of /tf: 50 Hz suffice for viewing
 BASE = "base"  # the frame of the robot's base, as in r2s's URDF
 TOPICS = {
@@ -32,7 +32,7 @@ Message = tuple[int, str, Any]  # ns, topic, message
 
 
 def stamps(recording: Recording) -> np.ndarray:
-    """Return the stamp (T,) ns of each row, on one clock: trajectories follow each other with pauses between them."""
+    """Return the stamps (T,) ns of the rows on one clock, with a pause between successive trajectories."""
     out, begin = np.empty(len(recording.t), dtype=np.int64), START_NS
     for s in recording.stretches:
         t = recording.t[s]
@@ -51,11 +51,11 @@ def write_mcap(
     """Write `path` (.mcap) and its Foxglove layout, and return a line for each part that was left out.
 
     Topics: /joint_states, where effort is tau; /external_wrench, if the recording has O_F_ext_hat_K; /reference, if
-    given; /tf, the links at 50 Hz or less; /robot_description, the URDF, latched.
+    given; /tf, the link poses at 50 Hz or less; /robot_description, the URDF, latched.
 
     Args:
-        robot, dynamics: for the URDF. recording: of this robot. reference: t (T,) s, q, dq, ddq (T, n) of the planned
-            motion, which begins with the recording.
+        robot, dynamics: the model for the URDF. recording: motion of this robot. reference: planned motion that
+            begins together with the recording: t (T,) s and q, dq, ddq (T, n).
 
     Raises:
         UserError: rosbags is not installed, or robot and recording differ in their number of joints.
@@ -100,7 +100,7 @@ def write_mcap(
 
 
 class _Messages:
-    """Makes ROS 2 messages with their stamps; `types` are the message classes of a rosbags typestore."""
+    """Builder of stamped ROS 2 messages; `types` are the message classes of a rosbags typestore."""
 
     def __init__(self, types: Mapping[str, Any]):
         self._types = types
@@ -121,7 +121,7 @@ class _Messages:
         ]
 
     def wrenches(self, wrench: np.ndarray, ns: np.ndarray) -> list[Message]:
-        """Return the wrench (T, 6) N and Nm that the arm exerts, in axes of the base: libfranka's `O_F_ext_hat_K`."""
+        """Return messages of `O_F_ext_hat_K` (libfranka): wrench (T, 6) N, Nm that the arm exerts, in base axes."""
         of, stamped = (self._types[f"geometry_msgs/msg/{kind}"] for kind in ("Wrench", "WrenchStamped"))
         return [
             (at, "/external_wrench", stamped(self._header(at), of(force=self._xyz(x[:3]), torque=self._xyz(x[3:]))))
@@ -129,7 +129,7 @@ class _Messages:
         ]
 
     def frames(self, recording: Recording, ns: np.ndarray, links: list[Link]) -> list[Message]:
-        """Return the pose of each link in the frame of its parent link, as in the URDF."""
+        """Return /tf messages: the pose of each link in the frame of its parent link, as in the URDF."""
         transform, stamped, message = (
             self._types[x]
             for x in ("geometry_msgs/msg/Transform", "geometry_msgs/msg/TransformStamped", TOPICS["/tf"])
@@ -167,7 +167,7 @@ class _Messages:
 
 
 def layout(n: int, topics: set[str]) -> dict[str, Any]:
-    """Return a Foxglove layout: the frames in 3D beside plots of position, velocity, effort and, if any, wrench."""
+    """Return a Foxglove layout: a 3D view, and plots of position, velocity, effort and, if recorded, wrench."""
     paths = {
         f"Plot!{field}": [f"/joint_states.{field}[{j}]" for j in range(n)]
         for field in ("position", "velocity", "effort")

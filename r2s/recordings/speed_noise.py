@@ -1,4 +1,4 @@
-"""Noise of an arm's velocity measurement, estimated from a recording; training adds it to the observations."""
+"""Estimate the noise of an arm's velocity measurement from recordings; training adds it to the observations."""
 
 from collections.abc import Iterator, Sequence
 
@@ -12,10 +12,10 @@ from r2s.recordings.recording import Recording
 HALF_S = 0.02  # s, half window of the Savitzky-Golay cubic; position noise of 1e-5 rad then causes 3e-4 rad/s
 MAX_HALF_S = 0.05  # s, largest half window: at 80 Hz the slope of a 2 Hz oscillation then errs by 0.04 %
 PIECE_S = 0.05  # s, length of the pieces among which the calm ones are chosen
-CALM = 0.1  # share of the pieces that are used: those with the smallest acceleration
+CALM = 0.1  # share of the pieces that are used, namely those with the smallest acceleration
 LONGEST_S = 600.0  # s, longest part of a recording that is used
 MAX_NOISE = 1.0  # rad/s, more than any velocity sensor adds
-MIN_ROWS = 8  # samples that a cubic needs to give a velocity
+MIN_ROWS = 8  # least number of samples for the slope of a cubic
 UNEVEN = 0.25  # share of the median step; a step that differs by more, as after a lost sample, ends a piece
 
 
@@ -23,8 +23,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
     """Return the standard deviation of the velocity noise (n,) rad/s; 0 if the sampling is too coarse, below 80 Hz.
 
     The reference velocity is the slope of a cubic through the positions (Savitzky and Golay, Analytical Chemistry
-    36(8), 1964). At low acceleration that slope is accurate, and a delay of the velocity filter has no effect. So the
-    result is the median over the tenth of all 50 ms pieces with the least acceleration, judged by q instead of dq.
+    36(8), 1964). At low acceleration this slope is accurate, and a delay of the velocity filter has no effect. So the
+    result is the median over the 10 % of all 50 ms pieces with the least acceleration (of q, instead of dq).
 
     Raises:
         UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.
@@ -58,7 +58,7 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
 
 
 def even(recording: Recording) -> Iterator[slice]:
-    """Yield the rows of a recording in pieces of at least MIN_ROWS rows with even steps."""
+    """Yield slices of a recording: pieces of at least MIN_ROWS rows with even time steps."""
     for rows in recording.stretches:
         steps = np.diff(recording.t[rows])
         if len(steps) < MIN_ROWS:

@@ -1,1 +1,1 @@
-"""Tables, pages, figures, rerun recordings, comparison of runs, trackers."""
+"""Report runs: tables, pages, figures, rerun recordings, comparison of runs, trackers."""

@@ -1,4 +1,4 @@
-"""Figures and rerun recording of stage=estimate: each value over time, with its 95 % interval."""
+"""Draw figures and write the rerun recording of stage=estimate: each value over time, with its 95 % interval."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,11 +16,11 @@ from r2s.reporting.figures.panels import panels
 from r2s.reporting.viewer.layout import log_series
 from r2s.reporting.wrench_page import DRAWN_HZ, FORCES, log_wrench
 
-LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and edges of its interval
+LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and limits of its 95 % interval
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
-    """Draw payload and friction over time. rows: `offline_estimation.table`. changes: times of payload changes, s."""
+    """Draw payload and friction over time. rows: `offline_estimation.table`. changes: payload change times, s."""
     t, colour = rows["t"].to_numpy(), colours(["estimate"])["estimate"]
 
     def band(axis, name: str, title: str, label: str, scale: float = 1.0) -> None:
@@ -49,10 +49,10 @@ def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Se
 def write_estimate_recording(
     path: Path, robot: Robot, recording: Recording, rows: pd.DataFrame, wrench: pd.DataFrame
 ) -> Path:
-    """Write a rerun recording: the arm with the force on it, and each estimate with the edges of its 95 % interval.
+    """Write a rerun recording: the arm, the force on the arm, and each estimate with its 95 % interval.
 
     Args:
-        rows: table of stage=estimate. wrench: table of `observe_recording`.
+        rows: table of the estimates of stage=estimate. wrench: table of the external force, by `observe_recording`.
     """
     stream = rr.RecordingStream(f"r2s {path.absolute().parent.name.replace('.', '-')}")
     shown = [n for n in rows.columns if n not in wrench.columns and not n.endswith("_half")]
@@ -67,7 +67,7 @@ def write_estimate_recording(
 
 
 def _log_columns(stream: rr.RecordingStream, table: pd.DataFrame, names: Sequence[str]) -> None:
-    """Log columns of a table over its column `t`, with the edges of their 95 % intervals."""
+    """Log the columns `names` of a table over its column `t`, with the limits of their 95 % intervals."""
     index = [rr.TimeColumn("time", duration=table["t"].to_numpy())]
     colour = colours(["estimate"])["estimate"]
     for name in names:
@@ -81,7 +81,7 @@ def _log_columns(stream: rr.RecordingStream, table: pd.DataFrame, names: Sequenc
 
 
 def _layout(names: Sequence[str]) -> rrb.Blueprint:
-    """Return the layout: a tab with the arm beside plots of the force on it, and a tab with a plot per column."""
+    """Return the layout: a tab with the arm and plots of the force on the arm, and a tab with a plot per column."""
     eye = rrb.EyeControls3D(position=[1.5, -1.1, 0.9], look_target=[0.35, 0.0, 0.4])
     legend = rrb.PlotLegend(visible=False)
     force = [rrb.TimeSeriesView(origin=f, name=f"force along {f[6]}, N", plot_legend=legend) for f in FORCES]

@@ -1,4 +1,4 @@
-"""Table, picture and viewer recording of a planned motion."""
+"""Write the report of a planned motion: table, figure and rerun recording."""
 
 from typing import Any
 
@@ -42,7 +42,7 @@ def excitation_page(
 
 
 def motion_figure(path: Any, robot: Robot, motion: Excitation) -> Any:
-    """Draw joint angles within their limits, and velocities, over time."""
+    """Draw joint angles with their limits, and velocities, over time."""
     some = thin(len(motion.t))
     low, high = robot.q_range
     with joint_panels(path, robot.n, "planned motion") as axes:

@@ -1,4 +1,4 @@
-"""The measure table of a run folder."""
+"""Read the measure table of a run folder."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Compare the table cells of two versions of a page of benchmarks/results, also by the intervals in the cells.
+"""Compare the table cells of two versions of a page of benchmarks/results, including the intervals in the cells.
 
 Cells are matched by section, row and column, so that added rows and changed paragraphs do not matter.
 """
@@ -17,7 +17,7 @@ Cell = tuple[str, str, str]  # section, row, column
 
 
 def table_cells(page: str) -> dict[Cell, str]:
-    """Return {(section, row, column): cell} of the tables of a markdown page; repeated names are numbered."""
+    """Return {(section, row, column): cell} for all tables in a markdown page; repeated names are numbered."""
     cells: dict[Cell, str] = {}
     for section, head, rows in _tables(page):
         columns, names = _numbered(head), _numbered([row[0] for row in rows])
@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Return the page without the rows of its tables, so that a table that is not made again has only its head."""
+    """Return the page without the rows of its tables: a table that is not made again then has only its head."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -38,11 +38,11 @@ def without_rows(page: str) -> str:
 
 
 def compare_pages(before: str, now: str) -> pd.DataFrame:
-    """Return a row (section, row, column, committed, now, verdict, change) per cell of either page.
+    """Return a table with a line per cell of either page: section, row, column, committed, now, verdict, change.
 
     verdict is one of VERDICTS. "last digit": each number differs by at most one unit of its last digit. "beyond
-    intervals": at least one interval of the cell does not overlap with its new version.
-    change is the largest relative change of a number of the cell; NaN where the numbers cannot be paired.
+    intervals": at least one interval in the cell does not overlap with its new version.
+    change is the largest relative change of a number in the cell; NaN if the numbers cannot be paired.
     """
     old, new = table_cells(before), table_cells(now)
     rows = []
@@ -54,7 +54,7 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
 
 
 def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
-    """Return `compare_pages` of all {page: text} in one table; with several pages, sections begin with the page."""
+    """Return `compare_pages` for all {page: text} in one table; with several pages, sections begin with the page."""
     parts = []
     for page, text in before.items():
         cells = compare_pages(text, now[page])
@@ -63,7 +63,7 @@ def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
 
 
 def _tables(page: str) -> Iterator[tuple[str, list[str], list[list[str]]]]:
-    """Yield section, head and rows of each table."""
+    """Yield (section, head, rows) for each table of a page."""
     section, block = "", []
     for line in [*page.splitlines(), ""]:
         if line.startswith("|"):
@@ -77,7 +77,7 @@ def _tables(page: str) -> Iterator[tuple[str, list[str], list[list[str]]]]:
 
 
 def _numbered(names: list[str]) -> list[str]:
-    """Return the names with repeated ones numbered: the second of equal names ends with (2)."""
+    """Return the names, with repeated names numbered: the second of two equal names ends with (2)."""
     seen: Counter[str] = Counter()
     numbered = []
     for name in names:
@@ -91,7 +91,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _last_digits(text: str) -> list[float]:
-    """Return each number's resolution: one unit of its last digit."""
+    """Return the resolution of each number in a text: one unit of its last digit."""
     parts = [x.lower().partition("e") for x in re.findall(NUMBER, text)]
     return [10.0 ** (int(power or 0) - len(number.partition(".")[2])) for number, _, power in parts]
 

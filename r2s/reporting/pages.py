@@ -1,4 +1,4 @@
-"""Figures, report.md and recording.rrd of a training, a transfer and a pipeline."""
+"""Write figures, report.md and recording.rrd of a training, a transfer and a pipeline."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -47,8 +47,8 @@ def transfer(
     """Save all episodes and the last second before each stop; draw four episodes; write the report.
 
     Args:
-        run, robot: of the transfer. episodes: {simulator or arm: its episodes}. rows: {the same: their measures}.
-        torque: (n,) Nm, the policy's torque limits. timing: of the arm's cycles; None without an arm.
+        run, robot: run and arm. episodes: {simulator or arm: its episodes}. rows: {simulator or arm: its measures}.
+        torque: (n,) Nm, the policy's torque limits. timing: latencies of the arm's cycles; None without an arm.
         stops: stops of the arm, with their reasons. halted: why the arm did not run all episodes, or None.
     """
     measures = measures_of(run.folder)
@@ -103,8 +103,8 @@ def pipeline(
     """Write one recording.rrd and one report of the whole pipeline; return the measure table of its task.
 
     Args:
-        run, robot: of the pipeline. identified: run folder. trained, transferred: {label: run folder}.
-        rows: {label: measures}, of all transfers.
+        run, robot: run and arm of the pipeline. identified: run folder of the identification.
+        trained, transferred: {label: run folder}. rows: {label: measures} for all transfers.
     """
     measures = measures_of(next(iter(transferred.values())))
     write_measures(run.folder, measures)

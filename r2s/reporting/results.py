@@ -1,4 +1,4 @@
-"""Output of stage=results: page cells compared with the committed ones, and a summary of all pages so far."""
+"""Report stage=results: compare the cells of a page with the committed cells, and summarize all pages so far."""
 
 import json
 from pathlib import Path
@@ -13,15 +13,15 @@ from r2s.reporting.page_comparison import VERDICTS
 from r2s.reporting.tables import print_table
 from r2s.runs import Run
 
-SHOWN = 20  # most cells that are printed
+SHOWN = 20  # largest number of cells that are printed
 NOTE = "without interval: the figure has changed, and the page states no interval that would judge it"
 
 
 def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.DataFrame) -> dict[str, Any]:
-    """Print the cells that differ; write differences.csv, report.md and that of `all_pages`; return the summary.
+    """Print the cells that differ; write differences.csv, report.md and the report of all pages; return the summary.
 
     Args:
-        run: its folder gets the files. page: name. commit: of the clone that made it. cells: of `compare_pages`.
+        run: receives the files. page: page name. commit: commit that made the page. cells: from `compare_pages`.
     """
     counts = {verdict: int((cells["verdict"] == verdict).sum()) for verdict in VERDICTS}
     cells.to_csv(run.folder / "differences.csv", index=False)
@@ -38,7 +38,7 @@ def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.Da
 
 
 def all_pages(folder: Path, last: dict[str, Any]) -> None:
-    """Write folder/report.md: a row per page, of the finished runs below it and of `last`, which ends now."""
+    """Write folder/report.md with a row per page, from the finished runs below `folder` and from `last`, this run."""
     done = {last["page"]: last}
     for path in sorted(folder.glob("*/summary.json")):
         other = json.loads(path.read_text())
@@ -53,7 +53,7 @@ def all_pages(folder: Path, last: dict[str, Any]) -> None:
 
 
 def _shown(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return these cells as a table of strings: beyond intervals, without interval, others; largest change first."""
+    """Return the cells as strings, by verdict (beyond intervals, without interval, others), largest change first."""
     order = cells.assign(rank=cells["verdict"].map({"beyond intervals": 0, "without interval": 1}).fillna(2))
     order = order.sort_values(["rank", "change"], ascending=[True, False])
     change = order["change"].map(lambda x: "" if pd.isna(x) else f"{100 * x:.0f} %")

@@ -1,4 +1,4 @@
-"""`r2s list`: run folders with their status, key figures and age."""
+"""List run folders with their status, key figures and age, for `r2s list`."""
 
 import csv
 import json
@@ -16,15 +16,15 @@ from r2s.runs import status_of
 
 LOST = ("failed", "killed")
 COLUMNS = ["status", "age", "result"]
-LONGEST = 46  # most letters of a run's name in a terminal; names begin with the time, which distinguishes runs
-LEAST = 20  # fewest letters to which a result is cut
+LONGEST = 46  # letters; longer run names are cut in a terminal, where the time at their beginning identifies them
+LEAST = 20  # letters; a result is not cut to fewer than this
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
     """Return a row of strings per run folder below `root`, the newest last.
 
     Args:
-        root: parent of <stage>/<name>. stage: only runs of this stage. failed: only failed or killed runs.
+        root: parent of <stage>/<name>. stage: only list this stage. failed: only list failed or killed runs.
     """
     found = []
     for path in Path(root).glob(f"{stage or '*'}/*/meta.json"):
@@ -43,7 +43,7 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
 
 
 def print_runs(console: Console, runs: pd.DataFrame, title: str) -> None:
-    """Print `run_rows`, one line each, cut to the width of a terminal but complete in a file or pipe."""
+    """Print `run_rows` with a line per run, cut to the width of a terminal, but complete in a file or pipe."""
     rows = [("run", *runs.columns), *((str(name), *map(str, row)) for name, row in runs.iterrows())]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     if console.is_terminal:
@@ -67,7 +67,7 @@ def ago(seconds: float) -> str:
 
 
 def _result(folder: Path, meta: Mapping[str, Any]) -> str:
-    """Return the key figures of a finished run, or the error or progress of another."""
+    """Return the key figures of a finished run, or the error or the progress of an unfinished one."""
     summary = folder / "summary.json"
     try:
         if summary.is_file():

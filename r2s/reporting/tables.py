@@ -1,4 +1,4 @@
-"""Tables of measures as data frames of strings, the same for terminal and reports."""
+"""Build tables of measures as data frames of strings, for the terminal and for reports."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,23 +14,23 @@ from r2s.tasks.measures import Measure, MeasureTable
 
 
 def number(value: float | None, form: str = "{:.3g}") -> str:
-    """Return a formatted number, "-" if it is missing or not finite."""
+    """Return a formatted number, or "-" if the number is missing or not finite."""
     return "-" if value is None or not np.isfinite(value) else form.format(value)
 
 
 def measure_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return the table of `rows` {label: row of evaluations.csv}, one line per simulator or arm."""
+    """Return `rows` {label: row of evaluations.csv} as a table of strings, one line per simulator or arm."""
     return _table([measures[key] for key in measures.rows], rows, measures.corner, decimals=1)
 
 
 def diagnostic_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return the second table of `rows`: gap to the prediction, motion, safety filter, without empty columns."""
+    """Return a second table of `rows`: gap to the prediction, motion, safety filter; empty columns are omitted."""
     present = [measures[key] for key in measures.diagnostics if any(key in row for row in rows.values())]
     return _table(present, rows, "", decimals=0)
 
 
 def _table(columns: Sequence[Measure], rows: Mapping[str, Mapping], corner: str, decimals: int) -> pd.DataFrame:
-    """Return a table of these columns; numbers have at least `decimals` decimals."""
+    """Return a table with a column per measure in `columns`; numbers have at least `decimals` decimals."""
     cells = {
         _counted(label, row): {m.column: m.cell(row.get(m.key), max(decimals, m.digits)) for m in columns}
         for label, row in rows.items()
@@ -63,7 +63,7 @@ def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, 
 def print_table(
     console: Console, frame: pd.DataFrame, title: str, caption: str | None = None, sentences: bool = False
 ) -> None:
-    """Print a table of strings: either sentences, or numbers, of which uncertain ones are dimmed."""
+    """Print a table of strings: either sentences, or numbers; uncertain numbers are dimmed."""
     how = {"title_justify": "left", "caption_justify": "left", "padding": (0, 1, 0, 0)}
     table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **how)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))

@@ -1,4 +1,4 @@
-"""Report of stage=tune: trials, and the best value so far compared with that of a grid at equal compute."""
+"""Report stage=tune: its trials, and its best value so far compared with a grid search at equal compute."""
 
 from collections.abc import Sequence
 from glob import glob
@@ -32,9 +32,9 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) of trials that run one after another, after `at` (K,) s of compute.
+    """Return the best value (K,) that successive trials have reached after `at` (K,) s of compute.
 
-    A value counts at its trial's end; nan (pruned, failed) only costs time. sign: 1 if larger is better, else -1.
+    A value is known when its trial ends; nan (pruned, failed) only uses time. sign: 1 if larger is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))
@@ -43,10 +43,10 @@ def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray,
 
 
 def read_grid(against: str, measure: str) -> list[Trained]:
-    """Return the finished trainings that match a glob and have this measure.
+    """Return the finished trainings that match the glob `against` and have the measure `measure`.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such training.
     """
     found, others = trainings_among(sorted(glob(against)))
     grid = [r for r in found if r.learned and measure in r.curve]
@@ -72,7 +72,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     sign = 1.0 if larger else -1.0
     at = np.array(SHARES) * trials["wall_clock_s"].sum()
     searched = best_so_far(trials["wall_clock_s"].tolist(), trials["value"].tolist(), at, sign)
-    # the last evaluation counts, as for a trial; summary.json is of other goals
+    # a job's value is its last evaluation, as for a trial; summary.json evaluates other goals
     spent, values = (np.array([r.curve[k].iloc[-1] for r in grid]) for k in ("wall_clock_s", measure))
     rng = np.random.default_rng(0)
     orders = [rng.permutation(len(grid)) for _ in range(ORDERS)]

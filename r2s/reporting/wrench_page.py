@@ -1,4 +1,4 @@
-"""Figure and rerun entities of the external wrench: force over time, and an arrow with a cone at the tip."""
+"""Show the external force: a figure over time, and in rerun an arrow with a 95 % cone at the arm's tip."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,17 +19,17 @@ DRAWN_HZ = 100.0
 FORCES = [f"force_{c}_N" for c in "xyz"]
 FRANKA = "Franka's O_F_ext_hat_K"
 METRES = 0.01  # m, length of the arrow per N
-CONE = 24  # points of the cone's edge
+CONE = 24  # number of points on the cone's edge
 TOUCH, NONE = "#cc0018", "#7f8790"
 
 
 def force_of(wrench: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the force and half widths of its 95 % intervals, (T, 3) N each, from a table of `observe_recording`."""
+    """Return force and half widths of the 95 % intervals, (T, 3) N each, from a table of `observe_recording`."""
     return wrench[FORCES].to_numpy(), wrench[[f"{name}_half" for name in FORCES]].to_numpy()
 
 
 def franka_force(recording: Recording) -> np.ndarray | None:
-    """Return the arm's own estimate of the force (T, 3) N on it, None if the recording has none.
+    """Return Franka's estimate of the force (T, 3) N on the arm, or None if the recording has no estimate.
 
     The sign is reversed: O_F_ext_hat_K is the force that the arm exerts.
     """
@@ -59,7 +59,7 @@ def draw_wrench(path: Path, wrench: pd.DataFrame, recording: Recording, contacts
 
 
 def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, wrench: pd.DataFrame) -> None:
-    """Log the moving arm, the force on it as an arrow with a 95 % cone at the tip, and Franka's own estimates."""
+    """Log the moving arm, the force as an arrow with a 95 % cone at the tip, and Franka's estimate of the force."""
     rows = at_rate(recording.t, FRAMES_HZ)
     t, index = recording.t[rows], [rr.TimeColumn("time", duration=recording.t[rows])]
     log_moving_robot(stream, robot, "arm", colours(["estimate"])["estimate"], t, recording.q[rows])

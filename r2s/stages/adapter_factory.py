@@ -1,4 +1,4 @@
-"""Make the adapter of conf/adapt with the identified model of the arm."""
+"""Make the adapter that conf/adapt describes, with the identified model of the arm."""
 
 import filecmp
 from dataclasses import replace
@@ -8,14 +8,14 @@ from r2s.errors import UserError
 from r2s.stages.build import part, plain
 from r2s.stages.run_config import checked, loaded, modules
 
-RECORDINGS = ("train.npz", "validation.npz")  # files of an identification that recorded an arm
+RECORDINGS = ("train.npz", "validation.npz")  # files that stage=identify writes when it records an arm
 PARAMETERS = "parameters.yaml"
 TORQUE = "commanded"  # adapters compare the commanded torque with the motion
-BESIDE = ("calibration",)  # keys of conf/adapt that are no arguments of the adapter
+BESIDE = ("calibration",)  # keys of conf/adapt that the adapter's class does not take
 
 
 def calibrated(calibration, robot, trust=()):
-    """Return identified dynamics, (space, posterior draws) or None, and recordings without payload or None."""
+    """Return identified dynamics, (space, posterior draws), and recordings without payload; a missing one is None."""
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
 
@@ -31,7 +31,7 @@ def calibrated(calibration, robot, trust=()):
 def free_recordings(calibration):
     """Return the recordings without contact from which the arm was identified, if they still exist.
 
-    They are read as in stage=identify. If they cannot give a contact threshold, print why and return [].
+    Read them as stage=identify does. If they do not suffice for a contact threshold, print why and return [].
     """
     from r2s.adaptation.wrench import unfit_for_threshold
     from r2s.recordings.readers import read
@@ -87,10 +87,10 @@ def with_declared_payload(cfg, robot, dynamics):
 def make_adapter(cfg, robot, source):
     """Return the adapter of conf/adapt for the policy of the run folder `source`, or None for adapt=none.
 
-    The adapter's model is that of adapt.calibration=, or the one on which the policy was trained.
+    The adapter's model comes from adapt.calibration=, or else from the calibration of the policy's training.
 
     Raises:
-        UserError: no arm, no identified model, or a model that was not identified from commanded torque.
+        UserError: there is no arm or no identified model, or the model was not identified from commanded torque.
     """
     from r2s.adaptation.adapters import AdapterContext
 
@@ -113,7 +113,7 @@ def make_adapter(cfg, robot, source):
 def calibration_of(cfg, source):
     """Return the run folder with the adapter's model: adapt.calibration, or the calibration of the policy's training.
 
-    Prefer the identification's own folder, which has recordings, to the copy of its model in the training's folder.
+    For a training, prefer the folder of the identification, which has recordings, to the training's own folder.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)
@@ -132,5 +132,5 @@ def calibration_of(cfg, source):
 
 
 def run_folder(path):
-    """Return the run folder whose path, or the path of a file in it, is given."""
+    """Return the run folder for its path or the path of a file in it."""
     return Path(path) if Path(path).is_dir() else Path(path).parent

@@ -12,10 +12,10 @@ from r2s.stages.recordings import labels_of, of_one_reader, recording_files
 def check_data(cfg, to):
     """Print the verdict on each recording of `cfg`, and write it to a JSON file.
 
-    to: file for a single recording; None: ROOT/check/NAME.json. With several recordings each has its own file.
+    to: file for the verdict on a single recording. None, or several recordings: ROOT/check/NAME.json for each.
 
     Raises:
-        UserError: a file cannot be read, or a verdict is fail.
+        UserError: a file cannot be read, or the verdict on a recording is fail.
     """
     if cfg.data.kind != "recording":
         raise UserError("check: expected data=recording data.path=FILE, or data=kinova_gen3")
@@ -35,7 +35,7 @@ def check_data(cfg, to):
 
 
 def judged(cfg, robot, file, validation):
-    """Return the verdict on the recording of a `FileData`, and the recording itself."""
+    """Return the verdict on the recording that a `FileData` describes, and the recording itself."""
     from r2s.identification.checks import check_recording
     from r2s.identification.verdict import judge, with_validation
 

@@ -12,7 +12,7 @@ def reads(cfg):
 
 
 def compare(cfg, overrides):
-    """Compare the trainings among the folders `runs=`; if these are transfers only, compare their adapters."""
+    """Compare the trainings in the folders `runs=`; if there are only transfers, compare the adapters of these."""
     from glob import glob
 
     from r2s.errors import UserError

@@ -23,12 +23,12 @@ class ContactData:
 
 
 def contact_data(cfg, robot, file):
-    """Return the `ContactData` of data.contact and data.contact_validation; None without data.contact.
+    """Return the `ContactData` from data.contact and data.contact_validation; None without data.contact.
 
-    file: `FileData` of the config; its columns are read.
+    file: `FileData` of the config, which has the names of the columns.
 
     Raises:
-        UserError: no tool, no commanded torque, a validation without data.contact, or a wrong file.
+        UserError: tool or commanded torque is missing, a validation has no data.contact, or a file is wrong.
     """
     from r2s.identification.checks import check_recording
 
@@ -48,10 +48,10 @@ def contact_data(cfg, robot, file):
 
 
 def press_parts(cfg, robot, arm):
-    """Return the `PressPlan` of data.presses, after checks that need no run folder.
+    """Check the settings of data.presses and return the `PressPlan`; no run folder is needed yet.
 
     Raises:
-        UserError: no tool, no surface of a simulated arm, or a wrong setting.
+        UserError: there is no tool, a simulated arm has no surface, or a setting is wrong.
     """
     from r2s.arm.presses import press_plan
     from r2s.stages.build import check_source, is_simulated
@@ -103,7 +103,7 @@ def pressed_surface(cfg, run, arm, plan):
 
 
 def calibrated_arm(cfg, robot):
-    """Return the identified arm of `calibration=` with its posterior, an `Arm`."""
+    """Return the identified arm of `calibration=`, with its posterior, as an `Arm`."""
     from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.stages.run_config import modules
@@ -113,7 +113,7 @@ def calibrated_arm(cfg, robot):
 
 
 def identify_surface(cfg, run, arm, data):
-    """Identify a surface; write contact.yaml, model and figure, print tables, return its entry of summary.json."""
+    """Identify a surface; write contact.yaml, model and figure, print tables, return the entry for summary.json."""
     from r2s.identification.contact.contact_file import save_contact
     from r2s.identification.contact.estimate import identify_contact
     from r2s.identification.contact.exchange import write_surface
@@ -141,7 +141,7 @@ def identify_surface(cfg, run, arm, data):
 
 
 def keep_calibration(cfg, run):
-    """Copy the arm of `calibration=` into the run folder, which then has everything for a later calibration=."""
+    """Copy the arm's model of `calibration=` into the run folder, so that a later calibration= can name it."""
     folder = Path(cfg.calibration)
     folder = folder if folder.is_dir() else folder.parent
     for name in ARM:

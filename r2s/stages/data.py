@@ -10,9 +10,9 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
-SLOW_MS = 1.5  # ms between rows of commands, above which their hold is printed
+SLOW_MS = 1.5  # ms; if rows of commands are farther apart, r2s prints how long it assumes that a command is held
 LEAST_PRESSES = 4
-MAX_OVERLAP = 0.2  # share of a validation motion that may repeat training motion, such as an approach to the start
+MAX_OVERLAP = 0.2  # largest share of a validation motion that may repeat training motion, such as the approach
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class ArmData:
         excitation_seed: seed of the training motion; the validation motion has the next seed.
         excitation: file of the training motion; None: it is optimized.
         ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
-        presses: number of paths on a surface to record instead; 0: none. press_point: (3,) m, and press_normal:
-            (3,), of its approximate plane; None: a table below the tip in the home posture.
+        presses: number of paths on a surface to record instead; 0: none. press_point (3,) m, press_normal (3,):
+            approximate plane of the surface; None: a table below the tip in the home posture.
 
     Raises:
         UserError: a value is outside its range.
@@ -63,7 +63,7 @@ class SimulatedData(ArmData):
     """Settings of data=simulated: the motion to record on a simulated arm with known dynamics.
 
     Attributes:
-        truth: name of the dynamics, see `make_truth`. delay, lag: of the actuation, s.
+        truth: name of the dynamics, see `make_truth`. delay, lag: delay and lag of the actuation, s.
         position_noise, velocity_noise: standard deviations of the sensor noise, rad and rad/s.
     """
 
@@ -81,7 +81,7 @@ class SimulatedData(ArmData):
 
 @dataclass(frozen=True)
 class FileData:
-    """Settings of data=recording, the user's recording: see conf/data/recording.yaml and r2s/recordings/readers.py.
+    """Settings of data=recording, recordings from files; conf/data/recording.yaml explains each setting.
 
     Raises:
         UserError: a number is outside its range.
@@ -114,7 +114,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return a recording with the command period of data.command_hz; without it, print the assumed hold."""
+        """Return the recording with the command period; without data.command_hz, print the hold that r2s assumes."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -131,9 +131,9 @@ class FileData:
 
 
 def file_data(cfg, path=None):
-    """Return the `FileData` of a config; keys of other kinds of data are ignored.
+    """Return the `FileData` of a config; ignore keys of data=arm and data=simulated.
 
-    path: replaces data.path, which may then be missing.
+    path: file that replaces data.path, which may then be missing.
     """
     from omegaconf import OmegaConf
 
@@ -150,9 +150,9 @@ def file_data(cfg, path=None):
 
 
 def read_file(robot, file, path, torque=None):
-    """Return the recording at `path`, read with the settings of a `FileData`; `torque` replaces data.torque.
+    """Read the recording at `path` with the settings of a `FileData`, and return it; `torque` replaces data.torque.
 
-    Print what the reader repaired. If data.path is a bag and `path` is not, topic and joints of the bag do not apply.
+    Print what the reader repaired. If only data.path is a bag, ignore topic and joints, which describe that bag.
     """
     from r2s.recordings.readers import is_bag, read
 
@@ -197,7 +197,7 @@ def read_episodes(path):
 
 
 def read_reference(path, n):
-    """Return {t, q, dq, ddq} of the reference motion that a recording of stage=identify followed, or None."""
+    """Return the reference motion {t, q, dq, ddq} for a recording of stage=identify; None if it was not saved."""
     import numpy as np
 
     from r2s.recordings.csv_table import read_csv
@@ -240,7 +240,7 @@ def check_cutoff(cutoff_hz, recordings):
 
 
 def read_user_ramps(robot, file):
-    """Return the ramps of a `FileData`, or None; their columns have the same names as in the recording."""
+    """Return the ramps of a `FileData`, or None; the ramps have the same column names as the recording."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
 
@@ -248,7 +248,7 @@ def read_user_ramps(robot, file):
         return None
     columns = dict(file.columns)
     if file.torque != "commanded":
-        columns["tau"] = None  # the name is of another kind of torque; ramps need the commanded one
+        columns["tau"] = None  # this column has another kind of torque; ramps need commanded torque
     ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
     check_ramps(robot, ramps)
     return replace(ramps, recording=file.held(ramps.recording))
@@ -270,9 +270,9 @@ def ramp_poses(cfg, robot):
 
 
 def record_motion(cfg, robot, motion, k, label, timing):
-    """Record motion number k on the arm; return the motion, given or optimized for data.seconds, and the recording.
+    """Record motion number k on the arm; return the motion and the recording. `motion` None: optimize one.
 
-    timing: receives the durations of the cycles.
+    timing: object that stores the durations of the cycles.
     """
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
@@ -292,7 +292,7 @@ def record_motion(cfg, robot, motion, k, label, timing):
 def record_ramps(cfg, robot, timing):
     """Record breakaway ramps in postures about home; return them, or None if there are no ramp postures.
 
-    timing: receives the durations of the cycles.
+    timing: object that stores the durations of the cycles.
     """
     from r2s.arm.ramp import ramp
     from r2s.progress import Progress
@@ -310,10 +310,10 @@ def record_ramps(cfg, robot, timing):
 def record_arm(cfg, robot, run, motion):
     """Record training motion, validation motion and ramps on an arm, and return them.
 
-    A resumed run reads files that exist. timing.csv gets the cycle durations, also those of a stopped motion.
+    A resumed run reads existing files instead. timing.csv lists the cycle durations, also after a stop.
 
     Args:
-        run: open run folder for the files. motion: the training motion; None: it is optimized.
+        run: open run folder for the files. motion: the training motion; None: r2s optimizes one.
 
     Raises:
         Stopped: the arm stopped; <name>_until_stop.npz has the motion until then.

@@ -20,7 +20,7 @@ WHY = {
     "friction": "calibration= sets the friction",
     "inertia": "calibration= sets the links",
 }
-LIMIT_SHARE = 0.6  # of the speed and acceleration limits, for motion with an unknown payload
+LIMIT_SHARE = 0.6  # share of the speed and acceleration limits that a motion with an unknown payload may use
 
 
 def reads(cfg):
@@ -30,7 +30,7 @@ def reads(cfg):
 
 
 def estimate(cfg, overrides):
-    """Estimate payload, friction, offsets and wrench with intervals; write estimate.csv, wrench.csv and figures."""
+    """Estimate payload, friction, offsets and wrench, with intervals; write estimate.csv, wrench.csv and figures."""
     from r2s.adaptation.adapters import AdapterContext
     from r2s.adaptation.estimator import Estimator
     from r2s.adaptation.offline_estimation import format_estimate, table
@@ -98,7 +98,7 @@ def estimate(cfg, overrides):
 
 
 def identified_surface(cfg, robot):
-    """Return the `IdentifiedSurface` of estimate.surface, or None; raise UserError if the robot has no tool."""
+    """Return the `IdentifiedSurface` of estimate.surface=, or None; raise UserError if the robot has no tool."""
     if not cfg.estimate.surface:
         return None
     from r2s.identification.contact.contact_file import load_contact
@@ -109,7 +109,7 @@ def identified_surface(cfg, robot):
 
 
 def wrench_observer(cfg, robot, dynamics, surface):
-    """Return the wrench observer, and the origin of its contact threshold: "recordings" or "noise"."""
+    """Return the wrench observer, and the source of its contact threshold: "recordings" or "noise"."""
     from r2s.adaptation.wrench import WrenchObserver, contact_threshold
     from r2s.adaptation.wrench_fusion import FusedWrench
 
@@ -135,7 +135,7 @@ def given_recording(cfg, robot):
     """Return the recording of data=recording with one row per millisecond, or None if an arm will be recorded.
 
     Raises:
-        UserError: no such file, no commanded torque, or wrong settings of the arm.
+        UserError: the file is missing or lacks commanded torque, or a setting of the arm is wrong.
     """
     from r2s.adaptation.offline_estimation import at_rate
 
@@ -182,7 +182,7 @@ def record_arm(cfg, robot):
 
 
 def summary(last, changes):
-    """Return the entries of summary.json: the last estimate and the times of payload changes."""
+    """Return the entries for summary.json: the last estimate, and the times at which the payload changed."""
     centre = [None if c != c else round(float(c), 5) for c in (*last.centre, *last.centre_half)]  # JSON has no nan
     return {
         "mass_kg": last.mass,

@@ -63,7 +63,7 @@ class Excite:
 
 
 def make_design(cfg, robot, how):
-    """Return the `PlannedWidths`: the expected interval widths that the motion should make small."""
+    """Return the `PlannedWidths`: the design minimizes the interval widths that they predict."""
     from r2s.identification.planned_width import PlannedWidths
     from r2s.stages.prior import make_settings
 

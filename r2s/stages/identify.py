@@ -40,7 +40,7 @@ def reads(cfg):
 class Parts:
     """Inputs of an identification, checked before a run folder is made.
 
-    With data=arm, `groups` and `ramps` are recorded later, along `motion`. earlier: from identify.from=, or None.
+    With data=arm, `groups` and `ramps` are recorded later. motion: from data.excitation. earlier: from identify.from.
     """
 
     robot: Any
@@ -56,7 +56,7 @@ class Parts:
 
 
 def make_parts(cfg):
-    """Return the inputs of an identification without connecting to a physical arm.
+    """Return the inputs of an identification, without connecting to a physical arm.
 
     Raises:
         UserError: settings contradict each other, or a file is missing or wrong.
@@ -97,7 +97,7 @@ def make_parts(cfg):
 
 
 def with_known_arm(cfg):
-    """Return which data option (presses, contact, loaded) to identify with the known arm of `calibration=`, or None.
+    """Return the option of `data` (presses, contact, loaded) that needs the known arm of `calibration=`, or None.
 
     Raises:
         UserError: the option needs a known arm, but neither `calibration=` nor data.path= is given.
@@ -159,7 +159,7 @@ def identify(cfg, overrides):
             made = replace(made, groups=(group,), ramps=ramps)
         judge_recordings(cfg, run, made)
         earlier, kinds = [made.earlier] if made.earlier else [], dict[str, Any]()
-        for group in made.groups[:-1]:  # each result is a prior of the next fit
+        for group in made.groups[:-1]:  # the result of each fit is a prior of the next fit
             fit = fit_group(cfg, run, made, group, earlier, run.folder / group.torque)
             space, found = fit.found.saved
             earlier.append(Earlier(str(run.folder / group.torque), group.torque, space, found.x, found.samples))
@@ -182,7 +182,7 @@ def identify(cfg, overrides):
 
 
 def judge_recordings(cfg, run, made):
-    """Judge the training recordings: write verdict.json, print warnings, raise UserError if a verdict is fail."""
+    """Judge the training recordings: write verdict.json and print warnings; raise UserError if a verdict is fail."""
     from r2s.identification.verdict import judge
     from r2s.runs import write_json
 
@@ -264,9 +264,9 @@ def fit_group(cfg, run, made, group, earlier, folder):
 
 
 def compared(made, group, found, settings, known_from):
-    """Return tables and summary.json entries on what each recording contributes, and on drift since identify.from.
+    """Return tables and summary.json entries: contribution of each recording, and drift since identify.from.
 
-    known_from: text that names the source of `settings.known`.
+    known_from: text that names the run or recording from which `settings.known` comes.
     """
     from r2s.identification.contributions import contradictions, contributions, validated
     from r2s.identification.known import FAR, block_of, disagreement, drift_table

@@ -13,7 +13,7 @@ PARENTS = (
     "estimate.surface",
     "dr.surface",
 )  # config keys that name a run folder
-FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; the commit fixes files of the package
+FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; files of the package are fixed by the commit
 # files of a run folder that another job may read
 READ = (
     *("config.yaml", "overrides.yaml", "policy.yaml", "summary.json", "measures.json", "evaluations.csv"),
@@ -32,7 +32,7 @@ def parents_of(cfg) -> list[str]:
 
 
 def files_of(cfg, parents: Iterable[str]) -> list[Path]:
-    """Return the files of a config's robot, and those of READ in `parents`: run folders or parameter files."""
+    """Return the robot files that a config names, and the READ files in `parents` (run folders, parameter files)."""
     from omegaconf import OmegaConf
 
     named = [str(value) for key in FILES if (value := OmegaConf.select(cfg, key))]

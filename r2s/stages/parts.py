@@ -1,4 +1,4 @@
-"""Make parts by the `_target_` of config nodes. Error messages name the settings as the user types them."""
+"""Make the objects that config nodes describe by `_target_`; errors name settings as the user types them."""
 
 import inspect
 import logging
@@ -9,13 +9,13 @@ from r2s.errors import UserError, nearest
 
 
 def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
-    """Call the class or function of a config node's `_target_` and return the result, a part.
+    """Call the class or function that a config node's `_target_` names, and return the result, a part.
 
     Args:
         node: config node; its keys are arguments of the target.
         group: path of the node in the config, for error messages.
-        given: positional arguments, which the config does not have.
-        beside: keys of the node that are no arguments of the target.
+        given: positional arguments in addition to those from the config.
+        beside: keys of the node that are not arguments of the target.
 
     Raises:
         UserError: the target does not exist or refuses these arguments.
@@ -44,10 +44,10 @@ def target(node: Any, group: str) -> Callable[..., Any]:
 
 
 def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *given: Any) -> Any:
-    """Return make(*given, **settings); error messages name the settings as the user types them.
+    """Return make(*given, **settings); errors name the settings as the user types them.
 
     Raises:
-        UserError: an unknown or missing argument, a string for a number, or an error of `make` itself.
+        UserError: an argument is unknown or missing or has a wrong type, or `make` raises an error.
     """
     check_types(make, group, settings)
     known, name = arguments(make), getattr(make, "__name__", make)
@@ -62,7 +62,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
         return make(*given, **settings)
     except UserError as error:
         first = str(error).split(":")[0].split(".")[0]
-        if first in settings and first != group:  # add the group, which the target does not know
+        if first in settings and first != group:  # add the group to the message, because the target does not know it
             raise UserError(f"{group}.{error}") from None
         raise
 
@@ -70,7 +70,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
 def arguments(make: Callable[..., Any]) -> dict[str, Any]:
     """Return {argument: type hint} of a function or class.
 
-    **kwargs of an __init__ stand for the arguments of the next class in the MRO. **kwargs of a function become "**".
+    For **kwargs of an __init__, add the arguments of the next class in the MRO. **kwargs of a function become "**".
     """
     found: dict[str, Any] = {}
     for owner in make.__mro__[:-1] if inspect.isclass(make) else (make,):
@@ -91,7 +91,7 @@ def arguments(make: Callable[..., Any]) -> dict[str, Any]:
 
 
 def check_types(make: Callable[..., Any], group: str, settings: Mapping[str, Any]) -> None:
-    """Raise UserError if a setting is a string, but its annotation is a number or a list of numbers."""
+    """Raise UserError if a setting is a string, but the argument's type is a number or a list of numbers."""
     hints = arguments(make)
     for key, value in settings.items():
         kinds = set(_kinds(hints.get(key)))

@@ -12,7 +12,7 @@ from r2s.stages.data import check_cutoff, read_file
 
 @dataclass(frozen=True)
 class LoadedData:
-    """The recording of the loaded arm, the payload declared to gravity compensation or None, and the files read."""
+    """Recording of the loaded arm, payload declared to the arm's gravity compensation (or None), and files read."""
 
     recording: Any
     declared: Any
@@ -23,10 +23,10 @@ def loaded_data(cfg, robot, file, torque=None):
     """Return the `LoadedData` of data.loaded, or None without data.loaded.
 
     Args:
-        file: `FileData` of the config; its columns are read. torque: kind of the torque; None: data.torque.
+        file: `FileData` of the config, with the column names. torque: kind of the torque; None: data.torque.
 
     Raises:
-        UserError: data.declared_payload or data.contact does not fit, or the file is wrong.
+        UserError: data.declared_payload or data.contact contradicts data.loaded, or the file is wrong.
     """
     from r2s.identification.checks import check_motion
     from r2s.physics.payload import payload_of
@@ -51,12 +51,12 @@ def loaded_data(cfg, robot, file, torque=None):
 
 
 def torque_of_calibration(cfg, given):
-    """Return the kind of torque from which `calibration=` was identified; a loaded recording must have the same.
+    """Return the kind of torque from which `calibration=` was identified; loaded recordings need the same kind.
 
     given: value of data.torque, or None.
 
     Raises:
-        UserError: `given` is another kind.
+        UserError: data.torque is another kind.
     """
     from r2s.stages.adapter_factory import PARAMETERS, TORQUE
     from r2s.stages.run_config import loaded
@@ -71,9 +71,9 @@ def torque_of_calibration(cfg, given):
 
 
 def identify_load(cfg, run, arm, data, label=""):
-    """Identify a payload; write payload.yaml and figure, print the tables, return the entry of summary.json.
+    """Identify a payload; write payload.yaml and figure, print the tables, return the entry for summary.json.
 
-    label: of the recording, if there are several loaded ones; payload.yaml is then in the folder payload_LABEL.
+    label: label of the recording if there are several; payload.yaml is then written to the folder payload_LABEL.
     """
     from r2s.identification.payload.estimate import identify_payload
     from r2s.identification.payload.payload_file import save_payload

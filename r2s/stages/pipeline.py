@@ -27,7 +27,7 @@ STEPS = {  # {first label of the step's commands: description}
 }
 STOPPED = 3  # exit status of a command that ended because the arm stopped, see r2s/cli.py
 MODELS = ("identified", "nominal")
-# with adapt=, also: computed torque with the identified model, and the policy trained on it with the adapter
+# labels with adapt=: computed torque on the identified model, and the policy of "identified" plus adapter
 COMPUTED, ADAPTED, SURFACE = "computed", "adapted", "surface"
 REFERENCE = "reference"  # for a task on a surface: hybrid control with the identified model, without learning
 ROWS = {
@@ -36,7 +36,7 @@ ROWS = {
     REFERENCE: "hybrid control, identified model",
 }
 PATHS = 6  # number of paths on the surface, 8 s each; the last one is for validation
-CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # for transfers only
+CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # in transfers only
 WHY = {
     "calibration": "it identifies the arm itself",
     "policy": "it trains its policies itself",
@@ -46,13 +46,13 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the config keys that the steps read, except those that the pipeline itself sets."""
+    """Return the config keys that the steps read, except keys that the pipeline sets for them."""
     keys = {"pipeline", *identify.reads(cfg), *train.reads(cfg), *transfer.reads(cfg)} - {"calibration", "policy"}
     return keys if cfg.pipeline.train_minutes is None else keys - {"budget"}
 
 
 def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
-    """Return those of the typed overrides that a step reads; `step` is its config."""
+    """Return the typed overrides that a step reads. step: config of the step."""
     own = ("stage=", "name=", "root=", "threads=", "pipeline.")
     return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
 
@@ -61,8 +61,8 @@ def run_step(words: dict[str, list[str]]) -> None:
     """Run the commands {label: words} in parallel; print progress line by line, and tables when a command ends.
 
     Raises:
-        UserError: a command failed; the others are terminated.
-        Stopped: the arm of a command stopped; the others are terminated.
+        UserError: a command failed; the remaining commands are terminated.
+        Stopped: a command's arm stopped; the remaining commands are terminated.
     """
     running: dict[str, subprocess.Popen] = {}
     last: dict[str, str] = {}
@@ -107,12 +107,12 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Return groups of a step's commands; those of a group run in parallel. With `moves`, each runs alone."""
+    """Return groups of commands to run in parallel: one group per step, or with `moves` one per command."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
 def command_prefix() -> list[str]:
-    """Return the command that starts r2s as in this process, from a checkout or installed, with --config-dir."""
+    """Return the words that start r2s like this process, from a checkout or as a package, with its --config-dir."""
     from hydra.core.hydra_config import HydraConfig
 
     program = [str(PACKAGE.parent / "run.py")] if CONF.parent != PACKAGE else ["-m", "r2s"]
@@ -149,7 +149,7 @@ def moves_box(cfg: Any) -> bool:
 
 
 def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the labels of the trainings, and those of the transfers."""
+    """Return the labels of the trainings and the labels of the transfers."""
     adapts = cfg.adapt.name != "none"
     unlearned = [REFERENCE] if touches(cfg) or moves_box(cfg) else [COMPUTED] if adapts else []
     trained = *MODELS, *unlearned
@@ -168,12 +168,12 @@ def check_free(root: Path, name: str, cfg: Any) -> None:
 def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
     """Return {label: words of a command} per step: identify, press on the surface if there is one, train, transfer.
 
-    Both trainings have the same settings, time and computer, so their policies differ by the model only. With an
+    Both trainings have the same settings, time and computer, so the policies differ only in the model. With an
     adapter, identification uses the unchanged arm: payload, friction and delay change for transfers only.
 
     Args:
-        cfg: config of the pipeline. name: of its run folder; the names of other run folders begin with it.
-        overrides: typed by the user; each command gets those that it reads.
+        cfg: config of the pipeline. name: name of the pipeline's run folder; all other folder names begin with it.
+        overrides: overrides that the user typed; each command receives only those that it reads.
     """
     root, choice = Path(cfg.root), chosen(overrides, cfg)
     both, adapts = cfg.threads or os.cpu_count() or 2, cfg.adapt.name != "none"
@@ -186,7 +186,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     ) -> list[str]:
         config = cfg.copy()
         config.stage, config.calibration = stage, calibration
-        if typed is not overrides:  # a command without adapter
+        if typed is not overrides:  # only commands without adapter pass other overrides
             config.adapt = {"name": "none"}
         full = f"{name}_{label}" if label != "identify" else name
         threads = cfg.threads if stage == "identify" else max(1, both // 2)
@@ -244,7 +244,7 @@ def tool_words(cfg: Any) -> list[str]:
 
 
 def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrides: Sequence[str]) -> None:
-    """Set task.friction to the identified one in trainings with the identified model, if the task has that key."""
+    """Set task.friction to the identified friction in trainings on the identified model, if the task has that key."""
     from r2s.identification.contact.contact_file import load_contact
 
     if "friction" not in cfg.task or any(o.startswith("task.friction=") for o in overrides):
@@ -257,11 +257,11 @@ def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
     """Raise UserError if identification or training would refuse an override, before anything moves."""
     first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
     identify.make_parts(compose_step(first["identify"], "stage=identify"))
-    train.make_parts(compose_step(trained["nominal"], "stage=train"))  # the others need the identified model
+    train.make_parts(compose_step(trained["nominal"], "stage=train"))  # other trainings need the identified model
 
 
 def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
-    """Return overrides that give a training the nominal model from which the identification starts."""
+    """Return overrides that select the nominal model, from which the identification starts, for a training."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices
@@ -270,7 +270,7 @@ def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
 
 
 def pipeline(cfg, overrides):
-    """Run every command in its own process; write one table, one recording and one report on all of them."""
+    """Run every command in a separate process; write one table, one recording and one report on all commands."""
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures
     from r2s.runs import read_summary

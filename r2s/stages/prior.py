@@ -1,4 +1,4 @@
-"""The prior of stage=identify: stated values identify.prior.PARAMETER.mean=, and an earlier run identify.from=RUN."""
+"""Make the prior of stage=identify from stated values (identify.prior.PARAMETER.mean=) and a run (identify.from=)."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,7 +14,7 @@ from r2s.stages.run_config import loaded
 class Earlier:
     """An earlier identification: folder, kind of torque, parameter space, values x (P,) and posterior draws (S, P).
 
-    drift: value of identify.drift. given: whether it comes from identify.from= or from this run.
+    drift: value of identify.drift. given: True for a run of identify.from=, False for an earlier fit in this run.
     """
 
     run: str
@@ -42,7 +42,7 @@ def earlier_run(cfg, robot):
     """Return the `Earlier` of identify.from=, or None.
 
     Raises:
-        UserError: RUN has no identification of this robot, or calibration= is given as well.
+        UserError: the run has no identification of this robot, or calibration= is also set.
     """
     from r2s.identification.parameter_file import load_parameters, load_posterior
 
@@ -62,9 +62,9 @@ def make_settings(cfg, torque, earlier=(), last=True):
     """Return the `Settings` of an identification from this kind of torque.
 
     Args:
-        earlier: list of `Earlier`. One with another kind of torque provides links and payload. One with the same kind
-            provides all values, friction family and terms, so that both identifications have the same model.
-        last: whether this is the last kind of torque; stated values of friction and sensors apply to the last only.
+        earlier: list of `Earlier`. With another kind of torque, it provides links and payload. With the same kind,
+            it provides all values, friction family and terms, so that both identifications have the same model.
+        last: whether this is the last kind of torque; only there do stated values of friction and sensors apply.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings
@@ -104,7 +104,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
 
 
 def check_known(robot, nominal, recording, settings):
-    """Raise UserError if a stated value does not fit the arm, or the recording cannot show the parameter."""
+    """Raise UserError if a stated value does not fit the arm, or its parameter has no effect in the recording."""
     from r2s.identification.stated import check_stated, stated_prior
     from r2s.identification.terms import scaled_prior, search_space
     from r2s.physics.dynamics import with_family
@@ -117,7 +117,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the initial dynamics of an identification: those of `earlier`, or for other torque only its links."""
+    """Return the initial dynamics of a fit: `earlier`'s dynamics, or for another kind of torque only its links."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -1,7 +1,7 @@
-"""The recordings of stage=identify and `r2s check`: one file or several, each with its own kind of torque.
+"""Find and read the recordings of stage=identify and `r2s check`: one or several files, each with a kind of torque.
 
-`data.path` and `data.validation` are a file, a pattern such as "logs/*.csv", a dict {path: FILE, torque: motor, ...}
-with the keys that differ from those of `data`, or a list of these.
+`data.path` and `data.validation` are a file, a pattern such as "logs/*.csv", a dict {path: FILE, torque: motor, ...},
+whose keys override those of `data`, or a list of files, patterns and dicts.
 """
 
 import glob
@@ -18,7 +18,7 @@ from r2s.stages.parts import plain
 
 OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints", "payload")
 FIND = "find"  # value of `payload` for a recording whose payload is to be identified
-ORDER = ("measured", "motor", "commanded")  # of the fits; the last gives the friction that a command has to overcome
+ORDER = ("measured", "motor", "commanded")  # order of fits; the last has the friction that a command has to overcome
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def recording_files(cfg, key="path"):
 
 
 def _matching(where: str, path: str) -> Iterator[str]:
-    """Yield the path, or, if it is a pattern, the matching files in the order of their names."""
+    """Yield the path itself, or, if the path is a pattern, the matching files in alphabetical order."""
     if not glob.has_magic(path) or located(path).exists():
         yield path
         return
@@ -72,7 +72,7 @@ def _matching(where: str, path: str) -> Iterator[str]:
 
 
 def of_one_reader(files):
-    """Return the `FileData`; if the first is a bag, remove its topic and joints from files of other formats."""
+    """Return the files; if the first is a bag, set `topic` and `joints` to None in files of other formats."""
     from r2s.recordings.readers import is_bag
 
     if not is_bag(Path(files[0].path)):
@@ -90,8 +90,8 @@ def read_groups(robot, files, validation, share, cutoff_hz):
     """Read the recordings; return one `Group` per kind of torque, in the order of the fits.
 
     Args:
-        files, validation: `FileData` of each file. Without `validation`, the share `share` at the end of each
-            recording, or of every period, is held out. cutoff_hz: see `without_payload`.
+        files, validation: `FileData` of each file. share: if `validation` is empty, the part at the end of each
+            recording, or of every period, that is held out. cutoff_hz: see `without_payload`.
     """
     made: dict[str, Group] = {}
 
@@ -132,7 +132,7 @@ def read_groups(robot, files, validation, share, cutoff_hz):
 
 
 def _read(robot, file, several, cutoff_hz):
-    """Return the checked recording of a file, less the torque of a known payload; `several`: errors name the file."""
+    """Read and check a recording, and subtract the torque of a known payload. several: name the file in errors."""
     from r2s.identification.checks import check_recording
     from r2s.identification.payload.unloaded import without_payload
     from r2s.physics.payload import payload_of
@@ -158,7 +158,7 @@ def _split(recording, share, label):
 
 
 def whole(recordings, label=""):
-    """Return the recordings {label: recording} joined to one recording."""
+    """Join the recordings {label: recording}, and return the joined recording."""
     from r2s.recordings.joined import joined
 
     own = [replace(r, name=r.name or label) for label, r in recordings.items()]

@@ -26,12 +26,12 @@ def reads(cfg):
 
 
 def commands_of(settings):
-    """Return the commands (lists of words) of `results.page`, with the folder `results.data` inserted.
+    """Return the commands (lists of words) that make `results.page`, with the folder `results.data` inserted.
 
-    A command is `make ...`, or the arguments of python.
+    A command is `make ...`, or arguments for python.
 
     Raises:
-        UserError: there is no such page, no checkout of r2s, or no data for a page that needs it.
+        UserError: the page does not exist, r2s is not a checkout, or the data for the page are missing.
     """
     page, pages, data = (settings[k] for k in ("page", "pages", "data"))
     if page not in pages:
@@ -78,8 +78,8 @@ def results(cfg, overrides):
 def cloned(clone, paths):
     """Clone this commit unless the clone exists; return {page: committed text, or ""} and the hash of the commit.
 
-    The rows of tables in the clone's pages are removed, so that a table that is not made again stays empty. The clone
-    appears under its name when it is complete.
+    In the clone's pages, tables have no rows, so that a table which is not made again stays empty. The clone has a
+    temporary name until it is complete.
     """
     from r2s.reporting.page_comparison import without_rows
 
@@ -100,10 +100,10 @@ def cloned(clone, paths):
 
 
 def execute(words, clone, log):
-    """Run `python WORDS`, or WORDS if they begin with make, with the r2s of the clone; append the output to `log`.
+    """Run `python WORDS` (or `make ...`, if WORDS begin so) with the clone's r2s; append the output to `log`.
 
     Raises:
-        UserError: the command fails; the message has the last line of its output.
+        UserError: the command fails; the message quotes the last line of output.
     """
     command = words if words[0] == "make" else [sys.executable, *words]
     with open(log, "a+") as file:

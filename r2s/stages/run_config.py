@@ -1,4 +1,4 @@
-"""Read config.yaml of a run folder. Anybody may have written it, so only parts of r2s or of `trust=` are called."""
+"""Read config.yaml of a run folder safely: anybody may have written it, so parts from unknown modules are refused."""
 
 import os
 import re
@@ -10,12 +10,12 @@ from r2s.errors import UserError
 from r2s.stages.parts import target
 
 PACKAGE = Path(__file__).parent.parent
-CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # of a wheel, or of a checkout
+CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, or in a checkout
 PROGRAM = "python run.py" if CONF.parent != PACKAGE else "r2s"  # how the user starts r2s
 TRUST = (
-    "R2S_TRUST"  # environment variable: `trust=` of a resumed search, whose trainings use the overrides in its folder
+    "R2S_TRUST"  # environment variable: `trust=` for trainings of a resumed search, whose folder has the overrides
 )
-# matches resolvers such as ${oc.env:HOME}, nested ${a${b}} that may become one, and an escaped $
+# matches resolvers such as ${oc.env:HOME}, nested ${a${b}} that may become a resolver, and an escaped $
 RESOLVER = re.compile(r"\$\{\s*(\w*)[^}]*(?::|\$\{)|\\\$")
 
 
@@ -36,7 +36,7 @@ def loaded(path):
 
 
 def modules(trust) -> list[str]:
-    """Return the module names in the option `trust=`: a name, names with commas, a list, or None.
+    """Return the module names in the option `trust=`, which is a name, names with commas, a list, or None.
 
     Raises:
         UserError: the option is anything else.
@@ -50,16 +50,16 @@ def modules(trust) -> list[str]:
 
 
 def run_config(folder, trust=None):
-    """Return the config.yaml of a run folder after `checked`; anybody may have written it.
+    """Read config.yaml of a run folder, check it with `checked`, and return it.
 
     Raises:
-        UserError: the file cannot be read, or names parts outside r2s and `trust`.
+        UserError: the file cannot be read, or names a part that is neither in r2s nor in a module of `trust`.
     """
     return checked(loaded(Path(folder) / "config.yaml"), Path(folder) / "config.yaml", trust)
 
 
 def replayed(cfg):
-    """Return a composed config, after `checked` if its overrides come from a run folder."""
+    """Return a composed config; if its overrides come from a run folder, check it with `checked` first."""
     return checked(cfg, "resume", os.environ[TRUST]) if TRUST in os.environ else cfg
 
 
@@ -67,13 +67,13 @@ def checked(cfg, where, trust=None):
     """Return a run folder's config with resolved interpolations; raise UserError if it could run untrusted code.
 
     r2s imports the module of a part and calls the part. So conf/ has to name the part in the same group, or a module
-    of `trust` has to define it. Resolvers can read the environment, so they count as parts of the module `oc`.
+    in `trust` has to define it. Resolvers can read the environment, so they are treated as parts of the module `oc`.
 
     Args:
-        where: file, for errors. trust: modules that the user trusts, see `modules`; replaces the config's `trust`.
+        where: file name for errors. trust: modules that the user trusts (`modules`); replaces the config's `trust`.
 
     Raises:
-        UserError: the config names another part, which has been neither imported nor called.
+        UserError: the config names an untrusted part; r2s has neither imported nor called it.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -111,7 +111,7 @@ def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...],
 
 
 def _is_own(key, value) -> bool:
-    """Return whether a setting names no part (dotted path), or one that conf/ names in the same group."""
+    """Return whether a setting is not the dotted path of a part, or conf/ names this part in the same group."""
     if key == ("friction", "family"):
         return "." not in str(value)
     if key[-1:] != ("_target_",):

@@ -37,7 +37,7 @@ WHY = {
 }
 CALIBRATION = ("parameters.yaml", "posterior.npz")  # files of an identification that a training copies
 SURFACE = ("contact.yaml", "contact_posterior.npz")  # files of dr.surface= that a training copies
-UPDATE_THREADS = 4  # most threads for updates; networks of 128 units cannot use more
+UPDATE_THREADS = 4  # largest number of threads for updates; networks of 128 units cannot use more
 
 
 def reads(cfg):
@@ -52,9 +52,9 @@ def reads(cfg):
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a training. They are made before its run folder, so that a config error leaves no folder.
+    """The parts of a training. They are made before the run folder, so that no folder remains after a config error.
 
-    Without training, only the first five are set, and `algo` is the controller.
+    For a controller without learning, only the first five are set, and `algo` is the controller.
     """
 
     robot: Any
@@ -111,7 +111,7 @@ def make_parts(cfg):
 
 
 def check_length(budget, loop, n_envs, key):
-    """Raise UserError if the budget ends before the first update; the message names algo.`key` as the reason."""
+    """Raise UserError if the budget ends before the first update; the error names the setting algo.`key`."""
     before = n_envs * max(1, math.ceil(loop.learning_starts / n_envs))
     if budget.env_steps is not None and budget.env_steps <= before:
         raise UserError(
@@ -193,13 +193,13 @@ def conclude(cfg, run, parts, selection):
 
 
 def share_threads(cfg):
-    """Return the number of threads for updates, and that for the physics, which runs at the same time."""
+    """Return the number of threads for updates and for the physics, which run at the same time."""
     learning = max(1, min(UPDATE_THREADS, all_threads(cfg) // 2))
     return learning, max(1, all_threads(cfg) - learning)
 
 
 def split_algo(cfg):
-    """Return number of arms, env steps of demonstrations, `Loop`, and the other settings of conf/algo."""
+    """Return the number of arms, the env steps of demonstrations, the `Loop`, and the other settings of conf/algo."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
@@ -214,7 +214,7 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config; a resumed training reads its own copies of models, because the originals may be gone."""
+    """Return the config; a resumed training reads models from its run folder, because the originals may be gone."""
     if not cfg.resume:
         return cfg
     model = cfg.copy()

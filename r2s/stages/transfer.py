@@ -29,7 +29,7 @@ from r2s.stages.build import (
 from r2s.stages.parts import part
 from r2s.stages.run_config import run_config
 
-REST_GAP = 0.05  # share of episodes; if `rest` on the arm is lower than predicted by more, print a warning
+REST_GAP = 0.05  # share of episodes by which `rest` on the arm may be below the prediction without a warning
 FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward", "costs")
 WHY = {k: "it comes from the policy's run" for k in FROM_POLICY}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
@@ -41,12 +41,12 @@ def reads(cfg):
 
 
 def trained_config(cfg, option="policy"):
-    """Return the run folder of `policy=` and its config; errors begin with `option`.
+    """Return the run folder `policy=` and its config; errors begin with `option`.
 
-    The config's calibration and surface become the copies in this folder, so no other folder is needed.
+    In this config, calibration and surface refer to the copies in the run folder, so no other folder is needed.
 
     Raises:
-        UserError: the folder is no finished training.
+        UserError: the folder is not that of a finished training.
     """
     if not cfg.policy:
         raise UserError(f"{option} must be given: {option}=RUN_FOLDER, of a finished stage=train")
@@ -69,9 +69,9 @@ class Request:
     """A policy and the episodes to run in every simulator and on the arm.
 
     Attributes:
-        robot, task, center: of the training; `center` is the center of its randomization.
-        source: run folder of the policy. policy: a trained one, or a controller. starts, goals: of all episodes.
-        draw: randomization of the training; None with simulator=none. soft_start_s: of the arm, s.
+        robot, task: robot and task of the training. center: center of the training's randomization.
+        source: run folder of the training. policy: trained policy or controller. starts, goals: one per episode.
+        draw: randomization of the training; None with simulator=none. soft_start_s: soft start of the arm, s.
     """
 
     robot: Any
@@ -89,7 +89,7 @@ def make_request(cfg):
     """Return the request; if there is an arm, check that a safe path leads to every start posture.
 
     Raises:
-        UserError: no finished training, neither simulator nor arm, an unsuitable arm, or no safe path to a start.
+        UserError: the training is unfinished, simulator and arm are none, the arm is unsuitable, or a path is unsafe.
     """
     from r2s.excitation.motion_checks import Space
     from r2s.excitation.paths import approach
@@ -128,7 +128,7 @@ def make_request(cfg):
 
 
 def has_box(surface):
-    """Return whether a value of arm.surface is a box."""
+    """Return whether `surface`, a value of arm.surface, describes a box."""
     return surface == "box" or (hasattr(surface, "get") and surface.get("box") is not None)
 
 
@@ -141,7 +141,7 @@ def goal_progress(label):
 
 
 def run_in_simulators(cfg, request, engine):
-    """Run the episodes in MuJoCo and in `engine`, if not None; return {name: measures} and {name: Episodes}."""
+    """Run the episodes in MuJoCo and, unless None, in `engine`; return {name: measures} and {name: Episodes}."""
     from r2s.engines.episodes import EngineArms
     from r2s.learning.evaluate import make_evaluation
     from r2s.tasks.rollout import gap, rollout
@@ -164,7 +164,7 @@ class ArmResult:
 
     Attributes:
         tried: (k,) indices of the goals whose episodes began. episodes: these k episodes; None if k = 0.
-        stops: stops that ended episodes early. timing: of the 1 kHz cycles; None if unknown.
+        stops: stops that ended episodes early. timing: durations of the 1 kHz cycles; None if unknown.
         halted: reason why the remaining goals did not run; None: all ran.
         blocked: reason of a stop that ended the last episode of an arm with an operator; None: no such stop.
     """
@@ -178,7 +178,7 @@ class ArmResult:
 
 
 def run_on_arm(cfg, request, runner, predicted):
-    """Run the goals whose predicted episodes have no collision and stay far enough from one; return the result."""
+    """Run those goals whose predicted episodes stay far enough from a collision; return the `ArmResult`."""
     import numpy as np
 
     from r2s.physics.collision import CollisionCheck
@@ -200,7 +200,7 @@ def run_on_arm(cfg, request, runner, predicted):
     with goal_progress(f"on {cfg.arm.name}") as progress:
         done = rollout(request.policy, runner, request.task, request.starts[tried], request.goals[tried], progress)
     stops = [replace(stop, episode=int(tried[stop.episode])) for stop in runner.stops]
-    tried = tried[: runner.done]  # goals that did not begin do not count as failures
+    tried = tried[: runner.done]  # goals whose episodes did not begin are not failures
     episodes = select_episodes(done, slice(len(tried)))
     return ArmResult(tried, episodes, stops, runner.timing, runner.halted, runner.blocked)
 
@@ -234,7 +234,7 @@ def predict(cfg, request, robot):
 def save_arm_result(run, request, name, result, predicted):
     """Write stops.txt, timing.csv and episodes_<arm>.csv with a row per episode; return the measures on the arm.
 
-    predicted: predicted episodes for the comparison, or None.
+    predicted: predicted episodes, with which the arm's episodes are compared, or None.
     """
     import pandas as pd
 
@@ -256,7 +256,7 @@ def save_arm_result(run, request, name, result, predicted):
 def rest_warning(rows, name):
     """Return a warning if fewer episodes end at rest on the arm than predicted, else None.
 
-    Success and path gap do not reveal a shaking policy, because its end effector hardly moves
+    Success and path gap do not reveal a shaking policy, because the end effector hardly moves
     (benchmarks/results/transfer.md).
     """
     seen, expected = (rows.get(k, {}).get("rest") for k in (name, "predicted"))
@@ -287,7 +287,7 @@ def transfer(cfg, overrides):
     with opened as runner, open_run(cfg, overrides, parents=[str(request.source)]) as run:
         shutil.copyfile(request.source / "config.yaml", run.folder / "policy.yaml")
         write_measures(run.folder, task.measure_table)
-        if twin:  # first, because it forks, which must precede any thread
+        if twin:  # first, because this forks processes, which must precede any thread
             result = run_on_twins(cfg, request, open_runner)
         if request.draw is not None:
             rows, episodes = run_in_simulators(cfg, request, engine)
@@ -296,7 +296,7 @@ def transfer(cfg, overrides):
         if runner:
             result = run_on_arm(cfg, request, runner, predicted)
         if request.draw is None:
-            predicted = None  # it was needed only to skip goals on the arm
+            predicted = None  # the prediction was needed only to skip goals on the arm
         if predicted is not None:
             rows["predicted"], episodes["predicted"] = task.measures(predicted) | {"stops": 0}, predicted
         if name != "none":

@@ -20,10 +20,10 @@ from r2s.stages.build import all_threads, console, open_run, unread
 from r2s.stages.parts import called, plain
 from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 
-MOST_STARTS = 3  # of a training that the system keeps ending, for example because memory is short
+MOST_STARTS = 3  # attempts to start a training that the system ends, for example because memory is short
 POLL_S = 0.2
-STOP_S = 20.0  # s, to wait for the end of a training after each signal; a step or an evaluation takes less
-EDGE = 0.05  # share of a range at each end that counts as its edge
+STOP_S = 20.0  # s, time for a training to end after each signal; a step or an evaluation takes less
+EDGE = 0.05  # share of a range, at each end, that is called its edge
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 
@@ -37,9 +37,9 @@ class Tune:
     """Settings of the config group `tune`.
 
     Attributes:
-        trials: total number. workers: number of parallel trainings, with one thread each; None: as threads=.
+        trials: total number of trials. workers: number of parallel trainings, one thread each; None: threads=.
         startup: number of random trials before TPE and the pruner start.
-        measure: key of the measure to optimize, a measure of the task; its value in the last evaluation counts.
+        measure: key of the task's measure to optimize, in the last evaluation of each training.
         space: {option: list of values, or a range for `parse_range`}.
         against: pattern of run folders of trainings to compare with, for example of a grid; None: no comparison.
 
@@ -109,7 +109,7 @@ def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
-    """Return a line for each setting of the best trial at an edge: within EDGE of a range's end, or a list's end."""
+    """Return a line for each setting of the best trial that is at an edge of its range or list of numbers."""
     from r2s.reporting.comparison.scores import edge, is_number
 
     lines = []
@@ -125,7 +125,7 @@ def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
 
 
 def training_words(cfg, overrides, settings):
-    """Return the overrides of a training: the typed ones that it reads, and the settings {option: value}."""
+    """Return the overrides of a training: typed overrides that a training reads, and the settings {option: value}."""
     step = cfg.copy()
     step.stage = "train"
     typed = [o for o in overrides_for(overrides, step) if not o.startswith(("resume=", "skip_completed="))]
@@ -147,7 +147,7 @@ def check_trainings(cfg, overrides, space):
 
 
 def logged_measures(parts):
-    """Return {key: Measure} of the measures that a training logs, found by a short evaluation; others need an arm."""
+    """Run a short evaluation; return {key: Measure} for the measures that a training logs (others need an arm)."""
     import torch
 
     from r2s.learning.evaluate import make_evaluation
@@ -159,12 +159,12 @@ def logged_measures(parts):
 
 
 class TrialRun:
-    """The training of an Optuna trial: a run folder of stage=train, and the process that writes in it.
+    """The training of an Optuna trial: a run folder of stage=train, and the process that writes in the folder.
 
-    If a killed stage=tune left a training running, that process may still write in the folder; then none is started.
+    After stage=tune was killed, a training may go on in this folder; as long as it does, no other is started.
 
     Args:
-        trial: of Optuna. folder: run folder. words: command of the training. log: file for its stderr.
+        trial: Optuna's trial. folder: run folder. words: command that starts the training. log: file for stderr.
     """
 
     def __init__(self, trial: Any, folder: Path, words: Sequence[str], log: Path):
@@ -183,7 +183,7 @@ class TrialRun:
     def stop(self) -> None:
         """End the training as Ctrl-C does, so that its run folder gets the status stopped.
 
-        A process started in the background of a shell ignores Ctrl-C, as do its children, so other signals follow.
+        Processes in the background of a shell ignore SIGINT, so SIGTERM and SIGKILL follow if necessary.
         """
         if self._process is None:
             return
@@ -196,7 +196,7 @@ class TrialRun:
                 continue
 
     def status(self) -> str:
-        """Return started (this process runs it), left (another process runs it), or the status of the run folder."""
+        """Return started (child of this process), left (runs in another process), or the status in the run folder."""
         from r2s.runs import is_locked, read_meta
 
         if self._process is not None and self._process.poll() is None:
@@ -218,10 +218,10 @@ class TrialRun:
 
 
 def follow(study: Any, one: TrialRun, measure: str) -> bool:
-    """Report evaluations, start the training if necessary, prune it if bad; return whether the trial is finished.
+    """Report evaluations; start the training if necessary, or prune it; return whether the trial is finished.
 
     Raises:
-        UserError: the training failed before its first evaluation, or ended MOST_STARTS times.
+        UserError: the training failed before its first evaluation, or ended early MOST_STARTS times.
     """
     import optuna
 
@@ -249,7 +249,7 @@ def follow(study: Any, one: TrialRun, measure: str) -> bool:
 
 
 def search(study: Any, how: Tune, make: Callable[[Any], TrialRun], workers: int) -> None:
-    """Run trials in parallel until `how.trials` exist; begin with unfinished trials of a stopped search."""
+    """Run trials in parallel until `how.trials` exist; first continue the unfinished trials of a stopped search."""
     import optuna
 
     from r2s.progress import Progress
@@ -278,13 +278,13 @@ def search(study: Any, how: Tune, make: Callable[[Any], TrialRun], workers: int)
 
 
 def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize", "maximize"]) -> Any:
-    """Return the Optuna study in study.db of a run folder; a resumed search draws with another seed."""
+    """Return the Optuna study from study.db in a run folder; a resumed search draws with another seed."""
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     storage = f"sqlite:///{run.folder / 'study.db'}"
     study = optuna.create_study(study_name="tune", storage=storage, direction=direction, load_if_exists=True)
-    # study.db has the drawn settings, but not the state of the generator
+    # study.db stores the drawn settings, but not the state of the random generator
     study.sampler = optuna.samplers.TPESampler(
         seed=(seed + 1000 * len(study.trials)) % 2**32, n_startup_trials=startup
     )
@@ -317,7 +317,7 @@ def tune(cfg, overrides):
         if done.empty:
             raise UserError(f"tune: no trial of {len(trials)} is complete")
         best = done.sort_values("value", key=lambda values: measure.sign * values).iloc[-1]
-        # the best value is biased, as its goals selected it; `last` is from goals that selected nothing
+        # the best value is biased, because it was selected on these goals; `last` comes from other goals
         last = read_summary(Path(cfg.root) / "train" / f"{run.folder.name}_{int(best['trial'])}", "tune")["last"]
         counts = trials["state"].value_counts().to_dict()
         run.summary({"best": best.to_dict() | {"unseen": last[how.measure]}, "trials": counts})

@@ -1,1 +1,1 @@
-"""Tasks: goals, observations, rewards, the rollout of an episode, and its measures."""
+"""Tasks: their goals, observations and rewards, the rollout of an episode, and the measures of a policy."""

@@ -1,10 +1,10 @@
-"""Costs in addition to the reward: a training limits the mean of each by a Lagrange multiplier that it adapts.
+"""Costs that a training limits in addition to the reward, with one adaptive Lagrange multiplier per cost.
 
-Maximize the mean reward r subject to mean costs c_k <= d_k (a constrained Markov decision process, Altman 1999):
-the policy maximizes r - sum_k lambda_k c_k / d_k, while lambda_k grows with c_k / d_k - 1 and stays at or above 0
-(Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization, ICLR 2019). The replay buffer stores the costs
-in their units, and an update weights them with the current multipliers. So one critic serves all four algorithms
-and no stored transition becomes stale. Means are over the steps of the training, exploration included.
+A training maximizes the mean reward r subject to mean costs c_k <= d_k (constrained Markov decision process, Altman
+1999). The policy maximizes r - sum_k lambda_k c_k / d_k. The rate of lambda_k is proportional to c_k / d_k - 1, and
+lambda_k stays at or above 0 (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization, ICLR 2019). The
+replay buffer stores the costs in their units, and each update weights them with the current multipliers. So costs
+need no separate critic, and no stored transition becomes stale. Means are over all training steps, with exploration.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,13 +18,13 @@ from r2s.tasks.press_measures import TOUCH_N
 from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State
 
-MARGIN_RAD = 0.1  # rad, from a position limit: where the safety filter starts to fade the torque
-PATIENCE = 50_000  # env steps in which a multiplier grows by 1 while its cost is twice the limit, as in rewards.py
-MOST = 50.0  # largest multiplier: a limit that no policy can meet must not drown the reward for the whole training
+MARGIN_RAD = 0.1  # rad, distance from a position limit at which the safety filter starts to fade the torque
+PATIENCE = 50_000  # env steps in which a multiplier grows by 1 while its cost is twice the limit; see rewards.py
+MOST = 50.0  # largest multiplier; beyond it, a limit that no policy can meet would drown the reward
 
 
 def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
-    """Return (m,) N, the force on the surface beyond the requested one."""
+    """Return (m,) N, the force on the surface minus the requested force, at least 0."""
     exerted = task.forces(state, goals)
     return (exerted[:, 0] - exerted[:, 1]).clip(0.0)
 
@@ -36,7 +36,7 @@ def impact_speed(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np
 
 
 def limit_margin(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
-    """Return (m,) rad, by how much the nearest joint is closer than MARGIN_RAD to a position limit."""
+    """Return (m,) rad, MARGIN_RAD minus the smallest distance of a joint from its position limits, at least 0."""
     low, high = robot.q_range
     return (MARGIN_RAD - np.minimum(state.q - low, high - state.q).min(1)).clip(0.0)
 
@@ -49,13 +49,13 @@ COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {
 
 
 class ConstrainedReward(Reward):
-    """A reward with costs. Its terms are the reward's, then the costs in their units, with weights -lambda / limit.
+    """A reward with costs: the terms of the reward, then the costs in their units with the weights -lambda / limit.
 
     Args:
         reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost, in its unit}.
 
     Raises:
-        UserError: an unknown cost, or a limit that is not positive.
+        UserError: a cost is unknown, or a limit is not positive.
     """
 
     def __init__(self, reward: Reward, robot: Robot, limits: Mapping[str, float]):
@@ -68,7 +68,7 @@ class ConstrainedReward(Reward):
 
     @property
     def factor(self) -> np.ndarray:
-        """(1 + k,), initial values of the reward's factor and of the multipliers of the costs."""
+        """(1 + K,), initial values of the reward's factor and of the K cost multipliers."""
         return np.array([self._reward.factor, *np.zeros(len(self._names))])
 
     def terms(self, task: Any) -> tuple[str, ...]:
@@ -85,19 +85,19 @@ class ConstrainedReward(Reward):
     def judge(
         self, task: Any, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (m,) m, and the terms and costs (m, k)."""
+        """Return the distance (m,) m, and the reward terms followed by the costs, (m, k)."""
         distance, terms = self._reward.judge(task, state, ddq, goals, reference)
         costs = [COSTS[name](self._robot, task, state, goals) for name in self._names]
         return distance, np.column_stack([terms, *costs])
 
     def weights(self, task: Any, progress: float, factor: Any = None) -> np.ndarray:
-        """Return the weights (k,); factor: see `factor`."""
+        """Return the weights (k,) of reward terms and costs; the argument has the form of the attribute `factor`."""
         factor = self.factor if factor is None else factor
         return np.array([*self._reward.weights(task, progress, factor[0]), *(-factor[1:] / self._limits)])
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> np.ndarray:
-        """Return the reward's factor and the multipliers after `env_steps` steps with mean terms `seen` (k,)."""
+        """Return the new factor and multipliers after `env_steps` steps with mean terms and costs `seen` (k,)."""
         own = len(seen) - len(self._names)
-        beyond = seen[own:] / self._limits - 1.0  # not clipped, or rare large costs would count too little
+        beyond = seen[own:] / self._limits - 1.0  # not clipped: otherwise rare large costs would hardly matter
         multipliers = (factor[1:] + beyond * env_steps / PATIENCE).clip(0.0, MOST)
         return np.array([self._reward.adapt(factor[0], progress, seen[:own], env_steps), *multipliers])

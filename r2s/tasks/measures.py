@@ -1,7 +1,7 @@
-"""The measures of a task: key, unit, direction, and how tables and figures show them.
+"""Descriptions of a task's measures: key, unit, which direction is better, and how tables and figures show them.
 
-A task class names its `measure_table`. Training and transfer write it into their run folder as measures.json, so that
-tables, pages and comparisons read a folder without the task's class.
+Each task class has a `measure_table`. Training and transfer write this table into their run folder as measures.json.
+So tables, pages and comparisons of run folders do not need the task's class.
 """
 
 import json
@@ -24,7 +24,7 @@ class Measure:
     Attributes:
         key: column of evaluations.csv. short: column heading of a table. title: name in figures and sentences.
         unit: unit of the shown value, "" if dimensionless. scale: shown value / stored value.
-        digits: decimals shown. lower_is_better: direction.
+        digits: decimals shown. lower_is_better: whether lower values are better.
         root_mean_square: whether several values are averaged as the root of their mean square.
     """
 
@@ -77,21 +77,21 @@ GAP = COMMON[0]
 
 @dataclass(frozen=True)
 class MeasureTable:
-    """The measures of a task, and the keys of those that each table and figure shows.
+    """The measures of a task, and the keys of the measures that each table and figure shows.
 
     Attributes:
-        measures: those of the task; COMMON are always added.
-        selection: measures that compare trainings. A row must contain the first; the last ranks groups of trainings.
+        measures: the measures of the task itself; the measures COMMON are always added.
+        selection: measures that compare trainings. Rows must contain the first; the last ranks groups of trainings.
         rows: columns of the table with a row per simulator and arm.
         comparison: columns of the table of trainings. curves: panels of the learning figure.
         scores: panels of the figure of scores.
         transfer: measures of a transfer to an arm that compare adapters, episode by episode.
         diagnostics: columns of a transfer's second table.
-        corner: heading of the row labels. description: what a policy does, in one sentence.
-        error: name, unit and scale of `Episodes.distance`. error_levels: lines in its figure, in that unit.
+        corner: heading of the column with the row labels. description: what a policy does, in one sentence.
+        error: name, unit and scale of `Episodes.distance`. error_levels: lines in the error's figure, in its unit.
         reward: name of `Episodes.reward`.
 
-    Defaults of empty lists: `measures` for `rows`, COMMON for `diagnostics`, else `selection`.
+    Replacements of empty lists: in `rows` all `measures`, in `diagnostics` COMMON, elsewhere `selection`.
     """
 
     measures: tuple[Measure, ...]
@@ -122,14 +122,14 @@ class MeasureTable:
 
     @property
     def known(self) -> dict[str, Measure]:
-        """{key: Measure}, COMMON included."""
+        """{key: Measure} of all measures, COMMON included."""
         return {m.key: m for m in (*COMMON, *self.measures)}
 
     def __getitem__(self, key: str) -> Measure:
         return self.known[key]
 
     def in_words(self, row: Mapping[str, Any]) -> list[str]:
-        """Return those measures of `selection` that the row contains: ["success at 1 cm 98 %", ...]."""
+        """Return the measures of `selection` that the row contains as words: ["success at 1 cm 98 %", ...]."""
         return [self[key].in_words(float(row[key])) for key in self.selection if row.get(key) not in (None, "")]
 
 

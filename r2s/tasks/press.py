@@ -16,19 +16,19 @@ from r2s.tasks.press_measures import PRESS, WINDOW_S, press_measures
 from r2s.tasks.surface_task import FAR_N, FINE_N, HARD_N, NORMAL, SurfaceTask, near, rough
 from r2s.tasks.task import Episodes, State
 
-LEAST_STEP = 0.2  # smallest step, share of the range of forces
-REVERSAL_S = 0.2  # s, in which the friction feedforward reverses after a step down
+LEAST_STEP = 0.2  # smallest force step, as a share of the range `force`
+REVERSAL_S = 0.2  # s, duration of the friction feedforward's reversal after a force step down
 
 
 @dataclass(frozen=True)
 class PressTask(SurfaceTask):
     """Press on a surface; a `Task` (r2s/tasks/task.py) from conf/task/press.yaml.
 
-    A goal is the row of `SurfaceTask`; its two forces are those before and after the step.
+    A goal is a row as in `SurfaceTask`; its two forces are the requested forces before and after the step.
 
     Attributes:
-        step_s: s, time of the force step. The others: see `SurfaceTask`.
-        creep: m/s, speed along the normal at which the fastest joint moves at FIRST_DQ (r2s/physics/impedance.py).
+        step_s: s, time of the force step. Other attributes: see `SurfaceTask`.
+        creep: m/s, tip speed along the normal with the fastest joint at FIRST_DQ (r2s/physics/impedance.py).
     """
 
     step_s: float = 3.5
@@ -53,12 +53,12 @@ class PressTask(SurfaceTask):
         return replace(task, creep=FIRST_DQ / float(np.abs(moves).max()))
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
-        """Return one point (1, 3) m ~ U(disc of radius `spread` on the plane)."""
+        """Return one point (1, 3) m, uniformly distributed in a disc of radius `spread` on the plane."""
         about, away = rng.uniform(0, 2 * np.pi), self.spread * np.sqrt(rng.uniform())
         return away * np.array([[np.cos(about), np.sin(about)]]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return two forces ~ U(force), at least LEAST_STEP of their range apart."""
+        """Return two forces, N, ~ U(force); they differ by at least the share LEAST_STEP of the range `force`."""
         low, high = self.force
         first = rng.uniform(low, high)
         second = first
@@ -71,26 +71,26 @@ class PressTask(SurfaceTask):
         return self.at(np.zeros(len(goals)), goals)
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force, N, of hybrid control at t (m,) s; the force steps at `force_rate`."""
+        """Return (m, 4), normal and force, N, for hybrid control at t (m,) s; the step is a ramp of `force_rate`."""
         first, second = goals[:, 6], goals[:, 7]
         moved = (self.force_rate * (t - self.step_s)).clip(0.0)
         force = first + np.sign(second - first) * np.minimum(moved, np.abs(second - first))
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of an impedance, m and m/s: position, and direction of friction.
+        """Return the target (m, 6) of an impedance: position, m, and a velocity, m/s, for the friction feedforward.
 
         The position moves from the start along the normal through the nominal plane, until the spring exerts the
-        larger of the two forces even on a surface at the farthest allowed position. The velocity only tells the
-        friction feedforward in which direction the joints are about to move: against the normal while the force
-        rises, along it after a step down.
+        larger of the two forces even on a surface at the farthest allowed position. The velocity only sets the
+        direction in which the friction feedforward expects the joints to move: against the normal while the force
+        rises, along the normal after a step down.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = self.at(t, goals) - self.depth(t, goals)[:, None] * goals[:, NORMAL]
         return np.concatenate([place, (self.creep * (2.0 * share - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the requested one, an ideal step."""
+        """Return (m, 2) N, the force against the nominal normal, and the requested force, a step without a ramp."""
         before = state.t < self.step_s + 0.5 / self.ctrl_hz
         return self.pressed(state, goals, np.where(before, goals[:, 6], goals[:, 7]))
 
@@ -99,8 +99,8 @@ class PressTask(SurfaceTask):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the force error (m,) N, and the reward terms (m, 5).
 
-        force -tanh(error / 5 N); precision 1 - tanh(error / 5 N) / 2 - tanh(error / 0.5 N) / 2; excess: -tanh of the
-        force above the requested one / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        force -tanh(error / 5 N); precision 1 - tanh(error / 5 N) / 2 - tanh(error / 0.5 N) / 2; excess
+        -tanh(excess force / 10 N); smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
         """
         beyond = -np.diff(self.forces(state, goals))[:, 0]
         error, excess = np.abs(beyond), np.tanh(beyond.clip(0.0) / HARD_N)

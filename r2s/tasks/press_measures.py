@@ -5,10 +5,10 @@ import numpy as np
 from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.task import Episodes
 
-WINDOW_S = 1.0  # s before the step, and before the end, over which the force error is averaged
-IMPACT_S = 0.1  # s after the first touch that count as its impact
-TOUCH_N = 0.5  # N, above which the tip counts as touching
-GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # limits of success: RMSE N in each window; overshoot N, or its share
+WINDOW_S = 1.0  # s, windows of the RMS force error: before the force step, and before the end
+IMPACT_S = 0.1  # s, duration of the impact, which begins at the first touch
+TOUCH_N = 0.5  # N, force above which the tip is in contact
+GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # limits of success: RMSE N in each window; overshoot N or share
 
 PRESS = MeasureTable(
     measures=(
@@ -42,10 +42,10 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
     """Return one row of evaluations.csv.
 
     force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the step, and in the
-    last second. overshoot_N: largest excess over the new force in the direction of the step, mean over episodes;
-    overshoot_share: the same relative to the step. impact_N: mean of the largest force within IMPACT_S of the first
-    touch. contact: share of the time in contact after the first touch. success: share of episodes within the limits
-    of GOOD_N. Stopped episodes count as failures in `success` and not at all in these other measures.
+    last second. overshoot_N: mean of the largest excess over the new force in the direction of the force step;
+    overshoot_share: the same, divided by the step. impact_N: mean of the largest force within IMPACT_S of the first
+    touch. contact: share of the time in contact after the first touch. success: share of episodes within GOOD_N, and
+    OVER_N or OVER_SHARE. Stopped episodes are failures in `success`; the other measures above exclude them.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]
@@ -71,7 +71,7 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
 
 
 def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> tuple[float, ...]:
-    """Return RMSE before the step and at the end, overshoot N and share, impact N, and contact of one episode."""
+    """Return one episode's RMSE before the step and at the end, overshoot as N and share, impact N, and contact."""
     window = round(WINDOW_S * ctrl_hz)
     error, change = force - asked, asked[-1] - asked[0]
     rmse = [float(np.sqrt((error[part] ** 2).mean())) for part in (slice(step - window, step), slice(-window, None))]
@@ -80,7 +80,7 @@ def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> 
 
 
 def impact_of(force: np.ndarray, ctrl_hz: int) -> tuple[float, float]:
-    """Return the peak of force (T,) N within IMPACT_S of the first touch, and the share of steps in contact since."""
+    """Return the peak of force (T,) N within IMPACT_S of the first touch, and the share of contact from then on."""
     touched = np.flatnonzero(force > TOUCH_N)
     if not len(touched):
         return 0.0, 0.0

@@ -1,6 +1,6 @@
 """Task push: push a box of unknown mass and friction to a pose on its table.
 
-The task knows the table and the size of the box. It observes the box's pose with the noise `pose_noise`, as from a
+The task knows the table and the size of the box. Observations contain the box's pose with `pose_noise`, as from a
 camera. Mass and friction of the box belong to the dynamics (`dr=box`, `arm.surface`); no observation contains them.
 """
 
@@ -35,7 +35,7 @@ from r2s.tasks.task import Episodes, State
 from r2s.tasks.tip_task import TipTask
 
 POSE, START = slice(0, 6), 6  # columns of a goal: pose of the box, then the start posture
-BEHIND = 0.04  # m, between tip and box at the start
+BEHIND = 0.04  # m, gap between tip and box at the start
 FAR_M, FAR_RAD, GAP_M, FINE_M, LEVEL_M = 0.1, 0.5, 0.05, 0.02, 0.02  # m, rad: tanh scales
 WEIGHTS = {
     "distance": 1.0,
@@ -46,8 +46,8 @@ WEIGHTS = {
     "smoothness": 1.0,
     "filter_penalty": 1.0,
 }
-# columns of an observation after q, dq, effort and `limited`, in the frame of the table: tip m, its velocity m/s, box
-# and error (x m, y m, yaw rad each)
+# columns of an observation, numbered from the end of q, dq, effort and `limited`, in the frame of the table: position
+# of the tip m, velocity of the tip m/s, pose of the box and pose error (each x m, y m, yaw rad)
 TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 
 
@@ -55,20 +55,20 @@ TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 class PushTask(TipTask):
     """Push a box to a pose; a `Task` (r2s/tasks/task.py) from conf/task/push.yaml.
 
-    A goal is the row (6 + n,): goal pose of the box, in the form of `State.box`, and start posture of the arm, rad.
-    The tip then is behind the box, at PUSHED_AT of the box's height.
+    A goal is a row (6 + n,): goal pose of the box, in the form of `State.box`, and start posture of the arm, rad.
+    In the start posture the tip is behind the box, at the share PUSHED_AT of the box's height.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         size: (3,) m, edges of the box. away: (low, high) m, distance of a goal from the box's nominal position.
-        bearing: degrees, goals lie within +- this angle of straight ahead. goal_yaw: degrees, their largest yaw.
-        spread: m, first_yaw: degrees, largest deviation of the box's first pose from nominal; read by `dr=box`.
+        bearing: degrees, goals lie within +- this angle of straight ahead. goal_yaw: degrees, largest yaw of a goal.
+        spread: m, first_yaw: degrees, largest deviation of the box's start pose from nominal; used by `dr=box`.
         pose_noise: m and degrees, standard deviation of the perceived pose in simulation.
         point, normal: nominal position of the box on its table, m, and normal of the table; None: see `table_frame`.
         displacement: m, by which an action of 1 shifts the tip's target under the default controller.
         tool, pool: see `SurfaceTask`. torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
-        tip_radius: m. frame: of the table. own, parameters: default controller and its parameters. `with_model` sets
-            these four.
+        tip_radius: m, radius of the tip. frame: frame of the table. own, parameters: default controller and its
+            parameters. `with_model` sets these four attributes.
     """
 
     ctrl_hz: int = 25
@@ -160,11 +160,11 @@ class PushTask(TipTask):
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) m, the tip's target for zero action: ahead of the box's nominal position by the middle of `away`."""
+        """(3,) m, the tip's target at zero action, ahead of the box's nominal position by the mean of `away`."""
         return self.table.outside(np.array([0.5 * sum(self.away), 0.0, self.height]))
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 3) m of an impedance, the same at all times."""
+        """Return the target (m, 3) m of an impedance: `centre`, at all times."""
         return np.tile(self.centre, (len(goals), 1))
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
@@ -179,7 +179,7 @@ class PushTask(TipTask):
         """Return goals (count, 6 + n), see the class.
 
         distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts with a gap of
-        BEHIND to the farthest corner that a box can have, and ~ U(-half edge, half edge) to the side.
+        BEHIND to the rearmost corner that any box can have, shifted sideways by U(-half edge, half edge).
 
         Raises:
             UserError: the tip does not reach a start or the far side of a goal.
@@ -208,7 +208,7 @@ class PushTask(TipTask):
         return goals[:, :3]
 
     def planar(self, state: State, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return box, goal and goal minus box, (m, 3) each: x m, y m, yaw rad in the table's frame (error: +-pi)."""
+        """Return box, goal and goal minus box in the table frame, (m, 3) each: x m, y m, yaw rad (error: +-pi)."""
         seen = self.table.pose(np.zeros((len(goals), 3)), 0.5 * self.size[2]) if state.box is None else state.box
         box, goal = self.table.planar(seen), self.table.planar(goals[:, POSE])
         error = goal - box
@@ -221,7 +221,7 @@ class PushTask(TipTask):
         return self.table.inside(place), np.einsum("ij,mjn->min", self.table.axes, jacobian)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 25,) to normalise `observe` by: the task's own scales."""
+        """Return mean and standard deviation (3 n + 25,) that normalise observations: fixed scales of the task."""
         n, (low, high) = robot.n, robot.q_range
         mean = np.zeros(3 * n + 25)
         mean[:n] = 0.5 * (low + high)
@@ -255,7 +255,7 @@ class PushTask(TipTask):
         return np.stack([none if state.force is None else np.linalg.norm(state.force, axis=1), none], 1)
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 11), pose of the box, its yaw error rad, the lowest point of the tip m, edges of the box m."""
+        """Return (m, 11), pose of the box, yaw error rad, height of the tip's lowest point m, edges of the box m."""
         box, _, error = self.planar(state, goals)
         pose, height = self.table.pose(box, 0.5 * self.size[2]), self.tip(state.q)[0][:, 2]
         edges = np.tile(self.size, (len(goals), 1))
@@ -267,7 +267,7 @@ class PushTask(TipTask):
         """Return the distance d of the box from its goal (m,) m, and the reward terms (m, 7).
 
         distance -tanh(d / 10 cm); yaw -tanh(|error| / 0.5 rad); precision: product of 1 - tanh(d / 10 cm) / 2 -
-        tanh(d / 3 cm) / 2 and the same for yaw with 0.5 rad and 10 degrees; gap -tanh(distance of the tip from the
+        tanh(d / 3 cm) / 2 and the same of yaw with 0.5 rad and 10 degrees; gap -tanh(distance of the tip from the
         box / 5 cm); height -tanh(error of the tip's height / 2 cm); smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2);
         filter_penalty -limited.
         """

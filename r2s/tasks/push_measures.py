@@ -7,7 +7,7 @@ from r2s.tasks.rollout import HOLD_S
 from r2s.tasks.task import Episodes
 
 GOOD_M, GOOD_RAD = 0.03, float(np.radians(10.0))
-YAW_ERROR, TIP_HEIGHT = 6, 7  # columns of `Episodes.box` behind the pose
+YAW_ERROR, TIP_HEIGHT = 6, 7  # columns of `Episodes.box` after the pose
 
 PUSH = MeasureTable(
     measures=(
@@ -39,9 +39,9 @@ PUSH = MeasureTable(
 def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
-    within_3cm, within_10deg: share of episodes with the box this close to its goal for the whole last 0.5 s.
-    success: both, without a stop, and with the tip always above the table, which it could penetrate freely in
-    simulation. distance_median_m, yaw_median_deg: median over episodes of the mean in the last 0.5 s. force_peak_N:
+    within_3cm, within_10deg: share of episodes with the box this close to its goal throughout the last 0.5 s.
+    success: share of episodes with both, without a stop, and with the tip always above the table (a simulated tip can
+    enter it). distance_median_m, yaw_median_deg: median over episodes of the mean in the last 0.5 s. force_peak_N:
     mean over episodes of the largest force at a control step. on_table: share of episodes with the tip in the table.
     """
     hold, box = round(HOLD_S * ctrl_hz), episodes.box

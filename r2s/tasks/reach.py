@@ -16,15 +16,15 @@ from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.rollout import measures
 from r2s.tasks.task import BaseTask, Episodes, ObservationTerm, State
 
-FINE_M = 0.02  # m, tanh scale of the observed error: the last centimetres span the range of a network's input
+FINE_M = 0.02  # m, tanh scale of the observed error, so that the last centimetres span a network input's range
 FINE_RAD = 0.015  # m^2/rad, tanh scale of the observed J^T error
 FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds: makes creeping joints visible
 OBSERVED = (  # terms of `observe`, for metadata
     f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
 )
-SPEED_NOISE = 0.05  # rad/s, speed noise of trainings for an identified arm; equals the speed that counts as rest
-CLOSE_M = 1e-3  # m, smallest initial distance that the reward divides by
-MIDDLE = 0.05, 0.95  # quantiles of the shoulder distance over random postures: default goal region
+SPEED_NOISE = 0.05  # rad/s, speed noise of trainings for an identified arm; equals REST (rollout.py)
+CLOSE_M = 1e-3  # m, lower bound of the initial distance by which the reward divides
+MIDDLE = 0.05, 0.95  # quantiles of the distance from the shoulder in random postures: default goal region
 POSTURES = 500  # random postures for these quantiles
 
 REACH = MeasureTable(
@@ -63,13 +63,13 @@ class ReachTask(BaseTask):
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         torque_fraction: share of tau_max that an action of 1 commands; one number for all joints, or one each.
-        cutoff_hz: low-pass on the torque.
+        cutoff_hz: cut-off frequency of the low-pass on the torque.
         start_spread: rad, episodes start at q_home + U(-spread, spread).
         reach: (low, high) m, distance of goals from the shoulder (the second joint, or the only one); None: the
             quantiles MIDDLE of random postures.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
         speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise learns not to react to it. So it does not excite oscillations of
+            else 0. A policy trained with noise learns not to react to noise. So it does not excite oscillations of
             elastic gears, which rigid models do not have (benchmarks/results/transfer.md).
     """
 
@@ -96,13 +96,13 @@ class ReachTask(BaseTask):
             check_number("task.speed_noise", self.speed_noise, "[0, 1]")
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "ReachTask":
-        """Return the task with the speed noise of a training for an arm with these dynamics."""
+        """Return the task with the speed noise that a training for an arm with these dynamics uses."""
         if self.speed_noise is not None:
             return self
         return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the torque of an action of 1, or the controller's limit."""
+        """Return (n,) Nm, the torque limit of the controller, or else the torque of an action of 1."""
         if self.controller is not None and self.controller.torque_limit is not None:
             return self.controller.torque_limit
         share = np.array(self.torque_fraction, dtype=float)
@@ -160,9 +160,9 @@ class ReachTask(BaseTask):
         return goals
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (6 n + 12,) to normalise `observe` by: the task's own scales.
+        """Return mean and standard deviation (6 n + 12,) that normalise observations: fixed scales of the task.
 
-        Statistics of random motion are unsuitable: random torques spin the wrist at 10 rad/s, whereas 0.1 rad/s
+        Statistics of random motion would be unsuitable: random torques spin the wrist at 10 rad/s, whereas 0.1 rad/s
         matters for stopping at a goal.
         """
         n, far = robot.n, self.region(robot)[1]
@@ -175,7 +175,7 @@ class ReachTask(BaseTask):
         return centre, np.concatenate(scale)
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, 6 n + 12) float32 of goals (m, 3) m; see `Task.observe`."""
+        """Return the observations (m, 6 n + 12) float32 for goals (m, 3) m; see `Task.observe`."""
         return observe(state.q, state.dq, state.ee, goals, state.jacobian, state.effort, torque)
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
@@ -239,7 +239,7 @@ def observe(
     effort: np.ndarray,
     torque: np.ndarray,
 ) -> np.ndarray:
-    """Return the observation (m, 6 n + 12) float32 in SI units; the same on the arm as in simulation.
+    """Return the observation (m, 6 n + 12) float32 in SI units, for arms and simulators alike.
 
     q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm),
     tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector towards the goal, which a network would

@@ -16,8 +16,8 @@ from r2s.compiled import njit
 from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
-PRECISION_M = (0.03, 0.01)  # m, tanh scales of the bonus
-STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint: the end effector can rest on the axis of a moving one
+PRECISION_M = (0.03, 0.01)  # m, tanh scales of the precision bonus
+STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint, on whose axis the end effector may be at rest
 TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 
 
@@ -27,7 +27,7 @@ def terms(
 ) -> np.ndarray:
     """Return (m, 5): the two halves of eq. (2), which add up to it, and the three terms that are not in the paper.
 
-    distance        -k1 d, with d the distance over the initial one
+    distance        -k1 d, with d the ratio of distance and initial distance
     smoothness      -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
     precision       1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2
     stillness       -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2)
@@ -65,11 +65,11 @@ MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2
 
 
 class Reward:
-    """A weighted sum of named terms. `reward._target_` names a subclass; other keys of its yaml are its arguments.
+    """A weighted sum of named terms. `reward._target_` names a subclass; other keys of the yaml are its arguments.
     This base class uses the terms and weights of the task: `reward=task`.
 
     Attributes:
-        factor: initial argument `factor` of `weights` and `adapt`, a number or an array.
+        factor: initial value of the argument `factor` of `weights` and `adapt`, a number or an array.
     """
 
     factor: Any = 1.0
@@ -88,12 +88,12 @@ class Reward:
         """Return the (k,) weights.
 
         Args:
-            task: of the training. progress: fraction of the budget that is spent. factor: result of `adapt`.
+            task: task of the training. progress: spent fraction of its budget. factor: last result of `adapt`.
         """
         return task.paper_weights
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> Any:
-        """Return the new factor after `env_steps` further steps, in which the terms had the means `seen` (k,)."""
+        """Return the new factor after `env_steps` more steps, in which the terms had the means `seen` (k,)."""
         return factor
 
 
@@ -101,18 +101,18 @@ class Reward:
 class Curriculum(Reward):
     """A reward whose weights change during a training.
 
-    Eq. (2) alone is an exploration problem: its acceleration terms make stopping early attractive. So training starts
-    with light smoothness and a bonus for precision. Then the weights move linearly towards eq. (2) between the two
-    `anneal` fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
+    Eq. (2) alone makes exploration difficult: its acceleration terms reward early stopping. So training starts with a
+    small weight of smoothness and a bonus for precision. Between the `anneal` fractions of the budget, the weights
+    move linearly towards eq. (2). reward=paper has the constant weights of eq. (2): smoothness 1, the others 0.
 
     Attributes:
         smoothness, precision, stillness, filter_penalty: weights before and after the change.
         anneal: fractions of the budget where the change starts and ends.
         max_filter_rate: largest share of the cycles, exploration included, in which the safety filter may change the
-            command; None: any. From the first fraction of `anneal` on, a higher share raises the filter penalty, and
-            a lower one reduces it, down to the curriculum's weight. A fixed weight does not fix the share: it
-            varies from 1 to 6 % of the cycles with the seed (benchmarks/results/minutes.md). This is integral control
-            of a Lagrange multiplier's logarithm (Stooke, Achiam and Abbeel, ICML 2020).
+            command; None: no limit. From the first fraction of `anneal` on, a higher share raises the filter penalty,
+            and a lower share reduces it, down to the curriculum's weight. With a fixed weight, the share varies with
+            the seed from 1 to 6 % (benchmarks/results/minutes.md). The adaptation is integral control of a Lagrange
+            multiplier's logarithm (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.
@@ -136,7 +136,7 @@ class Curriculum(Reward):
             check_number("reward.max_filter_rate", self.max_filter_rate, "(0, 1]")
 
     def terms(self, task: Any) -> tuple[str, ...]:
-        """Return TERMS; raise UserError if the task has others."""
+        """Return TERMS; raise UserError if the task has other terms."""
         if task.reward_terms != TERMS:
             raise UserError(
                 f"reward: a curriculum weights {', '.join(TERMS)}; {type(task).__name__} has "

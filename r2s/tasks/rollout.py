@@ -1,4 +1,4 @@
-"""The rollout of a policy, the same for simulators and arms, and the measures of reaching."""
+"""The rollout of a policy, with one function for simulators and arms, and the measures of task reach."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -11,12 +11,12 @@ from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import Robot
 from r2s.tasks.task import Episodes, State, Task, observe
 
-HOLD_S = 0.5  # s at the end of an episode in which the end effector has to stay within a distance to succeed
-REST = 0.05  # rad/s, below which a joint is at rest
+HOLD_S = 0.5  # s, time at the end of an episode in which the end effector must stay near the goal to succeed
+REST = 0.05  # rad/s, speed below which a joint is at rest
 
 
 class PolicyLike(Protocol):
-    """A policy, or the model-based controllers of r2s/learning/model_based.py."""
+    """Interface of policies and of the model-based controllers in r2s/learning/model_based.py."""
 
     def action(self, observation: torch.Tensor) -> torch.Tensor:
         """Return actions (B, a) in [-1, 1] for observations (B, d)."""
@@ -24,7 +24,7 @@ class PolicyLike(Protocol):
 
 
 class Arms(Protocol):
-    """Arms that run episodes, one control period at a time: a batch, one arm in an engine, or a real arm.
+    """Arms that run episodes, one control period at a time: a simulated batch, one arm in an engine, or a real arm.
 
     Attributes:
         robot: model of each arm. width: number of episodes that run at once.
@@ -40,7 +40,7 @@ class Arms(Protocol):
     def speeds(self) -> np.ndarray | None: ...  # noqa: D102
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Begin episodes number first, first + 1, ... at rest at starts (width, n) rad; return their state."""
+        """Begin the episodes first, first + 1, ... at rest in postures `starts` (width, n) rad; return the state."""
         ...
 
     def step(self, command: np.ndarray) -> State:
@@ -68,8 +68,8 @@ def rollout(
     its last state, and its last distance is infinite.
 
     Args:
-        policy: observation -> action. arms: simulated or real. task: with its controller.
-        starts: (E, n) rad. goals: (E, ...), see `Task.goals`; E is a multiple of `arms.width`.
+        policy: maps observations to actions. arms: simulated or real arms. task: the task with its controller.
+        starts: (E, n) rad, start postures. goals: (E, ...), see `Task.goals`; E is a multiple of `arms.width`.
         progress: callback with the number of finished episodes and their total.
     """
     robot, count, shape = arms.robot, len(goals), (len(goals), task.steps)
@@ -114,7 +114,7 @@ def _run(
 ) -> None:
     """Run the episodes with the indices `now` from their first state, and write them into `out`."""
     weights, scale, before = task.paper_weights, task.distance_scale(state, goals), state.dq.copy()
-    over = np.zeros(arms.width, dtype=bool)  # ended by a contact
+    over = np.zeros(arms.width, dtype=bool)  # whether a contact has ended the episode
     for k in range(task.steps):
         if not (state.stopped | over).all():
             state = arms.step(act(state, goals))
@@ -149,7 +149,7 @@ def _run(
 
 
 def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
-    """Return the state, with the `last` q, dq, ee and tau for the arms whose episode is `over` (m,)."""
+    """Return the state, but with the `last` q, dq, ee and tau for the arms whose episode is `over` (m,) bool."""
     names, here = ("q", "dq", "ee", "tau"), over[:, None]
     kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
     return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
@@ -158,8 +158,8 @@ def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
 def measures(episodes: Episodes) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
-    success_x: share of episodes within x of the goal for the whole last 0.5 s. distance_median_m: median over goals
-    of the mean distance in that time. return_paper: mean sum of eq. (2); return_smooth: the same without the noise of
+    success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
+    of the mean distance in this time. return_paper: mean sum of eq. (2); return_smooth: the same without the noise of
     measured speeds, which eq. (2) mistakes for acceleration. time_to_reach_s: median time until the end effector
     stays within 2 cm, over the episodes in which it does. overshoot_m: largest distance beyond 2 cm after it first
     came within 2 cm, mean over episodes. rest: share of episodes with every joint slower than REST for the whole last
@@ -214,9 +214,9 @@ def select_episodes(episodes: Episodes, which: slice | np.ndarray) -> Episodes:
 
 
 def episode_measures(task: Task, episodes: Episodes, predicted: Episodes | None = None) -> list[dict[str, float]]:
-    """Return a row per episode: its measures, `gap` to the same episode of `predicted`, and whether it was stopped.
+    """Return a row per episode: measures, `gap` to the same episode in `predicted`, and whether the arm stopped.
 
-    A stopped episode has no gap (nan).
+    The gap of a stopped episode is nan.
     """
     rows = []
     for k in range(len(episodes.goal)):

@@ -1,8 +1,8 @@
-"""Base class of tasks on a surface: nominal plane, approach, force estimate, and parts of their reward terms.
+"""Base class of tasks on a surface, with nominal plane, approach, force estimate, and parts of the reward terms.
 
 The task knows a nominal plane only. The true plane, its stiffness and its friction are part of the dynamics
-(`dr=contact`, `arm.surface`). Neither observation nor controller contains the true force: the policy observes an
-estimate from q, dq and the commanded torque.
+(`dr=contact`, `arm.surface`). Neither observation nor controller uses the true force: the policy observes a
+force estimate from q, dq and the commanded torque.
 """
 
 from dataclasses import dataclass, field, replace
@@ -25,12 +25,12 @@ from r2s.tasks.tip_task import TipTask
 
 POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8, 9  # columns of a goal
 LAG_M = 0.01  # m, lag of the tip behind its target, from damping at approach_speed and a friction error of 2 N
-RESIDUAL_M = 5e-3  # m, shift of the target by an action of 1 (default controller): a quarter of 20 N on the Panda
+RESIDUAL_M = 5e-3  # m, shift of the default controller's target by an action of 1: 5 N on the Panda
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
-# 1/rad, see `cartesian_impedance`; low, because a null-space torque reaches the tip where joints stick. On models of
-# twins 0 and 1 the reference's force errors are alike from 0.02 to 0.05, and up to twice as large at 0.2
+# 1/rad, see `cartesian_impedance`; low, because a null-space torque reaches the tip if joints stick. On models of
+# twins 0 and 1 the reference's force errors are similar from 0.02 to 0.05, and up to twice as large at 0.2
 NULL_STIFFNESS = 0.05
-REGULAR = 1e-3  # m^2/rad^2, regularizes the force estimate: no force along directions that no joint moves
+REGULAR = 1e-3  # m^2/rad^2, regularizes the force estimate: 0 in directions in which no joint moves the tip
 EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: middle of conf/dr/contact.yaml
 POSTURES = 12  # about this many points of a path must be within reach
 
@@ -45,11 +45,11 @@ class SurfaceTask(TipTask):
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         force: (low, high) N, range of the requested forces. force_rate: N/s, at which a requested force changes.
-        approach_speed: m/s, speed of the target along the nominal normal, so the highest closing speed at contact.
+        approach_speed: m/s, speed of the target along the nominal normal, thus the highest closing speed at contact.
         clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
             from `point`. place: m, tilt: degrees, largest deviation of the true plane from the nominal one.
         point, normal: the nominal plane in the base frame, m; None: a table below the tip at home.
-        tool: tool file of the robot if robot.tool is null; the stages read it.
+        tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of goals that a training draws from.
         stop: what a stop of the arm does to a contact, one of `r2s.physics.push_limit.STOPS`; None: release.
@@ -77,7 +77,7 @@ class SurfaceTask(TipTask):
     parameters: np.ndarray | None = field(default=None, repr=False)
     own: Impedance | None = field(default=None, repr=False)
     touches = True
-    approaches: ClassVar[int] = 1  # read by `control=hybrid`: its law's APPROACH
+    approaches: ClassVar[int] = 1  # APPROACH of the control law under `control=hybrid`
     target_size: ClassVar[int] = 6
 
     def __post_init__(self):
@@ -136,7 +136,7 @@ class SurfaceTask(TipTask):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with a limit of force and speed at the nominal plane that admits the requested forces."""
+        """Return the task with limits of force and speed at the nominal plane, which admit the requested forces."""
         limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1], self.stop)
         if limit is not None:
             limit = replace(limit, place=self.place, tilt=float(np.radians(self.tilt)))
@@ -174,11 +174,11 @@ class SurfaceTask(TipTask):
         raise NotImplementedError
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and requested force, N, of hybrid control at t (m,) s."""
+        """Return (m, 4), normal and requested force, N, for hybrid control at t (m,) s."""
         raise NotImplementedError
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return two drawn forces, N."""
+        """Return the two random forces of a goal, N."""
         raise NotImplementedError
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -222,10 +222,10 @@ class SurfaceTask(TipTask):
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, how far the target of the tip's centre is below the nominal plane at t (m,) s.
 
-        The target moves at approach_speed until the tip has certainly touched, then the force rises at force_rate.
+        The target moves at approach_speed until the tip has certainly touched. Then the force rises at force_rate.
         """
         height, K = goals[:, HEIGHT], self.spring
-        touched = self.beyond + LAG_M - (height - self.clearance)  # the tip's centre is a radius above its surface
+        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` is that of the tip's centre
         slow, late = self.approach_speed * t - height, (t - self.down_s).clip(0.0)
         return np.minimum(
             slow.clip(None, touched) + self.force_rate / K * late, touched + goals[:, FORCES].max(1) / K
@@ -238,14 +238,14 @@ class SurfaceTask(TipTask):
 
     @property
     def spring(self) -> float:
-        """Stiffness, N/m, of the controller's spring, or of the default controller's if it has no spring."""
+        """Stiffness, N/m, of the controller's spring; without a spring, that of the default controller."""
         for control in (self.controller, self.own):
             if isinstance(control, Impedance) and control.parameters[K_DEFAULT] > 0:
                 return float(control.parameters[K_DEFAULT])
         raise UserError(f"task: {type(self).__name__} needs a model of the arm; call with_model first")
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 12,) to normalise `observe` by: the task's own scales."""
+        """Return mean and standard deviation (3 n + 12,) that normalise observations: fixed scales of the task."""
         n = robot.n
         low, high = robot.q_range
         mean = np.zeros(3 * n + 12)
@@ -287,8 +287,8 @@ class SurfaceTask(TipTask):
     def estimate(self, state: State, normal: np.ndarray, jacobian: np.ndarray | None = None) -> np.ndarray:
         """Return (m,) N, the force against the normal (m, 3), estimated from q, dq and the last command.
 
-        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest it may be wrong by
-        the friction level over the lever arm; errors of the model bias it.
+        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest its error may
+        reach friction level / lever arm; model errors bias it.
         """
         jacobian = self.tip(state.q)[1] if jacobian is None else jacobian
         q, dq = np.ascontiguousarray(state.q), np.ascontiguousarray(state.dq)
@@ -316,7 +316,7 @@ class SurfaceTask(TipTask):
 
 
 def near(error: np.ndarray, coarse: float, fine: float) -> np.ndarray:
-    """Return 1 - tanh(error / coarse) / 2 - tanh(error / fine) / 2: 1 for no error (m,), 0 for a large one."""
+    """Return 1 - tanh(error / coarse) / 2 - tanh(error / fine) / 2: 1 at `error` (m,) 0, 0 at large errors."""
     return 1.0 - 0.5 * (np.tanh(error / coarse) + np.tanh(error / fine))
 
 

@@ -1,7 +1,7 @@
-"""The task protocol, which environment, rollout and policies depend on.
+"""The protocol `Task`, the interface of tasks for environment, rollout and policies.
 
-A task defines where episodes start, the goal, the observation, the reward terms, and how episodes are measured. A new
-task is one file beside reach.py and one yaml (docs/how_to/extending.md).
+A task defines start postures, goals, observations, reward terms, and the measures of episodes. To add a task, write
+one file next to reach.py and one yaml (docs/how_to/extending.md).
 """
 
 import copy
@@ -19,9 +19,9 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.rewards import TERMS
 
-# the score penalizes filter rates above this; lower rates do not make policies better
+# the score penalizes only filter rates above this value; lower rates do not make policies better
 MAX_FILTER_RATE = 0.04
-TORQUE_STD = 0.3  # share of the torque limit, normalises an observed controller torque
+TORQUE_STD = 0.3  # share of the torque limit, standard deviation that normalises an observed controller torque
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +29,12 @@ class State:
     """The state of m arms with n joints. Its arrays may be views that the next step overwrites.
 
     Attributes:
-        t: (m,) s since the episodes began. q, dq: (m, n) rad, rad/s.
+        t: (m,) s, time since the episode began. q, dq: (m, n) rad, rad/s.
         ee: (m, 3) m, the end effector. jacobian: (m, 3, n) m/rad, its translational Jacobian.
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target torque after the low-pass.
         stopped: (m,), whether the arm has stopped before the end of its episode.
         limited: (m,), share of the last control period in which the safety filter changed the command.
-        noise: (m, n) rad/s, sensor noise that `measured` adds to dq, which then is the true speed; None: dq is the
+        noise: (m, n) rad/s, sensor noise, which `measured` adds to the true speed dq. None: dq is already the
             measured speed, or the sensors are exact.
         force: (m, 3) N, force that the tool exerts, in base axes: the true force in simulation and on twins, the
             force that the arm reports otherwise. Rewards and measures use it, observations do not. None: unknown.
@@ -56,12 +56,12 @@ class State:
     box: np.ndarray | None = None
 
     def measured(self) -> "State":
-        """Return the state as the sensors measure it: what a policy or a controller uses."""
+        """Return the state as the sensors measure it, for policies and controllers."""
         return self if self.noise is None else replace(self, dq=self.dq + self.noise, noise=None)
 
     @staticmethod
     def at_home(robot: Robot) -> "State":
-        """Return one arm at rest at home, with zero kinematics: an input that makes functions compile."""
+        """Return one arm at rest at home, with zero ee and Jacobian, as an input to compile functions."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
         none = np.zeros(1, dtype=bool), np.zeros(1)
         return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
@@ -72,10 +72,10 @@ class Episodes:
     """E finished episodes of T control steps; index k along T is the state after step k.
 
     Attributes:
-        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) where it moves; see
+        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) if it moves; see
             `Task.goal_positions`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m.
-        reward: (E, T), under `Task.paper_weights`; for reaching, eq. (2).
-        reward_smooth: (E, T), the same from speeds without measurement noise.
+        reward: (E, T), with the weights `Task.paper_weights`; in task reach, eq. (2).
+        reward_smooth: (E, T), the reward computed from speeds without measurement noise.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
         collision: (E,) str, time and bodies of the contact that ended the episode; "" without contact.
@@ -105,9 +105,9 @@ class ObservationTerm:
 
     Attributes:
         name: name of the term. unit: its SI unit, "1" if dimensionless.
-        of: its source: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). With a plan, `goal` is the
+        of: source: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). With a plan, `goal` is the
             current reference position. A plan adds the sources ahead (next positions - ee), velocity (of the path),
-            limited, q_off and dq_off (plan minus arm). control: the torque of a controller that observes it.
+            limited, q_off and dq_off (plan minus arm). Source control: torque of a controller with `observes_torque`.
         divided_by: divisor, one number or one per element; None: 1. tanh: whether tanh is applied afterwards.
     """
 
@@ -122,8 +122,8 @@ class Task(Protocol):
     """What an arm has to do in episodes of `steps` control steps.
 
     Attributes:
-        ctrl_hz: policy rate. cutoff_hz: low-pass on the torque. steps: control steps of an episode.
-        substeps: physics steps of a control step.
+        ctrl_hz: policy rate. cutoff_hz: cut-off of the low-pass on the torque. steps: control steps per episode.
+        substeps: physics steps per control step.
         observation_summary: terms and units of an observation, for the metadata of policy.onnx.
         reward_terms: names of the reward terms. paper_weights: (k,), their weights in `Episodes.reward`.
         pool: number of goals that a training draws from.
@@ -132,7 +132,7 @@ class Task(Protocol):
         measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
         may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
         touches: whether the tool touches a surface, so that simulated arms need one (`Dynamics.surface`).
-        moves_box: whether that surface is a box that the tool pushes, so that arms must perceive it (`State.box`).
+        moves_box: whether the surface is a box that the tool pushes, so that arms must perceive it (`State.box`).
         push_limit: limit of the force and the speed of contacts; None: no limit.
     """
 
@@ -170,7 +170,7 @@ class Task(Protocol):
         ...
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "Task":
-        """Return the task for the identified model of one arm, which sets model-dependent defaults."""
+        """Return the task with the defaults that depend on the identified model of one arm."""
         ...
 
     def controlled_by(self, controller: Controller) -> "Task":
@@ -196,7 +196,7 @@ class Task(Protocol):
         ...
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, n) rad, the start postures of episodes with these goals; `starts` are the proposed ones."""
+        """Return (m, n) rad, the start postures of episodes with these goals; `starts`: proposed postures."""
         ...
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
@@ -208,11 +208,11 @@ class Task(Protocol):
         ...
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, d) float32; torque: `torque_limit`, which divides the efforts."""
+        """Return the observations (m, d) float32; torque: `torque_limit`, the divisor of the efforts."""
         ...
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, divisors of the distances in the reward; the episodes begin at `state`."""
+        """Return (m,) m, divisors of the distances in the reward; `state`: first state of the episodes."""
         ...
 
     def judge(
@@ -221,17 +221,17 @@ class Task(Protocol):
         """Return the distance (m,) m from the goal, and the reward terms (m, k).
 
         Args:
-            state: after a control period. ddq: (m, n) rad/s^2, mean over this period.
-            goals: (m, ...). scale: (m,) m, of `distance_scale`.
+            state: state after a control period. ddq: (m, n) rad/s^2, mean over this period.
+            goals: (m, ...). scale: (m,) m, result of `distance_scale`.
         """
         ...
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
-        """Return (m, 2) N, the force against a surface and the requested one; None: the task requests none."""
+        """Return (m, 2) N, the force against a surface and the requested force; None: no requested force."""
         ...
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 11): `State.box`, its yaw error rad, the tip's height above the table m, the box's edges m."""
+        """Return (m, 11): `State.box`, yaw error rad, the tip's height above the table m, the box's edges m."""
         ...
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
@@ -251,7 +251,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, goals: see `Task.observe`. controller: of the task. state: without its sensor noise, which this adds.
+        task, goals: see `Task.observe`. controller: the task's controller. state: its noise is added here.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()
@@ -263,7 +263,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
 
 
 def observation_scale(task: Task, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (d,) of what `observe` returns."""
+    """Return mean and standard deviation (d,) that normalise the result of `observe`."""
     mean, std = task.observation_scale(robot)
     if not task.control(robot).observes_torque:
         return mean, std
@@ -271,7 +271,7 @@ def observation_scale(task: Task, robot: Robot) -> tuple[np.ndarray, np.ndarray]
 
 
 class BaseTask:
-    """Defaults that most tasks share: torque control, goals that are positions, no model."""
+    """Base class with the defaults of most tasks: torque control, goals that are positions, no model."""
 
     ctrl_hz: int
     episode_s: float
@@ -305,7 +305,7 @@ class BaseTask:
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with the `push_limit` (r2s/physics/push_limit.py) of a table below the tip at home."""
+        """Return the task with a `push_limit` (r2s/physics/push_limit.py) for a table below the tip at home."""
         return self._with("push_limit", push_limit(robot, friction, force_max, speed_near))
 
     def _with(self, name: str, value: Any) -> Self:
@@ -340,7 +340,7 @@ class BaseTask:
     def score(self, row: Mapping[str, float]) -> float:
         """Return the score of one evaluation.
 
-        One percentage point of success within 1 cm, or of episodes at rest, counts as much as 1 of the return. Each
+        One percentage point of success within 1 cm, or of episodes at rest, equals 1 of the return. Each
         percentage point of the filter rate above MAX_FILTER_RATE costs 10.
         """
         price = 1e3 * max(row["limited"] - MAX_FILTER_RATE, 0.0)

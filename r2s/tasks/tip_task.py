@@ -1,4 +1,4 @@
-"""Base class of tasks for a tool: default controller, its torque limit, and starts that the goals replace."""
+"""Base class of tasks for a tool's tip, with default controller, torque limit, and starts that goals define."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ class TipTask(BaseTask):
     """A task for the tip of a tool, with a Cartesian impedance as its default controller.
 
     Attributes:
-        torque_fraction: share of tau_max, the largest torque of the default controller and of control=torque.
+        torque_fraction: largest torque of the default controller and of control=torque, as a share of tau_max.
         cutoff_hz, speed_noise: see `ReachTask`.
-        own: the default controller, which `with_model` makes; None before.
+        own: the default controller; None until `with_model` makes it.
     """
 
     torque_fraction: float | tuple[float, ...]
@@ -27,13 +27,13 @@ class TipTask(BaseTask):
     own: Impedance | None
 
     def as_reach(self) -> ReachTask:
-        """Return a reach task with the same rates and torques; raise UserError if one is not allowed."""
+        """Return a reach task with the same rates and torques; raise UserError if a value is not allowed."""
         return ReachTask(
             self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
         )
 
     def noise_for(self, dynamics: Dynamics) -> float:
-        """Return `speed_noise`, rad/s, or its default in trainings for an arm with these dynamics."""
+        """Return `speed_noise`, rad/s, or if None, the default in trainings for an arm with these dynamics."""
         if self.speed_noise is not None:
             return self.speed_noise
         return SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0
@@ -55,7 +55,7 @@ class TipTask(BaseTask):
         return self.as_reach().torque_limit(robot) if limit is None else limit
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, n) rad, home: `begin` replaces it by the goals' start postures."""
+        """Return the home posture (count, n) rad, which `begin` replaces by the start postures of the goals."""
         return np.tile(robot.q_home, (count, 1))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:

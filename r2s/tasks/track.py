@@ -60,10 +60,10 @@ class TrackTask(BaseTask):
     A goal is a plan (steps + 1 + preview, 6 + 3 n) of r2s/tasks/trajectory.py, with a row for each control step.
 
     Attributes:
-        ctrl_hz: policy rate, 50 to 200. episode_s: length of a path, s. ramp_s: duration of its acceleration, and of
-            its deceleration.
+        ctrl_hz: policy rate, 50 to 200. episode_s: length of a path, s. ramp_s: s, duration of the
+            acceleration, and of the deceleration.
         torque_fraction, boost: the largest target torque is boost x torque_fraction x tau_max, at most tau_max.
-        cutoff_hz: low-pass on the torque.
+        cutoff_hz: cut-off frequency of the low-pass on the torque.
         preview: samples of the path ahead in an observation.
         speed: (low, high) m/s, drawn peak speed; lower where the arm's limits require it.
         size: (low, high) m, drawn radius of a path about its centre. kinds: subset of KINDS, equally probable.
@@ -95,7 +95,7 @@ class TrackTask(BaseTask):
         if not isinstance(self.ctrl_hz, int) or not 50 <= self.ctrl_hz <= 200 or cycles % self.ctrl_hz:
             raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; 50, 100, 125 and 200 are")
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
-        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # plans are kept whole
+        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # plans are stored whole
         check_number("task.boost", self.boost, "(0, inf)")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.pool", self.pool, "[1, inf)", whole=True)
@@ -128,7 +128,7 @@ class TrackTask(BaseTask):
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(5,), weights of error and smoothness."""
+        """(5,), weights of the reward terms: 1 for distance and smoothness, 0 for the others."""
         return PAPER
 
     def region(self, robot: Robot) -> tuple[float, float]:
@@ -153,11 +153,11 @@ class TrackTask(BaseTask):
         return super().control(robot)
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, n) rad, home: `begin` replaces it by the paths' starts."""
+        """Return the home posture (count, n) rad, which `begin` replaces by the first postures of the paths."""
         return np.tile(robot.q_home, (count, 1))
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, n) rad, the starts of the paths."""
+        """Return (m, n) rad, the first postures of the paths."""
         return goals[:, 0, 6 : 6 + starts.shape[1]]
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
@@ -204,11 +204,11 @@ class TrackTask(BaseTask):
         This checks neither contacts nor whether trainings contain such curves.
 
         Args:
-            robot: the arm. start: (3,) m of the end effector. shape: offset from there, (T, 3) m, at arc length u
-                (T,) m. pace: peak du/dt, m/s; lower where the arm's limits require it.
+            robot: the arm. start: (3,) m, first end-effector position. shape: maps u (T,) m, the arc length, to the
+                offset (T, 3) m from `start`. pace: peak du/dt, m/s; lower where the arm's limits require it.
 
         Raises:
-            UserError: the arm cannot follow it.
+            UserError: the arm cannot follow the curve.
         """
         plan = self._paths(robot).plan(np.array(start, dtype=float), shape, pace, self._times)
         if plan is None:
@@ -217,14 +217,14 @@ class TrackTask(BaseTask):
 
     @property
     def _times(self) -> np.ndarray:
-        """(T,) s, of the rows of a plan."""
+        """(T,) s, times of the rows of a plan."""
         return np.arange(self.steps + 1 + self.preview) / self.ctrl_hz
 
     def _paths(self, robot: Robot) -> Paths:
         return Paths(robot, self.torque_limit(robot), self.episode_s, self.ramp_s)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (d,) to normalise `observe` by: the task's own scales."""
+        """Return mean and standard deviation (d,) that normalise observations: fixed scales of the task."""
         n = robot.n
         centre, scale = self._region.observation_scale(robot)
         ahead = np.repeat(self.speed[1] * np.arange(1, self.preview + 1) / self.ctrl_hz, 3)
@@ -232,11 +232,11 @@ class TrackTask(BaseTask):
         more = np.concatenate([ahead, *(np.full(wide, x) for wide, x in widths)])
         scale = scale.copy()
         scale[2 * n + 6 : 2 * n + 9] = FAR_M  # the error
-        scale[3 * n + 12 : 4 * n + 12] = FAR_M  # J'error
+        scale[3 * n + 12 : 4 * n + 12] = FAR_M  # J^T error
         return np.concatenate([centre, np.zeros(len(more))]), np.concatenate([scale, more])
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, d) float32 of plans `goals`; see `observation_terms`."""
+        """Return the observations (m, d) float32 for the plans `goals`; see `observation_terms`."""
         n = state.q.shape[1]
         rows, k = np.arange(len(goals)), self._at(state.t)
         now = goals[rows, k]
@@ -290,9 +290,9 @@ class TrackTask(BaseTask):
         """Return one row of evaluations.csv.
 
         path_rmse_mm: RMS distance of end effector and reference, over all steps of all paths that were not stopped.
-        path_max_mm: mean over paths of their largest error. within_x: share of the steps; steps of stopped paths
-        count as outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: RMS over joints
-        and time. jerk: m/s^3, RMS at the end effector, cubic fit over JERK_S. stopped: share of the paths.
+        path_max_mm: mean over paths of their largest error. within_x: share of steps within x; steps of stopped
+        paths are outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: RMS over joints
+        and time. jerk: m/s^3, RMS of the end effector, from cubic fits over JERK_S. stopped: share of stopped paths.
         q_left_rad, limited: as for reaching.
         """
         ended = ~np.isfinite(episodes.distance).all(1)
@@ -323,7 +323,7 @@ class TrackTask(BaseTask):
         return -(row["path_rmse_mm"] if np.isfinite(row["path_rmse_mm"]) else 1e3) - 100 * row["stopped"]
 
     def _at(self, t: np.ndarray) -> np.ndarray:
-        """Return (m,), the plan rows at t (m,) s."""
+        """Return (m,), the indices of the plan rows at t (m,) s."""
         return np.minimum(np.rint(t * self.ctrl_hz).astype(np.int64), self.steps)
 
 

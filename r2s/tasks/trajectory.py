@@ -1,7 +1,7 @@
 """End-effector trajectories: curves, the postures that follow them, and the fastest feasible timing.
 
 A curve is x(u), m, with |dx/du| <= 1. Inverse kinematics on a grid of u and a cubic spline yield the postures q(u).
-The clock u(t) accelerates along a minimum-jerk polynomial to the pace v, m/s, and slows down along one at the end. So
+The clock u(t) accelerates along a minimum-jerk polynomial to the pace v, m/s, and slows down likewise at the end. So
 position, velocity and acceleration of end effector and joints are continuous. The pace is reduced until torque, speed
 and acceleration keep a margin to the limits of the arm and of its safety filter.
 """
@@ -21,8 +21,8 @@ from r2s.physics.safety_filter import APPROACH, DECELERATION, DQ_ALLOWED, OFFSET
 KINDS = ("fourier", "eight", "circle", "waypoints")
 SPACE = np.eye(3)
 GRID_M = 0.01  # m, step of u between two postures of the inverse kinematics
-HARMONICS = 3  # of a random Fourier curve
-LEADS = 60  # points from home to the start of a path; as many more at the start let the posture converge
+HARMONICS = 3  # harmonics of a random Fourier curve
+LEADS = 60  # points from home to the start of a path, and repetitions of the start until the posture converges
 OFF_M = 1e-4  # m, largest position error of a posture
 INSIDE = 0.05  # rad, least distance of a path from the position limits of the safety filter
 # Shares of the largest target torque, and of the filter's speed limit and acceleration bound, that a path may use;
@@ -70,7 +70,7 @@ def _waypoints(rng: np.random.Generator, size: float, axes: np.ndarray) -> Curve
     """Return a curve of minimum-jerk motions between random points of a ball, or of a disc."""
     points = [np.zeros(3)]
     length = 0.0
-    while length < 8.0:  # m of u, more than the length of an episode
+    while length < 8.0:  # m of u, more than an episode can cover
         direction = rng.standard_normal(len(axes)) @ axes
         point = size * rng.uniform(0.3, 1.0) * direction / np.linalg.norm(direction)
         if len(points) == 1 or np.linalg.norm(point - points[-1]) > 0.3 * size:
@@ -93,9 +93,9 @@ def smooth(s: np.ndarray) -> np.ndarray:
 
 
 def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return position, pace and acceleration at t (T,) s of a clock of unit pace, from 0 to `seconds`.
+    """Return u, du/dt and d2u/dt2 at t (T,) s of a clock with pace 1 that runs from 0 to `seconds`.
 
-    The pace rises along `smooth` in the first `ramp` s and falls along it in the last; outside it is 0.
+    The pace du/dt rises along `smooth` in the first `ramp` s and falls in the last `ramp` s; outside it is 0.
     """
 
     def integral(s: np.ndarray) -> np.ndarray:
@@ -114,7 +114,7 @@ class Paths:
 
     Attributes:
         robot: the arm. torque: (n,) Nm, largest target torque.
-        seconds: s, duration of a path. ramp: s, duration of its acceleration and of its deceleration.
+        seconds: s, duration of a path. ramp: s, duration of the acceleration, and of the deceleration.
     """
 
     robot: Robot
@@ -153,10 +153,10 @@ class Paths:
         return q(u[:, 0]), along * rate, q(u[:, 0], 2) * rate**2 + along * slope
 
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
-        """Return the largest ratio of a path's torque, or of its speed and acceleration, to what is allowed.
+        """Return the largest ratio of a path's torque, or of its speed and acceleration, to the allowed value.
 
         The torque comes from the nominal model. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq), with
-        v, the speed allowed at q.
+        the speed v that is allowed at q.
         """
         limits = self._limits  # type: ignore[attr-defined]
         shares = [np.abs(self._model.rigid(q, dq, ddq)) / (TORQUE * self.torque)]  # type: ignore[attr-defined]
@@ -183,7 +183,7 @@ class Paths:
             strain = self.strain(*self.timed(q, pace, coarse))
             if strain <= 1.0:
                 return self.rows(*self.timed(q, pace, t))
-            pace *= 0.99 / np.sqrt(strain)  # accelerations scale with its square, speeds linearly
+            pace *= 0.99 / np.sqrt(strain)  # accelerations scale with the pace squared
             if pace < SLOWEST * first:
                 return None
         return None

@@ -21,23 +21,23 @@ from r2s.tasks.trajectory import KINDS, V, X, clock, curve
 from r2s.tasks.wipe_measures import GOOD_M, GOOD_N, WIPE, wipe_measures
 
 A = slice(6, 9)  # columns of the acceleration in a path, after position and velocity
-SLOW_V = 0.01  # m/s, at which the expected friction of the surface reaches its level
+SLOW_V = 0.01  # m/s, tip speed at which the expected friction of the surface reaches its level
 FAR_M = 0.01  # m, tanh scale of the path error
 REST_S = 0.3  # s, pause between the full force and the path, and after the path
-STEADY = 0.25  # share of the integral rate at the limit of stability: a gain margin of 12 dB
+STEADY = 0.25  # integral rate as a share of its stability limit: a gain margin of 12 dB
 
 
 @dataclass(frozen=True)
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal is the row of `SurfaceTask` with the forces at start and end of the path, which `goals` makes equal, and
-    then the path: position, velocity and acceleration (9,) before the first control step and after each step.
+    A goal is a row as in `SurfaceTask`, with the forces at start and end of the path; `goals` draws equal forces. The
+    path follows: position, velocity and acceleration (9,) before the first control step and after each step.
 
     Attributes:
         speed: (low, high) m/s, drawn peak speed. size: (low, high) m, drawn radius of a path. kinds: subset of
             KINDS, equally probable. ramp_s: s, duration of the path's acceleration, and of its deceleration.
-        friction: expected friction coefficient of the surface. The others: see `SurfaceTask`.
+        friction: expected friction coefficient of the surface. Others: see `SurfaceTask`.
         inertia: (3, 3) kg, effective mass of the tip at the nominal plane.
     """
 
@@ -80,14 +80,14 @@ class WipeTask(SurfaceTask):
         """Return the task with the model of one arm; see `SurfaceTask.with_model`."""
         tip = Tip(robot)
         q = tip.posture(self.plane(robot)[0])
-        q = robot.q_home if q is None else q  # `goals` raises
+        q = robot.q_home if q is None else q  # out of reach: `goals` raises
         jacobian, mass = tip(q)[1], InverseDynamics(robot, dynamics).mass(q[None])[0]
         inertia = np.linalg.inv(jacobian @ np.linalg.solve(mass, jacobian.T))
         return super(WipeTask, replace(self, inertia=inertia)).with_model(robot, dynamics)
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """Stiffness N/m and rate r of the integrals 1/s, from the tip's effective mass at the plane.
+        """Stiffness, N/m, and rate r of the integral action, 1/s, from the tip's effective mass at the plane.
 
         A path needs the stiffest spring that the latency allows: K = m w^2 with the smallest effective mass m. With
         the law's critical damping, the largest mass M has the characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s
@@ -98,7 +98,7 @@ class WipeTask(SurfaceTask):
         return {"stiffness": K, "integral_rate": float(STEADY * 2.0 * np.sqrt(K / masses[-1]))}
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
-        """Return (steps + 1, 3) m, a curve of random kind with speed ~ U(speed), anywhere within `spread`."""
+        """Return (steps + 1, 3) m, a curve of random kind with speed ~ U(speed) at a random place within `spread`."""
         size, speed = rng.uniform(*self.size), rng.uniform(*self.speed)
         shape = curve(self.kinds[rng.integers(len(self.kinds))], rng, size, axes)
         t = np.arange(self.steps + 1) / self.ctrl_hz - self.begin_s
@@ -139,13 +139,13 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force, N, of hybrid control; unequal forces are interpolated along the path."""
+        """Return (m, 4), normal and requested force, N, for hybrid control; linear in time between the two forces."""
         share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
         force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return an impedance's target (m, 6), position and velocity, in the middle of the period from t on."""
+        """Return an impedance's target (m, 6), position and velocity, half a control period after t (m,) s."""
         middle, normal = t + 0.5 / self.ctrl_hz, goals[:, NORMAL]
         now, down = self.now(middle, goals), self.depth(middle, goals)[:, None] * normal
         return np.concatenate([now[:, X] - down, now[:, V]], axis=1)
@@ -157,7 +157,7 @@ class WipeTask(SurfaceTask):
         return now[:, A] @ self.inertia + self.friction * force * now[:, V] / np.maximum(speed, SLOW_V)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 18,) to normalise `observe` by: the task's own scales."""
+        """Return mean and standard deviation (3 n + 18,) that normalise observations: fixed scales of the task."""
         mean, std = super().observation_scale(robot)
         return np.append(mean, np.zeros(6)), np.concatenate([std, np.ones(3), np.full(3, 0.5 * self.speed[1])])
 
@@ -178,7 +178,7 @@ class WipeTask(SurfaceTask):
         ]
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the requested one."""
+        """Return (m, 2) N, the force against the nominal normal, and the requested force."""
         return self.pressed(state, goals, self.contact(state.t, goals)[:, 3])
 
     def judge(
@@ -187,8 +187,8 @@ class WipeTask(SurfaceTask):
         """Return the distance from the path along the nominal plane (m,) m, and the reward terms (m, 6).
 
         force -tanh(error / 5 N); path -tanh(distance / 1 cm); precision: product of 1 - tanh(error / 5 N) / 2 -
-        tanh(error / 2 N) / 2 and the same for the distance with 1 cm and 3 mm; excess -tanh(e / 10 N) with the force
-        e above the requested one; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        tanh(error / 2 N) / 2 and the same for the distance with 1 cm and 3 mm; excess -tanh(e / 10 N) with the excess
+        e of the force, N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
         """
         beyond, normal = -np.diff(self.forces(state, goals))[:, 0], goals[:, NORMAL]
         offset = self.tip(state.q)[0] - self.at(state.t, goals)

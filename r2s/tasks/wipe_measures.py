@@ -6,7 +6,7 @@ from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.press_measures import TOUCH_N, impact_of
 from r2s.tasks.task import Episodes
 
-GOOD_N, GOOD_M = 2.0, 0.003  # N, m: a step counts as wiped if force and path error are within both
+GOOD_N, GOOD_M = 2.0, 0.003  # N, m: a step is wiped if force error and path error are within these limits
 SUCCESS = 0.95  # share of a path that must be wiped
 
 WIPE = MeasureTable(
@@ -38,10 +38,10 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv; the path starts at step `begin`, and forces and errors count from there.
+    """Return one row of evaluations.csv, over the steps from `begin` on, at which the path starts.
 
-    within_2N, within_3mm: share of the steps with so small a force error, and path error; wiped: share with both;
-    contact: share with more than TOUCH_N. Steps of stopped episodes count as misses. success: share of episodes wiped
+    within_2N, within_3mm: share of the steps with a force error, or path error, within the limit; wiped: with both;
+    contact: with more than TOUCH_N. Steps of stopped episodes are in none of these. success: share of episodes wiped
     to SUCCESS. force_rmse_N, path_rmse_mm: RMS error over the steps of the episodes that were not stopped. impact_N:
     mean over these episodes of the largest force within IMPACT_S of the first touch, also before `begin`.
     """

@@ -1,4 +1,4 @@
-"""External torque and force at which a Franka arm stops itself (libfranka's setCollisionBehavior)."""
+"""Set the external torque and force at which a Franka arm stops itself (libfranka's setCollisionBehavior)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from r2s.physics.push_limit import STIFF, PushLimit
 from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
 
-OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to it, so that no reflex acts
-# Share of the cautious thresholds that friction and model errors use up: they cause an external torque of up to 3.7
-# of 20 Nm in a Panda's joints 1 to 4 and 2.2 of 12 Nm in its wrist.
+OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to this value, so that no reflex acts
+# Share of the cautious thresholds that friction and model errors use up: they appear as external torque of up to
+# 3.7 Nm (threshold 20 Nm) in joints 1 to 4 of a Panda, and 2.2 Nm (threshold 12 Nm) in its wrist.
 ERROR = 0.2
 FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/contact.yaml
 
@@ -27,7 +27,7 @@ class CollisionThresholds:
         torque: (7,) Nm at the joints. force: (6,) N and Nm at the end effector.
 
     Raises:
-        UserError: a count is wrong, or a value is not above 0.
+        UserError: the number of values is wrong, or a value is not above 0.
     """
 
     torque: Sequence[float] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
@@ -47,8 +47,8 @@ CAUTIOUS = CollisionThresholds()
 def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
     """Return the thresholds for a task: above every force that its push limit allows, and at least CAUTIOUS.
 
-    The load case is a tip on the plane with the largest normal force that the limit allows on a rigid surface, and
-    FRICTION times this force tangentially. For model errors, ERROR times CAUTIOUS is added.
+    In the load case, the tip exerts on the plane the largest normal force that the limit allows on a rigid surface,
+    and FRICTION times this force tangentially. ERROR times CAUTIOUS is added for model errors.
 
     Raises:
         UserError: the thresholds would switch the reflexes off.

@@ -9,7 +9,7 @@ import numpy as np
 from r2s.arm.clients.connection_check import Finding
 from r2s.physics.robot import SIM_DT
 
-LOST_SHARE = 0.01  # of the states; the same limit as for lost commands, because both use the same cable
+LOST_SHARE = 0.01  # share of the states; the same limit as for lost commands, because both use the same cable
 GAP_S = 0.02  # 20 cycles without an answer stop the arm
 REALTIME = Path("/sys/kernel/realtime")  # where libfranka looks for a real-time kernel
 LIMITS = resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK
@@ -30,7 +30,7 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check the states of an arm at rest; arm, here: their times (k,) s on the arm's and this computer's clock."""
+    """Check the states of an arm at rest; arm, here: times (k,) s of the states, by the arm's and our clock."""
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)

@@ -1,4 +1,4 @@
-"""The check at connection, before anything moves: does the arm at the address match the model?"""
+"""Check at connection, before anything moves, whether the arm at the address matches the model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,19 +15,19 @@ from r2s.physics.robot import Robot
 
 # Both kinematics are exact and use the same q: they differ only by single precision (1e-7 m) and rounded robot files
 PLACE_M, ANGLE_DEG = 1e-3, 0.2  # a tenth of the accuracy of a policy; 0.2 deg are 1 mm at 0.3 m
-LOAD_KG = 0.01  # 0.08 Nm at full reach: less than the friction of any joint, so gravity compensation still holds
+LOAD_KG = 0.01  # 0.08 Nm at full reach: less than the friction of any joint, so the arm does not sink
 GRAVITY = 0.1  # m/s^2: 0.6 deg of tilt, 1 % of gravity compensation
 # Without O_ddP_O, the gravity torque is compared. Link models differ, so only tilts above 5 to 12 deg are detected
-GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # of the largest gravity torque at the posture, and Nm
+GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # allowed error: share of the posture's largest gravity torque, plus Nm
 BEYOND = 0.1  # rad, how far a person may guide a joint beyond its limit
 
 
 @dataclass(frozen=True)
 class ArmType:
-    """A type of Franka arm with its own limits (Franka's FCI documentation).
+    """A type of Franka arm and its limits (Franka's FCI documentation).
 
     Attributes:
-        name: of the type. version: of its FCI.
+        name: name of the type. version: version of its FCI.
         q_min, q_max, dq_max, tau_max: (7,) rad, rad/s, Nm. dtau_max: Nm/s.
     """
 
@@ -40,7 +40,7 @@ class ArmType:
     dtau_max: float = 1000.0
 
     def within(self, robot: Robot) -> Robot:
-        """Return the robot with its position and velocity limits clipped to the arm's."""
+        """Return the robot with its position and velocity limits clipped to those of this arm type."""
         q_min, q_max = np.maximum(robot.q_min, self.q_min), np.minimum(robot.q_max, self.q_max)
         return replace(robot, q_min=q_min, q_max=q_max, dq_max=np.minimum(robot.dq_max, self.dq_max))
 
@@ -59,10 +59,10 @@ FR3 = ArmType("FR3", 10, fr3_limits.Q_MIN, fr3_limits.Q_MAX, fr3_limits.DQ_MAX, 
 
 @dataclass(frozen=True)
 class Finding:
-    """One compared quantity.
+    """The result of the comparison of one quantity.
 
     Attributes:
-        name: what was compared. expected: by r2s. found: on arm or computer. refused: whether `found` is not allowed.
+        name: the quantity. expected: its value in r2s. found: on arm or computer. refused: whether not allowed.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Connection:
     """What a client expects of its arm.
 
     Attributes:
-        arm: its type. declared: payload that its gravity compensation should assume, including the end effector.
+        arm: type of the arm. declared: payload, with end effector, for which the arm should compensate gravity.
         moves: False for `r2s check`: a mismatch is only reported, and no motion begins.
     """
 
@@ -88,7 +88,7 @@ class Connection:
     moves: bool = True
 
     def findings(self, robot: Robot, version: int, state: Any) -> list[Finding]:
-        """Compare the model with the arm's FCI version and its RobotState at rest."""
+        """Compare the robot model with the FCI version of the arm and with the arm's RobotState at rest."""
         return [
             Finding(
                 "FCI version", f"{self.arm.version} ({self.arm.name})", f"{version}", version != self.arm.version
@@ -122,7 +122,7 @@ class Connection:
 
 
 def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
-    """Return the gravity torque (n,) Nm of the nominal links and load (4,) (`mass_and_moment`) at q (n,) rad."""
+    """Return the gravity torque (n,) Nm of nominal links and a load (4,) from `mass_and_moment`, at q (n,) rad."""
     rest = np.zeros((1, robot.n))
     return nominal_torque(robot, q[None], rest, rest)[0] + LoadTorque(robot)(q, load)
 
@@ -136,7 +136,7 @@ def _load_of(robot: Robot, s: Any) -> np.ndarray:
 
 
 def refuse(findings: Sequence[Finding], what: str) -> None:
-    """Raise UserError, in one line, with all findings that are refused; do nothing if there are none."""
+    """Raise UserError, with one line that lists all refused findings; do nothing if there are none."""
     if wrong := [str(finding) for finding in findings if finding.refused]:
         raise UserError(f"{what}: {'; '.join(wrong)}")
 
@@ -149,7 +149,7 @@ def _posture(arm: ArmType, q: np.ndarray) -> Finding:
 
 
 def _limits(arm: ArmType, robot: Robot) -> list[Finding]:
-    """Compare limits: torque must not exceed the arm's; home must be within the limits clipped to the arm's."""
+    """Compare the limits: torque limits must not exceed the arm's, and home must be within the clipped limits."""
     step, torque = robot.dtau_max / arm.dtau_max, robot.tau_max / arm.tau_max
     i, j, home = int(torque.argmax()), int(step.argmax()), robot.q_home
     k = int(np.maximum(robot.q_min - home, home - robot.q_max).argmax())

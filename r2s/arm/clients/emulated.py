@@ -1,4 +1,4 @@
-"""The Franka clients connected to our emulator of the control box, with a hidden twin behind it."""
+"""Open a Franka client on our emulator of the control box, which drives a hidden twin."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -38,9 +38,9 @@ def emulated_arm(
 
     Args:
         robot: nominal model. client: 'panda' or 'fr3'.
-        seed: of the rigid twin behind the emulator. noise, payload, declared_payload, surface: see `TwinBase`.
-        realtime: 1 kHz instead of lock-step. operator, collision_torque, collision_force, speed_share, moves: see
-            `Panda`.
+        seed: seed of the rigid twin behind the emulator. noise, payload, declared_payload, surface: see `TwinBase`.
+        realtime: run at 1 kHz instead of in lock-step. operator, collision_torque, collision_force, speed_share,
+            moves: see `Panda`.
     """
     if client not in CLIENTS:
         raise UserError(f"arm.client: {client!r}; allowed: {choices(CLIENTS)}")

@@ -1,7 +1,7 @@
 """The wire format of the Franka Control Interface (FCI), as far as torque control needs it.
 
 A client connects to TCP port 1337 and sends its version and a UDP port. The robot then sends one RobotState per
-millisecond by UDP and, during a motion, expects a RobotCommand for each. Two versions are implemented: 5 (libfranka
+millisecond by UDP and, in a motion, expects a RobotCommand for each state. Two versions are implemented: 5 (libfranka
 0.9, the Panda, FER) and 10 (libfranka 0.18 and later, the FR3). All structs are packed and little-endian.
 
 Source: the public headers of libfranka-common (service_types.h, rbk_types.h), checked against both client packages.
@@ -13,7 +13,7 @@ PORT = 1337  # fixed in libfranka: several robots need several addresses
 VERSIONS = (5, 10)
 HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
 CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
-MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # unused deviations follow
+MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # allowed deviations follow, unused
 COLLISION = np.dtype(  # both our clients set the thresholds during acceleration to the same values
     [
         ("torque_acceleration", "<f8", (2, 7)),
@@ -55,7 +55,7 @@ MOVE_STATUS = {
 DONE, NOT_POSSIBLE, EMERGENCY = 0, 1, 5  # status of all other requests; NOT_POSSIBLE also means a wrong version
 
 
-# torque control in a Move request, and in RobotState during the motion; 0.9 has no "none" among motion generators
+# codes of torque control in a Move request and in a motion's RobotState; libfranka 0.9 has no generator "none"
 EXTERNAL_CONTROLLER = 2
 GENERATOR_REQUESTED = {5: 1, 10: 4}
 GENERATOR_RUNNING = {5: 2, 10: 5}
@@ -65,7 +65,7 @@ OTHER_CONTROLLER, NO_GENERATOR = 3, 0
 IDLE, MOVE_MODE, GUIDING, REFLEX, USER_STOPPED = 1, 2, 3, 4, 5  # robot_mode
 
 
-# indices in `errors` and `reflex_reason`, of 41
+# indices in the 41 flags of `errors` and of `reflex_reason`
 N_ERRORS = 41
 JOINT_POSITION_LIMITS, JOINT_VELOCITY, JOINT_REFLEX, CARTESIAN_REFLEX = 0, 3, 6, 7
 COMMUNICATION_CONSTRAINTS, TORQUE_DISCONTINUITY, TORQUE_RANGE = 25, 32, 34

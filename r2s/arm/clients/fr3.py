@@ -1,4 +1,4 @@
-"""The FR3 through pylibfranka, libfranka 0.18 and later: hardware, or the emulator in FCI version 10.
+"""Connect to an FR3 through pylibfranka (libfranka 0.18 and later): hardware, or the emulator in FCI version 10.
 
 pylibfranka has neither rate limiter nor low-pass in this loop: the arm receives each command unchanged.
 """
@@ -20,7 +20,7 @@ STOP_DISTANCE = 0.02  # rad, braking distance of a joint from 0.2 rad/s, the spe
 def within_fr3(robot: Robot) -> Robot:
     """Return the robot with its limits clipped to an FR3's and with an FR3's position-dependent velocity limit.
 
-    An FR3 allows no speed in the last hundredths of a radian. The limits exclude that range and a stopping distance.
+    An FR3 allows no speed in the last hundredths of a radian. The new limits exclude these and a stopping distance.
     """
     margin = fr3_limits.VELOCITY_OFFSET**2 / (2 * fr3_limits.DECELERATION) + STOP_DISTANCE
     return replace(
@@ -43,7 +43,7 @@ def as_driven(robot: Robot) -> Robot:
 
 class _FR3Client(Client):
     name, package = "fr3", "pylibfranka"
-    version = 10  # libfranka connects to no other, and pylibfranka does not pass the number on
+    version = 10  # libfranka connects to no other version, and pylibfranka does not report it
 
     def __init__(self, address: str, realtime: bool):
         super().__init__(address, realtime)

@@ -1,4 +1,4 @@
-"""Base of Panda and FR3: the `Arm` protocol on a libfranka client, hardware or emulated.
+"""Implement the `Arm` protocol on a libfranka client, hardware or emulated: the base of Panda and FR3.
 
 libfranka has no point-to-point motion in torque control. `move_to` therefore follows a slow, checked joint path with
 the recorder's tracking controller, in the same 1 kHz torque loop as every other motion. So `move_to` needs no model
@@ -33,13 +33,13 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import SIGNALS
 
 # move_to: slow and weak, so that a person who blocks a link meets a bounded force (docs/explanation/safety.md)
-SPEED = 0.2  # of dq_max
-ACCELERATION = 0.2  # of ddq_max
-TORQUE_SHARE = 0.2  # of tau_max, torque limit of the driver
+SPEED = 0.2  # share of dq_max
+ACCELERATION = 0.2  # share of ddq_max
+TORQUE_SHARE = 0.2  # share of tau_max that the driver allows
 MAX_DEVIATION = 0.1  # rad off the path, less where an obstacle is near; beyond it `move_to` gives up
 SETTLE_S = 3.0  # s, longest time to settle at the end of the path
-INTEGRAL_GAIN = 15.0  # of tau_max per rad s; overcomes breakaway torque at the end of the path
-INTEGRAL_SHARE = 0.15  # of tau_max, limit of that integral
+INTEGRAL_GAIN = 15.0  # share of tau_max per rad s; overcomes breakaway torque at the end of the path
+INTEGRAL_SHARE = 0.15  # share of tau_max, limit of the integral's torque
 ARRIVED = 2e-3  # rad from the target: the motion ends
 ACCEPTED = 1e-2  # rad from the target after SETTLE_S: accepted, because a real wrist's friction may hold it there
 MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
@@ -60,10 +60,10 @@ class Franka:
     Args:
         robot: limits and nominal model.
         client: the connection.
-        operator: called with the reason before the arm moves again after a stop. None: after a stop `move_to` refuses
+        operator: called with the reason of a stop before the arm moves again. None: after a stop, `move_to` refuses
             to move until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
-        connection: what is expected of the arm; None: not checked.
+        connection: properties that the arm must have; None: they are not checked.
         speed_share: factor on all allowed speeds, in every motion.
 
     Raises:
@@ -109,7 +109,7 @@ class Franka:
 
         Raises:
             NotCleared: the arm stopped before, and no operator agreed that it may move.
-            StopRequested: a signal, or the policy's process ended; the arm is at rest.
+            StopRequested: a signal came, or the policy's process ended; the arm is at rest.
             ArmStopped: q is outside the limits, the arm is not ready, or no path exists (in these cases nothing
                 moved); the arm stopped on the path, deviated from it by 0.1 rad, or ended more than 10 mrad from q.
 
@@ -151,7 +151,7 @@ class Franka:
         self._send(tau)
 
     def stop(self) -> None:
-        """Damp the remaining motion for at most 0.5 s, and end it; an earlier reason stays in `blocked`."""
+        """Damp the remaining motion for at most 0.5 s, and end it; do not change an earlier reason in `blocked`."""
         if self._damping:  # the command loop calls `stop` while it damps
             return
         for part in (self._damp, self._end):  # `_end` also runs if damping failed
@@ -229,7 +229,7 @@ class Franka:
         return found
 
     def _read_idle(self) -> None:
-        """Read the arm between motions; tau_J_d is then the torque of the arm's own controller, not a command."""
+        """Read the state between motions; set tau_J_d to 0, because the arm then reports its controller's torque."""
         s = self._client.idle()
         self._begun = _ms(s)
         sample = self._sample(s)
@@ -318,7 +318,7 @@ def _ms(state: Any) -> int:
 
 
 def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray, share: float) -> tuple[Excitation, int]:
-    """Return a minimum-jerk path that is followed by rest, and the number of rows before this rest."""
+    """Return a minimum-jerk path with SETTLE_S of rest at its end, and the number of rows before this rest."""
     distance = np.abs(end - start)
     # peaks of minimum jerk: velocity 15/8 distance / T, acceleration 10/sqrt(3) distance / T^2
     duration = max(

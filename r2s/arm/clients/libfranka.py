@@ -1,4 +1,4 @@
-"""libfranka through its two Python packages: import, connection, error messages, and what both clients share."""
+"""Use libfranka through its two Python packages: import, connection, messages, and the base of both clients."""
 
 import socket
 import time
@@ -18,13 +18,13 @@ CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in 
 
 
 class Client:
-    """One of libfranka's two Python packages; RobotState has the same attributes in both.
+    """Base of the clients for libfranka's two Python packages, whose RobotState has the same attributes.
 
     Every method raises ArmStopped with libfranka's message.
 
     Attributes:
-        name: option of the group `arm`, and the extra that installs the package. package: its module.
-        version: of the arm's FCI.
+        name: option of the group `arm`, and the extra that installs the package. package: name of its module.
+        version: version of the arm's FCI.
 
     Args:
         address: host name or IP. realtime: require a real-time kernel and priority.
@@ -46,7 +46,7 @@ class Client:
         raise NotImplementedError
 
     def exchange(self, tau: np.ndarray) -> Any:
-        """Send tau (7,) Nm for this cycle, wait for the next one and return its RobotState."""
+        """Send tau (7,) Nm for this cycle, wait for the next cycle and return its RobotState."""
         raise NotImplementedError
 
     def finish(self) -> None:
@@ -89,7 +89,7 @@ def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
     """Return the connected robot object that `make` creates.
 
     Raises:
-        UserError: there is no connection; the message has libfranka's reason.
+        UserError: the connection failed; the message contains libfranka's reason.
     """
     if not is_reachable(address):
         raise UserError(f"arm={extra}: no connection to {address}: no answer; is the cable plugged in?")
@@ -100,9 +100,9 @@ def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
 
 
 def is_reachable(address: str) -> bool:
-    """Return whether a computer answers at the address; a refused connection counts as an answer.
+    """Return whether a computer answers at the address; a refused connection is an answer too.
 
-    The FCI port comes second, because opening it occupies the arm's only client slot.
+    The FCI port is tried second, because opening it occupies the arm's only client slot.
     """
     for port in (DESK_PORT, fci.PORT):
         try:

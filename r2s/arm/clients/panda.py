@@ -1,7 +1,7 @@
-"""The Panda (FER) through panda-python, libfranka 0.9: hardware, or the emulator in FCI version 5.
+"""Connect to a Panda (FER) through panda-python (libfranka 0.9): hardware, or the emulator in FCI version 5.
 
-libfranka calls back once per millisecond, while r2s calls an `Arm`. Therefore libfranka's loop runs in a thread; its
-callback passes the state on and waits for the command. libfranka's rate limiter and low-pass are off: the arm
+libfranka calls a callback once per millisecond, while r2s calls an `Arm`. So libfranka's loop runs in a thread, where
+the callback passes the state on and waits for the command. libfranka's rate limiter and low-pass are off: the arm
 receives each command unchanged.
 """
 

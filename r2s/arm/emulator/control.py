@@ -1,6 +1,6 @@
-"""The control box between an FCI server and an arm: modes, control cycles, missed answers, reflexes, injected faults.
+"""Emulate the control box between FCI server and arm: modes, cycles, missed answers, reflexes, injected faults.
 
-It emulates Franka's Control, without sockets and without a clock: one call of `cycle` is one millisecond.
+The box is Franka's Control, here without sockets and without a clock: one call of `cycle` is one millisecond.
 """
 
 from collections import deque
@@ -23,7 +23,7 @@ HOLD = 5e3, 100.0  # Nm/rad, Nm s/rad, of the fault 'hold': stiffer than a perso
 CUTOFF_HZ = 15.0  # low-pass of the external torque; our choice, Franka does not publish it
 FRAMES = ("F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE")
 DESK = ("F_T_EE", "m_ee", "F_x_Cee", "m_load", "F_x_Cload", "O_ddP_O")  # what an operator sets in Franka's Desk
-INSIDE = 0.02  # rad from a position limit, to which recovery moves a joint that is beyond it
+INSIDE = 0.02  # rad inside a position limit, where recovery places a joint that is beyond the limit
 _ERRORS = (  # parts of the messages of `Reflexes`, and libfranka's index of the same error
     ("steps", fci.TORQUE_DISCONTINUITY),
     ("torque", fci.TORQUE_RANGE),
@@ -40,10 +40,10 @@ class Fault:
         kind: 'late': the answers in these cycles arrive too late, and the arm repeats its last torque. 'drop': the
             states of these cycles do not reach the client. 'discontinuity': the first joint's torque steps by twice
             the allowed size. 'joint_limit': the arm reports a position limit. 'estop': the stop button is pressed and
-            stays pressed. 'press': it is pressed, and released after `cycles` ms. 'hold': an external force holds the
-            first link; the arm needs the attribute `external` for it.
+            stays pressed. 'press': the button is pressed, and released after `cycles` ms. 'hold': an external force
+            stops the first link; for this, the arm needs the attribute `external`.
         cycle: the first control cycle, from 0.
-        motion: number of the server's motion, from 0; a client's `move_to` is one motion, or none if already there.
+        motion: number of the server's motion, from 0; a client's `move_to` makes one per straight part of its path.
         cycles: number of consecutive cycles of the fault; 20 late or dropped cycles stop the arm.
 
     """
@@ -69,12 +69,12 @@ class Control:
     Attributes:
         state: RobotState of `version`, without message_id.
         running: whether a motion is active.
-        stopped_by: why the last motion was aborted; None if it was not.
+        stopped_by: why the last motion was aborted; None if the motion was not aborted.
 
     Args:
         arm: the arm behind the box. If its state lacks the true external torque, the box reports zero.
-        version: of the FCI. faults, max_missed: see `Emulator`.
-        desk: settings of `DESK` by name, such as {"m_ee": 0.73}, right or wrong; the arm itself does not change.
+        version: version of the FCI. faults, max_missed: see `Emulator`.
+        desk: settings of `DESK` by name, such as {"m_ee": 0.73}; they may be wrong and do not change the arm.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class Control:
         self._sense()
 
     def first_answer(self) -> None:
-        """Record that the client's loop runs; from now on cycles count."""
+        """Record the first answer of the client's loop; the success rate is above 0 from now on."""
         self._answered.append(True)
         self._sense()
 
@@ -186,7 +186,7 @@ class Control:
             self._place(self._arm.read().q)
 
     def idle(self, ms: int) -> None:
-        """Advance time between motions; when the stop button is released the arm becomes idle, as on a Franka."""
+        """Advance time between motions by `ms`; a released stop button makes the arm idle, as on a Franka."""
         if self._mode == fci.USER_STOPPED and self._pressed_ms > 0:
             self._pressed_ms -= ms
             if self._pressed_ms <= 0:
@@ -266,7 +266,7 @@ class Control:
         plus the effect of wrong `DESK` settings. Here it is exact: free of friction and of other model errors.
 
         Args:
-            gain: of the low-pass; 1 for an arm at rest.
+            gain: gain of the low-pass; 1, without filtering, for an arm at rest.
         """
         s, arm = self.state, self._arm.read()
         raw = np.zeros(7) if arm.tau_ext_hat_filtered is None else arm.tau_ext_hat_filtered

@@ -1,11 +1,11 @@
-"""An emulated Franka control box for libfranka's clients: our own FCI server in a process of its own, on loopback.
+"""Emulate a Franka control box for libfranka's clients: our FCI server runs in a separate process, on loopback.
 
     with Emulator(partial(RigidTwin, robot, 3), version=5) as address:
         arm = Panda(robot, address, operator=lambda reason: True)
 
 Any `Arm` of r2s can be behind it. In lock-step, the default, the arm's clock advances only with a command: the same
 commands cause the same motion, bit for bit, however slow either side is. In real time the clock runs at 1 kHz, and an
-answer that arrives after its millisecond counts as missed.
+answer that arrives after its millisecond is too late: it is missed.
 
 It emulates no network jitter, no brakes, and nothing that makes a motion safe beside a person.
 """
@@ -28,13 +28,13 @@ START_S = 180.0  # longest time for the process to import, compile and create it
 
 
 class Emulator:
-    """A `Server` in a process of its own, which ends with the context or with this process.
+    """Runs a `Server` in a separate process, which ends when the context or this process ends.
 
     Args:
-        make_arm: creates the arm in that process, so it must be picklable: `partial(RigidTwin, robot, 3)`.
-        version: of the FCI. 5: libfranka 0.9 (the Panda). 10: 0.18 and later (the FR3).
+        make_arm: creates the arm in the other process, so must be picklable: `partial(RigidTwin, robot, 3)`.
+        version: version of the FCI. 5: libfranka 0.9 (the Panda). 10: 0.18 and later (the FR3).
         realtime: run at 1 kHz instead of in lock-step.
-        faults: injected faults.
+        faults: the faults to inject.
         max_missed: consecutive cycles without an answer that stop the arm. desk: settings of the box, see `Control`.
     """
 
@@ -77,7 +77,7 @@ class Emulator:
 
 def _child(pipe, settings: tuple) -> None:
     make_arm, version, realtime, faults, max_missed, desk = settings
-    os.setsid()  # as a control box, it receives no signal of the terminal
+    os.setsid()  # like a control box, it gets no signals from the terminal
     try:
         socket = open_port()
         arm = make_arm()

@@ -1,4 +1,4 @@
-"""The emulated control box's model of its arm: URDF, poses, gravity torque and external wrench."""
+"""Model the arm as the emulated control box does: URDF, poses, gravity torque and external wrench."""
 
 from dataclasses import replace
 from xml.etree import ElementTree as ET
@@ -34,7 +34,7 @@ class BoxModel:
         self._place, self._axes = ee_pose(robot)
 
     def pose(self, q: np.ndarray, tool: np.ndarray) -> np.ndarray:
-        """Return the pose (4, 4), in the base frame at q (n,) rad, of a frame `tool` (4, 4) in the flange's frame."""
+        """Return the base-frame pose (4, 4), at q (n,) rad, of a frame with the pose `tool` (4, 4) on the flange."""
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         flange = np.eye(4)
@@ -43,7 +43,7 @@ class BoxModel:
         return flange @ tool
 
     def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the wrench (6,) N, Nm in the base frame at the frame `tool` that explains torque (n,) Nm best.
+        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that explains torque (n,) Nm best.
 
         Near a singularity it is zero, as in libfranka.
         """
@@ -61,6 +61,6 @@ class BoxModel:
         return self._data.qfrc_bias + self._load(q, self._carried(s), s["O_ddP_O"])
 
     def _carried(self, s: np.ndarray) -> np.ndarray:
-        """Return mass and first moment (4,) in the last link's frame of end effector and load."""
+        """Return the mass and first moment (4,) of end effector plus load, in the last link's frame."""
         parts = ((s["m_ee"], s["F_x_Cee"]), (s["m_load"], s["F_x_Cload"]))
         return np.sum([np.append(m, m * (self._place + self._axes @ x)) for m, x in parts], axis=0)

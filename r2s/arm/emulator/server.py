@@ -1,4 +1,4 @@
-"""The robot's side of the Franka Control Interface on loopback: requests by TCP, states and commands by UDP."""
+"""Serve the robot's side of the Franka Control Interface on loopback: requests by TCP, states and commands by UDP."""
 
 import contextlib
 import os
@@ -24,8 +24,8 @@ class Server:
     """Serves one client at a time, in one thread.
 
     A motion begins when the client has answered the newest state. Until then the arm stands still and the server
-    repeats states, because a client may skip some while it starts. The first answer is not executed. The first
-    command of a motion answers the first state with a control_command_success_rate above zero.
+    repeats states, because a client may skip some while it starts. The server does not execute that first answer.
+    Its first executed command answers the first state with a control_command_success_rate above zero.
     """
 
     def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
@@ -163,7 +163,7 @@ class Server:
     # --- the cycle, by UDP
 
     def _commands(self) -> None:
-        """Process the client's commands; only an answer to the newest state counts."""
+        """Process the client's commands; ignore those that do not answer the newest state."""
         assert self._udp is not None
         kind = fci.COMMAND[self._version]
         with contextlib.suppress(BlockingIOError):
@@ -183,12 +183,12 @@ class Server:
                     self._send()
                 elif not self._realtime:
                     self._cycle(command["tau_J_d"].copy())
-                elif not self._ahead:  # at once: a real box computes beside the client, not in the client's time
+                elif not self._ahead:  # at once: a real box computes in parallel, not in the client's time
                     self._control.cycle(command["tau_J_d"].copy())
                     self._ahead = True
 
     def _cycle(self, tau: np.ndarray | None) -> None:
-        """Run one cycle, and the following ones whose states are dropped, because the client cannot answer them."""
+        """Run one cycle, then all cycles whose states are dropped, because the client cannot answer these states."""
         self._control.cycle(tau)
         while self._control.dropped and not self._realtime:
             self._message_id += 1
@@ -213,7 +213,7 @@ class Server:
         else:
             self._send()
         if self._realtime:
-            # this process may wake late; a box does not, so that must not shorten the client's time to answer
+            # this process may wake late, unlike a box; the client must still get its time to answer
             self._due = max(self._due + SIM_DT, time.monotonic() + ANSWER_S)
         elif self._move is None:
             self._due = time.monotonic() + IDLE_MS * SIM_DT
@@ -248,7 +248,7 @@ def open_port() -> socket.socket:
     """Open the FCI's port, which clients always use, on the first free loopback address; return the server socket.
 
     Raises:
-        UserError: all are in use.
+        UserError: the port is in use on all addresses.
     """
     for k in range(1, 255):
         try:

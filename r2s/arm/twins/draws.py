@@ -1,4 +1,4 @@
-"""Random parameters of both variants of hidden twin: links, torque offset, cable drag, sensor noise."""
+"""Draw the parameters that both variants of hidden twin have: links, torque offset, cable drag, sensor noise."""
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, 
     offset = rng.uniform(offset_range[:, 0], offset_range[:, 1]) * rng.choice([-1, 1], n)
     return np.array(
         [
-            # Table I gives gravity error plus offset; their sum must not move an arm at home
+            # the paper's Table I lists gravity error plus offset; this sum must not move an arm at home
             np.clip(offset, -hold - unbalanced, hold - unbalanced),
             drag_max * rng.uniform(0.15, 0.7, n),  # Nm
             drag_max * rng.uniform(0.0, 0.3, n),  # Nm, of a cable along two joints

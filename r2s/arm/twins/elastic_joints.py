@@ -1,19 +1,19 @@
-"""Joints with elastic gears and dry friction that warms up, compiled: one 1 ms cycle of the elastic twin.
+"""Simulate a 1 ms cycle of the elastic twin, compiled: joints with elastic gears and dry friction that warms up.
 
-Per joint, theta and w = dtheta/dt of the motor (at the joint's side of the gear), q and v of the link:
+Per joint, theta and w = dtheta/dt are of the motor (scaled to the joint's side of the gear), q and v of the link:
     rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v + J'F
     s = K (theta - q) + D (w - v)
     f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c one value per direction
-F is the contact force of a surface (r2s/physics/contact.py).
+s is the gear torque, F the contact force of a surface (r2s/physics/contact.py).
 L (w - v) is the damping of the gear by the drive's torque loop. A motor at rest stays exactly at rest while the net
 torque on it is within f at w = 0; friction then balances that torque.
-warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus a sine of theta each per revolution of the joint, of the
-motor, and of half a revolution of the motor (the two lobes of a strain wave gear).
+warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus three sines of theta: their periods are one revolution
+of the joint, one of the motor, and half of one of the motor (the two lobes of a strain wave gear).
 
 Integration is Verlet's: half a step of positions, a whole step of velocities with the forces there, half a step of
 positions. Velocity-dependent forces are taken at the middle of the step, with one correction. A motor that comes to
 rest within a step rests or reverses from that moment on (as in r2s/physics/stick_slip.py; motors act on each other
-only through their gears, so that each is solved by itself).
+only through their gears, so each motor is solved separately).
 """
 
 import numpy as np
@@ -33,7 +33,7 @@ FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: friction power, W, at which h
 HELP, HELP_VISCOUS, HELP_WIDTH = range(18, 21)  # the arm's own friction compensation: Nm, Nm s/rad, rad/s
 ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
 OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
-# ... of the state (STATES, n); *_AT: at the time of the sensors; ADDED: Nm, added to the command by the arm's control
+# ... of the state (STATES, n); *_AT: when the sensors read; ADDED: Nm, added to the command by the arm's control
 LINK_Q, LINK_V, THETA, W, MOTOR, HEAT, Q_MEASURED, DQ_MEASURED, TAU_MEASURED, THETA_AT, W_AT, S_AT, ADDED, STATES = (
     range(14)
 )
@@ -58,7 +58,7 @@ def ripple(p, theta, i):
 
 @njit(cache=True)
 def level(p, w, load, side, i):
-    """Return cold friction without ripple, Nm, for motion in direction `side` at w rad/s; for w = 0: breakaway."""
+    """Return cold friction without ripple, Nm, in direction `side` at w rad/s; at w = 0, breakaway torque."""
     coulomb = p[C_POS, i] if side > 0 else p[C_NEG, i]
     speed = abs(w)
     rise = (p[BREAK, i] - 1.0) / (1.0 + (speed / p[V_STRIBECK, i]) ** p[SHAPE, i])
@@ -67,11 +67,11 @@ def level(p, w, load, side, i):
 
 @njit(cache=True)
 def _next_velocity(p, w, middle, push, load, factor, h, i):
-    """Return the motor's velocity, rad/s, after h s; `push` is the net torque on it except friction, Nm.
+    """Return the motor's velocity, rad/s, after h s; `push`, Nm, is the net torque on it without friction.
 
     Args:
-        p, i: parameters and joint. w: velocity now, rad/s. middle: velocity, rad/s, at which friction is evaluated if
-            the motor keeps its direction. load: gear torque, Nm. factor: on friction.
+        p, i: parameters, joint. w: velocity now, rad/s. middle: velocity, rad/s, at which friction is evaluated if
+            the motor keeps its direction. load: gear torque, Nm. factor: factor on friction.
     """
     side = np.sign(w)
     if w != 0.0:
@@ -90,7 +90,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
 
 @njit(cache=True)
 def _active(line, cycle, t, delay):
-    """Return the row of `line` that a joint executes at t cycles: the newest one after its delay; -1: none yet."""
+    """Return the row of `line` that a joint executes at t cycles: the newest whose delay is over; -1: none yet."""
     slots, arrival = len(line), line.shape[1] - 1
     for k in range(cycle, max(cycle - slots, -1), -1):
         if line[k % slots, arrival] + delay <= t:
@@ -111,7 +111,7 @@ def _commanded(line, cycle, begin, end, delay, i):
 
 @njit(cache=True)
 def compensate(p, s, gravity):
-    """Write the torque that the arm's own control adds: gravity (n,) Nm and partial friction compensation."""
+    """Write the torque that the arm's control adds to commands: gravity (n,) Nm and partial friction compensation."""
     for i in range(s.shape[1]):
         dq = s[DQ_MEASURED, i]
         s[ADDED, i] = gravity[i] + p[HELP, i] * np.tanh(dq / p[HELP_WIDTH, i]) + p[HELP_VISCOUS, i] * dq
@@ -119,13 +119,13 @@ def compensate(p, s, gravity):
 
 @njit(cache=True)
 def advance(p, s, arm, line, cycle, steps, age):
-    """Advance the arm by one cycle in `steps` steps; the sensors read the state `age` cycles before its end.
+    """Advance the arm by one cycle in `steps` steps; the sensors read `age` cycles before the cycle's end.
 
     Args:
         p, s: parameters, and the state, which is updated.
-        arm: links and gravity of the true arm, and of its `Touch`: contact, Jacobian, frames, axes, and whether there
-            is a surface.
-        line: (slots, n + 1), the last commands, Nm, and the time when each arrived, cycles. cycle: current number.
+        arm: links and gravity of the true arm, and from its `Touch`: contact, Jacobian, frames, axes, and whether
+            there is a surface.
+        line: (slots, n + 1), the last commands, Nm, and the time when each arrived, cycles. cycle: current cycle.
     """
     links, gravity, touch = arm
     n, h = s.shape[1], SIM_DT / steps
@@ -146,7 +146,7 @@ def advance(p, s, arm, line, cycle, steps, age):
                 factor(mass, root)
             _accelerate(p, s, f, bias, root, h, correction == 1)
         _move(s, 0.5 * h)
-        share = steps * (1.0 - age) - step  # part of this step that is over when the sensors read
+        share = steps * (1.0 - age) - step  # part of this step that has passed when the sensors read
         if 0.0 <= share <= 1.0:
             for i in range(n):
                 s[THETA_AT, i] = (1.0 - share) * before[0, i] + share * s[THETA, i]
@@ -195,7 +195,7 @@ def _external_forces(p, s, f, line, cycle, begin, end, h):
 
 @njit(cache=True)
 def _accelerate(p, s, f, bias, root, h, last):
-    """Predict the velocities at the middle of the step; if `last`, use those predicted before to take the step."""
+    """Predict the velocities at the middle of the step; if `last`, take the step with the earlier prediction."""
     n, q = s.shape[1], s[LINK_Q]
     for i in range(n):
         gear = f[F_SPRING, i] + p[GEAR, i] * (f[F_W, i] - f[F_LINK_V, i])
@@ -218,7 +218,7 @@ def _accelerate(p, s, f, bias, root, h, last):
 
 @njit(cache=True)
 def sense(p, s, noise, dq_filter):
-    """Read the sensors from the *_AT rows; noise (3, n) is standard normal."""
+    """Compute the sensor values from the *_AT rows; noise (3, n) is standard normal."""
     for i in range(s.shape[1]):
         s[Q_MEASURED, i] = ENCODER * np.round((s[THETA_AT, i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
         s[DQ_MEASURED, i] += dq_filter * (s[W_AT, i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_MEASURED, i])

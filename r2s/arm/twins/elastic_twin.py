@@ -1,10 +1,10 @@
 """The elastic variant of the hidden twin, with effects that the identification's models lack.
 
-Elastic gears that oscillate; friction with exact rest, another Stribeck curve than the models', warming, and ripple
-with the gears' rotation (elastic_joints.py); a control box that compensates a part of the friction from the measured
+It has elastic gears that oscillate; friction with exact rest, another Stribeck curve, warming, and ripple with the
+gears' rotation (elastic_joints.py); a control box that compensates a part of the friction from the measured
 speed; a clock that jitters and occasionally loses a packet; a different delay and lag for each joint. Wrong masses,
 centres and tensors, offsets, cable drag, noise and quantisation are as in the rigid variant. `seed` draws a robot.
-Only this file reads its parameters. Seeds 0-9 are for development; seeds of 200 and above are for judging.
+Only this file reads that robot's parameters. Seeds 0-9 are for development; seeds of 200 and above are for judging.
 
 One cycle of 1 ms: the control box adds its compensations to the command; elastic_joints.py integrates rotors and
 links in steps of at most 0.05 ms; the sensors read the motors up to half a millisecond before the end.
@@ -24,9 +24,9 @@ from r2s.physics.robot import SIM_DT, Robot
 
 MIN_STEPS = 20  # per cycle: 1 s of open loop is then within 1e-5 rad of the result with finer steps
 MAX_STEPS = 200
-PHASE_STEP = 0.1  # rad, largest phase of the fastest oscillation at home that one step covers
+PHASE_STEP = 0.1  # rad, largest phase change in one step of the fastest oscillation (at home)
 SLOTS = 8  # cycles of stored commands
-WARM_SPEED = 0.25  # of dq_max, at which heat settles at 1
+WARM_SPEED = 0.25  # share of dq_max, speed at which heat settles at 1
 STATIC_ROUNDS = 50  # fixed-point iterations that find the posture in which the gears balance gravity
 
 
@@ -40,7 +40,7 @@ class ElasticTwin(TwinBase):
         stiffness: None: drawn at random, like the other parameters.
 
     Raises:
-        UserError: gears so stiff, or rotors and links so light, that their oscillation needs more than MAX_STEPS.
+        UserError: the gears are so stiff, or rotors and links so light, that a cycle needs more than MAX_STEPS.
     """
 
     def __init__(self, robot: Robot, seed: int, **settings: Any):
@@ -128,7 +128,7 @@ class ElasticTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw the parameters (ROWS, n), all except the gears' damping.
+    """Draw all parameters (ROWS, n) except the gears' damping.
 
     Args:
         robot, rng: the arm, and the random stream.
@@ -144,7 +144,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[ej.C_NEG] = coulomb - asymmetry + model.dof_frictionloss
     p[ej.C_POS] = coulomb + asymmetry + model.dof_frictionloss
-    p[ej.BREAK] = rng.uniform(1.1, 1.35, n)  # of the Coulomb level
+    p[ej.BREAK] = rng.uniform(1.1, 1.35, n)  # times the Coulomb level
     p[ej.MU] = rng.uniform(0.01, 0.02, n)  # Nm per Nm of gear torque
     p[ej.V_STRIBECK], p[ej.SHAPE] = rng.uniform(0.02, 0.08, n), rng.uniform(1.0, 1.6, n)
     p[ej.VISCOUS], p[ej.POWER] = 0.5 * size * rng.uniform(0.7, 1.3, n), rng.uniform(0.6, 0.9, n)
@@ -173,7 +173,7 @@ def _critical_damping(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
 
 
 def _steps(p: np.ndarray, inertia: np.ndarray) -> int:
-    """Return the number of steps per cycle that resolves the gears' fastest oscillation."""
+    """Return the number of steps per cycle that the gears' fastest oscillation needs."""
     mobility = np.linalg.inv(inertia) + np.diag(1 / p[ej.ROTOR])  # of the gears' deflections
     root = np.sqrt(p[ej.STIFF])
     fastest = np.sqrt(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])

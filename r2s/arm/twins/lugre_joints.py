@@ -1,4 +1,4 @@
-"""LuGre friction of the rigid twin, compiled: implicit friction for the engine's step, and the sensors.
+"""Compute the rigid twin's LuGre friction, implicitly for the engine's step, and its sensor values (compiled).
 
 Per joint (Canudas de Wit et al., IEEE TAC 40(3), 1995), with bristle deflection z rad and velocity v:
     dz/dt = v - s0 |v| z / g(v),   f = s0 z + s1(v) dz/dt + s2 v,   s1(v) = s1 exp(-(v / vd)^2)
@@ -20,7 +20,7 @@ DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMAT
 DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; LAG, DQ_FILTER: gains per cycle of torque lag and speed filter
 # ... and of the state (STATES, n)
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED, TAU_MEASURED, BENT = range(12)
-Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, of the contact with a surface
+Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, joint torque of the contact with a surface
 
 DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, otherwise each reversal would cause a torque pulse
 SWEEPS, CONVERGED = 50, 1e-9  # most Gauss-Seidel sweeps, and the change, rad/s, at which they end
@@ -28,7 +28,7 @@ SWEEPS, CONVERGED = 50, 1e-9  # most Gauss-Seidel sweeps, and the change, rad/s,
 
 @njit(cache=True)
 def _stribeck(p, z, v, load, i):
-    """Return the friction level g(v), Nm; z gives the direction."""
+    """Return the friction level g(v), Nm, in the direction of the sign of z."""
     coulomb = p[C_POS, i] if z >= 0 else p[C_NEG, i]
     fade = np.exp(-((v / p[V_STRIBECK, i]) ** 2))
     return coulomb * (1 + (p[BREAK, i] - 1) * fade) + p[MU, i] * abs(load)
@@ -43,7 +43,7 @@ def cable_drag(p, q, i):
 
 @njit(cache=True)
 def rest(p, s, q, compensation, gravity):
-    """Set the state at rest at q (n,) rad; bristles hold compensation, offset and cable drag minus gravity, Nm."""
+    """Set the state to rest at q (n,) rad; bristles balance compensation + offset + cable drag - gravity, Nm."""
     s[:] = 0
     for i in range(len(q)):
         s[Q, i] = q[i]
@@ -68,7 +68,7 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
     Args:
         p, s: parameters and state. line: (slots, n) Nm, the last commands. cycle: number of this cycle.
         tau, compensation: (n,) Nm, command and gravity compensation. mass: (n, n) kg m^2.
-        touch: contact and Jacobian of r2s/physics/contact.py, and whether the tip may touch.
+        touch: contact and Jacobian of r2s/physics/contact.py, and whether the tip may touch the surface.
     """
     n, slots, h = len(tau), len(line), SIM_DT
     q, v, w = s[Q], s[V], s[V_GUESS]
@@ -114,7 +114,7 @@ def _solve(p, s, damping, mass):
 
 @njit(cache=True)
 def _solve_touch(p, s, damping, mass, contact, jacobian):
-    """Solve the step together with the contact, which adds to mass and drive; store its joint torque in TOUCH."""
+    """Solve the step with the contact, which adds to mass and drive; store the contact's joint torque in TOUCH."""
     n, h = len(damping), SIM_DT
     added, soft, guess = np.empty(n * (n + 1) // 2), np.empty((n, n)), np.empty(GUESS)
     start_guess(contact, jacobian, s[V], h, guess)
@@ -154,10 +154,10 @@ def _sweep(p, s, damping, mass):
 
 @njit(cache=True)
 def sense(p, s, mass, noise):
-    """Finish the step after the engine: update bristles, friction, bias and sensors.
+    """Complete the step after the engine's part: update bristles, friction, bias and sensors.
 
     Args:
-        p, s: parameters, and the state with Q, V after the step and V_BEFORE.
+        p, s: parameters, and the state with Q, V after the step and V_BEFORE before it.
         mass: (n, n) kg m^2. noise: (3, n), standard normal, of q, dq and tau_J.
     """
     n, h, v, before = s.shape[1], SIM_DT, s[V], s[V_BEFORE]

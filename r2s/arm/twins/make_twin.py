@@ -1,4 +1,4 @@
-"""The hidden twins by their variant: `arm=twin arm.variant=rigid|elastic`."""
+"""Make a hidden twin of either variant: `arm=twin arm.variant=rigid|elastic`."""
 
 from typing import Any
 

@@ -3,7 +3,7 @@
 It runs in another engine (DART), with another friction family (LuGre: bristles, Stribeck, load and direction
 dependence, breakaway), torque offsets, torque delay and lag, cable drag, sensor noise and quantisation. Its masses,
 centres and tensors are wrong: they differ from the nominal ones that gravity compensation uses. `seed` draws a robot;
-only this file reads its parameters. Seeds 0-9 are for development; seeds of 100 and above are for judging.
+only this file reads that robot's parameters. Seeds 0-9 are for development; seeds of 100 and above are for judging.
 
 One cycle: the command passes delay and lag; lugre_joints.py solves the friction of the next step implicitly, together
 with the coupled joint velocities and the contact with a surface; DART takes the step with that friction linearised
@@ -28,7 +28,7 @@ STOP_MARGIN = 0.1  # rad by which the mechanical stops lie beyond the position l
 class RigidTwin(TwinBase):
     """The rigid variant; arguments as in `TwinBase`.
 
-    Each `move_to` also resets clock and bristles, so an evaluation on a fresh twin is reproducible.
+    Each `move_to` also resets clock and bristles, so an evaluation on a new twin is reproducible.
 
     Args:
         stiffness: None: rigid gears. Otherwise the gears bend without oscillation, and the encoders, which are on the
@@ -105,11 +105,11 @@ class RigidTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw the parameters (ROWS, n), all except delay, lag and speed filter.
+    """Draw all parameters (ROWS, n) except delay, lag and speed filter.
 
     Args:
         robot, rng: the arm, and the random stream.
-        inertia: (n,) kg m^2, of each joint at home with the others free.
+        inertia: (n,) kg m^2, inertia of each joint at home with the others free.
         unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
 
     """
@@ -119,7 +119,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     coulomb = 0.6 * level  # viscous friction adds the rest of the level
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[lj.C_NEG], p[lj.C_POS] = coulomb - asymmetry, coulomb + asymmetry
-    p[lj.BREAK] = rng.uniform(1.1, 1.5, n)  # of the Coulomb level
+    p[lj.BREAK] = rng.uniform(1.1, 1.5, n)  # times the Coulomb level
     p[lj.MU] = rng.uniform(0.01, 0.02, n)  # Nm per Nm of joint load
     p[lj.V_STRIBECK] = rng.uniform(0.05, 0.15, n)
     p[lj.S0] = p[lj.BREAK] * coulomb / rng.uniform(3e-4, 8e-4, n)  # breaks away after U(0.3, 0.8) mrad

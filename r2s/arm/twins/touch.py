@@ -1,6 +1,6 @@
-"""The surface of a twin, drawn from the twin's seed near its nominal place, and the tool's contact with it.
+"""Draw a twin's surface from its seed, near the nominal place, and compute the tool's contact with this surface.
 
-A box is drawn from the seed as well; each episode places it anew.
+A box is drawn from the seed as well; each episode places the box anew.
 """
 
 from collections.abc import Mapping
@@ -48,14 +48,14 @@ class BoxSurface:
 
 
 class Touch:
-    """The contact of a tool's tip with a surface, in arrays for a twin's compiled cycle; without a surface: none.
+    """The contact of a tool's tip with a surface, in arrays for a twin's compiled cycle; the surface may be absent.
 
     Attributes:
-        contact: (COLUMNS,) of r2s/physics/contact.py; jacobian: (ROWS, n); frames: (n, POSE); axes: (n, 3).
+        contact: (COLUMNS,), see r2s/physics/contact_layout.py; jacobian: (ROWS, n); frames: (n, POSE); axes: (n, 3).
         links: from `links_of`. there: whether there is a surface.
 
     Args:
-        robot: the arm. surface: None: no surface.
+        robot: the arm. surface: the drawn surface; None: no surface.
     """
 
     def __init__(self, robot: Robot, surface: Surface | BoxSurface | None):
@@ -73,7 +73,7 @@ class Touch:
     def start(self, q: np.ndarray, seed: list[int]) -> float:
         """Reset the contact, place a box anew, and return the penetration depth, m, of the tip at q (n,) rad.
 
-        seed: of the episode. The depth is -inf far from the surface; the bristle is not deflected.
+        `seed` is the episode's seed. Far from the surface, the depth is -inf. The bristle starts undeflected.
         """
         self.contact[DEFLECTION:] = self._first[DEFLECTION:]
         if self._table is not None:
@@ -107,7 +107,7 @@ class Touch:
         return self._seen
 
     def wrench(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the arm exerts on the surface: joint torque (n,) Nm; wrench (6,) N, Nm, at the end effector."""
+        """Return what the arm exerts on the surface: joint torque (n,) Nm, and end effector's wrench (6,) N, Nm."""
         link_frames(self.links, q, self.frames, self.axes)
         last, force = self.frames[-1], -self.contact[FORCE : FORCE + 3]
         R, normal = last[3:].reshape(3, 3), self.contact[NORMAL : NORMAL + 3]
@@ -118,7 +118,7 @@ class Touch:
 
 
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
-    """Draw a twin's surface near its nominal place; U: uniform distribution.
+    """Draw a twin's surface near its nominal place; in comments, U is the uniform distribution.
 
     surface: False: none. True: a table below the tip at home. {point: m, normal}: a plane at this place. box: a box
     of `r2s.physics.box.SIZE` on a table in front of the tip at home; {box: [3 edges m]}: a box of this size, with

@@ -1,7 +1,7 @@
-"""Base of both variants of hidden twin: settings, reflexes, payload, surface, extra delay, episodes.
+"""Implement what both variants of hidden twin share: settings, reflexes, payload, surface, extra delay, episodes.
 
-A variant (rigid_twin.py, elastic_twin.py) draws a random robot near the nominal one from its seed, and has its own
-model of drives and friction. Only the variant's own code reads the drawn parameters.
+A variant (rigid_twin.py, elastic_twin.py) draws a random robot near the nominal one from its seed, and adds a
+model of drives and friction. Only the variant's code reads the drawn parameters.
 """
 
 from collections import deque
@@ -23,8 +23,8 @@ STAYS = 2e-3  # rad; a `move_to` that moves no joint farther may leave the tip p
 class TwinBase:
     """An `Arm` (r2s/arm/interface.py) whose parameters are hidden: only its seed is known.
 
-    The same seed, noise stream and calls lead to bit-identical states. `move_to` begins an episode with a noise
-    stream of its own: the noise of a twin's k-th episode does not depend on what happened in earlier episodes.
+    The same seed, noise stream and calls lead to bit-identical states. `move_to` begins an episode with a separate
+    noise stream: the noise of a twin's k-th episode does not depend on what happened in earlier episodes.
 
     A variant implements `_start(q)`, which places the arm, `_advance(tau)`, which runs one cycle under a command,
     `_attach(payload)`, which changes the payload at once, and `_sensors()`, which returns q, dq and tau_J. It sets
@@ -32,16 +32,16 @@ class TwinBase:
     `_friction_scale`, and adds the force of the contact `_touch` to its links, whose angles are `_link_q`.
 
     Attributes:
-        robot, declared_payload: see below.
+        robot, declared_payload: see the arguments.
 
     Args:
         robot: the nominal arm. seed: determines the hidden robot, which is drawn near the nominal one.
         payload: the carried body, see `r2s.physics.payload.payload_of`: kg of a point mass, or a mapping.
         declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), in the same form;
             None: no payload.
-        stiffness: Nm/rad, gear stiffness of the strongest joints; of others in proportion to their torque limit.
+        stiffness: Nm/rad, gear stiffness of the strongest joints; for others, in proportion to their torque limits.
         noise: number of the sensor noise stream; two recordings of one robot need different numbers.
-        friction_scale: factor of the drawn friction, except of its load-dependent part; below 1 for a warm arm.
+        friction_scale: factor on the drawn friction, except on its load-dependent part; below 1 for a warm arm.
         extra_delay_s: s, delay of commands in addition to the variant's own; whole milliseconds.
         surface: what the robot's tool may touch, drawn from the seed. False: nothing. True: a table below the tip at
             home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of this one, in the base frame.
@@ -87,7 +87,7 @@ class TwinBase:
         self._sent = np.zeros(robot.n)
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad; friction holds the torque that gravity compensation leaves.
+        """Place the arm at rest at q (n,) rad; friction balances the error of the gravity compensation.
 
         A tip that already presses on the surface may stay there, but `move_to` places no tip inside the surface.
         """
@@ -152,7 +152,7 @@ class TwinBase:
 
     @property
     def _last_command(self) -> np.ndarray:
-        """(n,) Nm, the last command sent; without an extra delay it is the one that the arm executes."""
+        """(n,) Nm, the last command sent; without an extra delay, the command that the arm executes."""
         return self._sent if self._extra_delay else self._tau_J_d
 
     def _delayed(self, tau: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""contact.yaml and contact_posterior.npz: an identified surface for other stages and other programs."""
+"""Write and read contact.yaml and contact_posterior.npz, an identified surface for other stages and programs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     """Write contact.yaml, and contact_posterior.npz to the same folder.
 
     Args:
-        path: of contact.yaml. robot: with its tool. source: origin of the estimate (recording, calibration, run).
+        path: the contact.yaml to write. robot: the arm with its tool. source: recording, calibration and run.
     """
 
     def number(value: float) -> float:
@@ -74,16 +74,16 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     document["penetration_m"] = [number(v) for v in found.penetration]
     document["mujoco"] = mujoco_contact(surface, inverse_mass(robot))
     document["sdf"] = sdf_surface(surface)
-    with atomic_write(path.with_name("contact_posterior.npz")) as part:  # first: contact.yaml must not exist alone
+    with atomic_write(path.with_name("contact_posterior.npz")) as part:  # first, so contact.yaml never exists alone
         np.savez_compressed(part, **found.draws)  # type: ignore[arg-type]
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
 def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurface:
-    """Return the surface of a run folder of stage=identify (or of a contact.yaml).
+    """Return the surface from a run folder of stage=identify or from a contact.yaml.
 
-    where: the option that names the folder, for error messages.
+    where: the option through which the user named the folder, for error messages.
 
     Raises:
         UserError: a file is missing or damaged.
@@ -100,7 +100,7 @@ def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurfac
 
 
 def _parse(document: dict[str, Any], draws: dict[str, np.ndarray]) -> IdentifiedSurface:
-    """Parse the document for `load_contact`; a malformed one raises KeyError, ValueError and the like."""
+    """Parse the document for `load_contact`; a malformed one raises KeyError, ValueError or a similar error."""
     found, plane = document["parameters"], document["plane"]
     interval = {n: (float(v["interval95_low"]), float(v["interval95_high"])) for n, v in found.items()}
     interval["slope"] = interval.pop(f"slope_at_{LOAD:g}N")

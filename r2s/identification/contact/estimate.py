@@ -1,4 +1,4 @@
-"""Identification of a surface that an arm has pressed: stiffness, exponent, damping, friction, plane, intervals."""
+"""Identify a surface that an arm has pressed: stiffness, exponent, damping, friction and plane, with intervals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,11 +16,11 @@ from r2s.identification.result import SHARPER
 from r2s.physics.surface import UNIT_DEPTH, Surface
 from r2s.recordings.recording import Recording
 
-STEPS, ROUNDS = 25, 4  # Jacobians of a search; number of searches, reweighted in between
-AT_BOUND = 0.02  # share of the stiffness' logarithmic range that counts as its bound
+STEPS, ROUNDS = 25, 4  # most Jacobians of a search; number of searches, with reweighting before each
+AT_BOUND = 0.02  # a stiffness closer to a bound than this share of its logarithmic range is at the bound
 COVERED = (2.5, 97.5)  # %, percentiles of a 95 % interval
 # Standard deviations of errors that more data do not reduce (from friction laws and time steps): slope relative,
-# damping s/m, height m, tilt rad. Simulated arms on exact surfaces had them (benchmarks/contact_identification.py).
+# damping s/m, height m, tilt rad; seen on simulated arms on exact surfaces (benchmarks/contact_identification.py).
 SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
 SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
 
@@ -31,11 +31,11 @@ class ContactEstimate:
 
     Attributes:
         surface: the estimate. Its `point` is the point of the plane that is closest to the mean contact.
-        draws: {name: (S, ...)} of the posterior: the values of a `Surface`, its point and normal, and `slope`, N/m,
-            of the force at LOAD.
+        draws: posterior draws {name: (S, ...)} of the values of a `Surface`, its point and normal, and of `slope`,
+            the slope of the force at LOAD, N/m.
         identifiable: {name: whether the data determine it}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
-        training, validation: predicted forces on the fitted presses and on others; None without others.
+        training, validation: forces predicted for the fitted presses and for other presses; None without others.
     """
 
     surface: Surface
@@ -52,19 +52,19 @@ class ContactEstimate:
 
     @property
     def slope(self) -> float:
-        """N/m, slope of the force at LOAD, as a posterior mean, because the exponent is seldom certain."""
+        """Slope of the force at LOAD, N/m; it is the posterior mean, because the exponent is seldom certain."""
         return float(self.draws["slope"].mean())
 
     @property
     def height(self) -> tuple[float, float]:
-        """m, 95 % interval of the plane's position along its normal at `surface.point`, relative to the estimate."""
+        """95 % interval, m, of the plane's position along its normal at `surface.point`, relative to the estimate."""
         along = (self.draws["point"] - self.surface.point) @ self.surface.normal
         low, high = np.percentile(along, COVERED)
         return float(low), float(high)
 
     @property
     def tilt_deg(self) -> float:
-        """Degrees, angle from the estimated normal within which 95 % of the drawn normals lie."""
+        """Angle in degrees from the estimated normal within which 95 % of the drawn normals lie."""
         across = self.draws["normal"] - self.surface.normal
         return float(np.degrees(np.percentile(np.linalg.norm(across, axis=1), 95)))
 
@@ -80,9 +80,9 @@ def identify_contact(
     """Estimate the surface from a recording with contact.
 
     Args:
-        arm: with a tool. recording: free motion, presses and slides, with commanded torque.
+        arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
         held_out: presses on the same surface for validation; None: a fit without the last press predicts that press.
-        seed: of the posterior's draws. report: called with the share of work that is done, and the next task.
+        seed: seed of the posterior's draws. report: called with the share of finished work and the next task.
 
     Raises:
         UserError: there is too little contact, or the recording does not determine the stiffness.
@@ -109,7 +109,7 @@ def identify_contact(
 
 
 def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
-    """Reweight and solve the problem repeatedly, from a start u (8,); return the problem and its solution (8,)."""
+    """Reweight and solve the problem repeatedly, starting at u (8,); return the problem and its solution (8,)."""
     for _ in range(ROUNDS):
         problem = problem.reweighted(u)
         u = problem.minimized(u, STEPS)[0]
@@ -117,7 +117,7 @@ def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.
 
 
 def _check(problem: ContactProblem, u: np.ndarray) -> None:
-    """Raise UserError if joints move too briefly in contact, or the stiffness is at a bound."""
+    """Raise UserError if joints move too briefly during contact, or if the stiffness is at a bound."""
     rows = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum()
     if (touched := problem.torque.row_s * rows) < LEAST_S:
         raise UserError(
@@ -135,7 +135,7 @@ def _check(problem: ContactProblem, u: np.ndarray) -> None:
 def _concluded(
     problem: ContactProblem, u: np.ndarray, training: Press, validation: Press | None, seed: int
 ) -> ContactEstimate:
-    """Return the estimate at u (8,) with the draws of its posterior."""
+    """Return the surface estimate at u (8,), with posterior draws."""
     whole = problem.whole(u)
     steps = posterior(problem, whole, seed).steps[:, : len(u)]
     draws = np.clip(u + steps + _systematic(np.random.default_rng(seed), len(steps)), 0.0, 1.0)

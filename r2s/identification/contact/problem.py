@@ -1,4 +1,4 @@
-"""Torque residual of an arm that touches an unknown surface; the arm is known up to its posterior."""
+"""Set up the torque residual of an arm that touches an unknown surface; the arm is known up to its posterior."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,14 +15,14 @@ from r2s.identification.search.levenberg_marquardt import minimize
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
-SLOWEST = 0.01  # rad/s; below this speed residuals rise, because a joint that seems to slide may stick and slip
-DRIFT = 0.02  # of each joint's friction: sigma of the change of friction and offset since the calibration
+SLOWEST = 0.01  # rad/s, slowest sliding; below it residuals rise, as a joint that seems to slide may stick and slip
+DRIFT = 0.02  # of each joint's friction; sigma of friction's and offset's change since the calibration
 EXACT = 1e-4  # of a joint's friction: lower limit of a row's sigma, even in a noise-free simulation
-SEEN = 0.03  # standard deviations, all rows together: posterior directions with less effect are dropped
-FTOL = 1e-6  # relative gain of a step below which a search ends
+SEEN = 0.03  # posterior directions with less effect on all rows together, in standard deviations, are dropped
+FTOL = 1e-6  # a search ends when a step lowers the cost by less (relative)
 STEP = 1e-5  # finite-difference step on the unit cube
 REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
-PLAY = 3.0  # standard deviations of the tip's encoder noise below 40 Hz
+PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise below 40 Hz
 FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 
 
@@ -30,14 +30,14 @@ FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 class ContactProblem:
     """Least squares over a surface u (8,) and the arm's uncertainty w (r,), whose prior is standard normal.
 
-    Rows are the R windows in which a joint slides in one direction, as in `TorqueResidual`, because a resting joint's
-    friction may have any value within its breakaway torques. Rows are linear in w, so w is eliminated in closed form
-    (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+    Rows are the R windows in which a joint slides in one direction (see `TorqueResidual`), because the friction of a
+    resting joint may have any value between its breakaway torques. Rows are linear in w, so w is eliminated in closed
+    form (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
     Attributes:
-        torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: the tip at F instants.
+        torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
         error: (T, n) Nm, the torque residual at x.
-        directions: (T, n, r) Nm, change of the residual per unit of each w.
+        directions: (T, n, r) Nm, change of the residual per unit of each element of w.
         sigma: (T, n) Nm, standard deviation of an independent row.
         space: the space of the surfaces.
     """
@@ -58,20 +58,20 @@ class ContactProblem:
 
     @property
     def rows(self) -> np.ndarray:
-        """(T, n) bool, whether the window of a moment and joint counts as a row."""
+        """(T, n) bool, whether the window of a moment and joint is used as a row."""
         return self.torque.seen
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each row; errors in different blocks count as independent."""
+        """(R,) block of each row; errors in different blocks are treated as independent."""
         return np.unique(self.torque.clusters[self.rows.ravel()], return_inverse=True)[1]
 
     def contact_torque(self, u: np.ndarray) -> np.ndarray:
-        """Return the mean joint torque (T, n) Nm of contact with a surface u (8,) over each window."""
+        """Return the joint torque (T, n) Nm of contact with a surface u (8,), averaged over each window."""
         return self.motion.filtered(self.tip.contact_of(*self.space.plane(u), self.space.law(u))[0])
 
     def data(self, u: np.ndarray) -> np.ndarray:
-        """Return the residual (R,), in standard deviations, for a surface u (8,) and the arm at x, w = 0."""
+        """Return the residual (R,), in standard deviations, for a surface u (8,) and the arm at x (w = 0)."""
         return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
 
     def slope(self, u: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return rows (C, R + r + 8) of trials (C, 8) at the best w, with a normal prior instead of u's flat one."""
+        """Return rows (C, R + r + 8) of trials u (C, 8) at the best w; a normal prior replaces u's flat prior."""
         return np.stack([np.concatenate([self._projected(self.data(u)), FLAT * (u - 0.5)]) for u in trials])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
@@ -105,12 +105,12 @@ class ContactProblem:
         return np.concatenate([self._projected(self.slope(u)), FLAT * np.eye(len(u))])
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-        """Return a local minimum (8,) near u, and its sum of squares."""
+        """Return the u (8,) of a local minimum near u, and the sum of squares there."""
         u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with weights from the residual at u (8,) and the correlation of its rows."""
+        """Return the problem with weights from the residual at u (8,) and from the correlation of rows."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
@@ -124,7 +124,7 @@ class ContactProblem:
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return residual (R + 8 + r,) and derivative, as a single part, at a vector (8 + r,) of surface and arm."""
+        """Return residual (R + 8 + r,) and its derivative at a vector `whole` (8 + r,), in a list of one part."""
         u, w = whole[:8], (whole[8:] - 0.5) * 2 * REACH
         prior = np.concatenate([np.full(8, FLAT), np.full(len(w), 2 * REACH)])
         r = np.concatenate([self.data(u) + self.arm @ w, prior * (whole - 0.5)])
@@ -138,8 +138,8 @@ def contact_problem(
 
     Args:
         space, x: the arm's parameter space, with a tool, and values (P,).
-        samples: (S, P), draws of their posterior; None: only DRIFT is uncertain.
-        recording: with commanded torque. surfaces: the space of the unknown surface.
+        samples: (S, P), draws of their posterior; None: only DRIFT makes the arm uncertain.
+        recording: recording with commanded torque. surfaces: the space of the unknown surface.
     """
     torque = TorqueResidual(space, recording, slowest=SLOWEST)
     motion = torque.motion

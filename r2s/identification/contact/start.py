@@ -1,4 +1,4 @@
-"""First guess of an unknown surface, from the place, direction and growth of the external force on the tip."""
+"""Guess an unknown surface from the place, direction and growth of the external force on the tip."""
 
 from collections.abc import Iterator
 
@@ -11,12 +11,12 @@ from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.recordings.recording import Recording
 
-MOVING = 0.02  # rad/s, speed below which a joint's friction counts as unknown
-KNOWN = 0.1  # standard error of a moving joint's friction, relative to it
-SURE = 4.0  # standard deviations above which a force counts as contact
+MOVING = 0.02  # rad/s, speed below which a joint's friction is treated as unknown
+KNOWN = 0.1  # relative standard error of a moving joint's friction
+SURE = 4.0  # standard deviations from 0 above which a force indicates contact
 LEAST_S = 0.2  # s, least duration of contact
 STIFFNESS = (5e2, 2e5)  # N/m, range of first guesses
-FLAT = 3.0  # ratio of spread within a plane to across it, above which positions determine the normal
+FLAT = 3.0  # ratio of the positions' spread along a plane to that across it, above which they determine the normal
 
 
 def first_guesses(
@@ -25,7 +25,7 @@ def first_guesses(
     """Return the space of surfaces about a first plane, and start vectors u (8,) in it.
 
     Args:
-        space, x: the arm's parameter space, with a tool, and values (P,). recording: with commanded torque.
+        space, x: the arm's parameter space, with a tool, and values (P,). recording: recording with commanded torque.
 
     Raises:
         UserError: the recording shows no contact.
@@ -54,7 +54,7 @@ def first_guesses(
 def _starts(
     surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield starts u for each normal (3,) and two exponents; a line fit of height to force gives their stiffness."""
+    """Yield starts u for each normal (3,) and two exponents, with the stiffness of a line fit of height to force."""
     for normal in normals:
         height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
         slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0
@@ -67,9 +67,9 @@ def _starts(
 
 
 def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the tip's centre (T, 3) m, the force on it (T, 3) N, and whether this is certain (T,), at T moments.
+    """Return tip centre (T, 3) m, force on the tip (T, 3) N, and whether the force is certain (T,), at T moments.
 
-    The force is a least-squares fit over the joints, below 10 Hz; a resting joint's friction counts as unknown.
+    The force is a least-squares fit over the joints, below 10 Hz; a resting joint's friction is treated as unknown.
     """
     space, motion = torque.space, torque.motion
     d = space.dynamics(x)

@@ -1,4 +1,4 @@
-"""Parameters of an unknown surface as a vector on the unit cube."""
+"""Map the parameters of an unknown surface to a vector on the unit cube."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from r2s.physics.surface import UNIT_DEPTH, Surface
 
-LOAD = 10.0  # N, load at which a surface is described, so that other values depend little on its exponent
+LOAD = 10.0  # N, load at which slope and height are defined, so that they depend little on the exponent
 # bounds from foam to steel; slope of the force at LOAD (N/m) and bristle (m) are logarithms
 TILT = 0.6  # rad about the first plane, whose error is at most the angle of friction
 HEIGHT = 0.02  # m about the first plane
@@ -27,10 +27,10 @@ WIDTH = UPPER - LOWER
 
 @dataclass(frozen=True)
 class SurfaceSpace:
-    """Surfaces near a plane through `origin` (3,) m with the unit normal `normal` (3,).
+    """The space of surfaces near a plane through `origin` (3,) m with unit normal `normal` (3,).
 
-    A vector u tilts the plane about two axes through the origin. The plane is then shifted along its normal such that
-    the force LOAD presses the tip to `height`.
+    A vector u tilts the plane about two axes through the origin, and then shifts it along its normal so that the
+    force LOAD presses the tip to the height in u.
     """
 
     origin: np.ndarray
@@ -52,7 +52,7 @@ class SurfaceSpace:
         return self.origin + height[..., None] * normal, normal
 
     def law(self, u: np.ndarray) -> np.ndarray:
-        """Return K, exponent, damping, friction and bristle (..., 5) for u (..., 8), as `contact_law` does."""
+        """Return K, exponent, damping, friction and bristle (..., 5) for u (..., 8), ordered as in `contact_law`."""
         p = LOWER + u * WIDTH
         K = LOAD / (LOAD * p[..., 4] / np.exp(p[..., 3])) ** p[..., 4]
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
@@ -68,6 +68,6 @@ class SurfaceSpace:
         return self.axes @ (normal / (normal @ self.normal)) / WIDTH[:2]
 
     def unit(self, height: float, slope: float, exponent: float, friction: float) -> np.ndarray:
-        """Return u (8,) of an untilted plane with the tip at `height`, m, under LOAD; slope: N/m at LOAD."""
+        """Return u (8,) of an untilted plane that has the tip at `height` m and the slope `slope` N/m under LOAD."""
         p = np.array([0.0, 0.0, height, np.log(slope), exponent, 0.0, friction, np.log(2e-4)])
         return np.clip((p - LOWER) / WIDTH, 0.0, 1.0)

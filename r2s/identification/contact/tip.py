@@ -1,4 +1,4 @@
-"""Motion of a tool's tip in a recording, and the joint torque that its contact with a surface causes."""
+"""Compute a tool tip's motion in a recording, and the joint torque of its contact with a surface."""
 
 from dataclasses import dataclass
 
@@ -20,8 +20,8 @@ class TipMotion:
     Attributes:
         step: s, time between instants. starts: (F,) bool, whether a stretch starts at the instant.
         centre: (F, 3) m, centre of the tip. radius: m.
-        axes, origins: (F, n, 3), of the joints in the base frame. dq: (F, n) rad/s.
-        play: m, tip motion that may be mere encoder noise, so it bends bristles elastically only.
+        axes, origins: (F, n, 3), joint axes and their origins in the base frame. dq: (F, n) rad/s.
+        play: m, tip motion that may be encoder noise only; it bends bristles elastically.
     """
 
     step: float
@@ -58,7 +58,7 @@ class TipMotion:
     def contact_of(
         self, point: np.ndarray, normal: np.ndarray, law: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the same as `contact`, for a plane by point and normal with the values of `contact_law`."""
+        """Return the result of `contact` for a plane with `point`, `normal` and the values `law` of `contact_law`."""
         tau, out = np.empty_like(self.dq), np.empty((3, len(self.dq)))
         motion = self.centre, self.axes, self.origins, self.dq, self.starts
         _contact(motion, (self.radius, self.step, self.play), point, normal, law, tau, out)
@@ -83,7 +83,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
 
     Friction is mu F z, where z is the deflection of the bristles (Dahl 1968 in two dimensions): dz = (dx - |dx| z) /
     bristle along the path x of the deepest point over the surface. Noise would lengthen the path of a resting tip and
-    so relax z. Hence a path within `play` bends bristles elastically only.
+    so relax z. Hence a path shorter than `play` only bends bristles elastically.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play = settings

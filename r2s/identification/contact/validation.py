@@ -1,4 +1,4 @@
-"""How well an identified surface predicts the normal force of presses, compared with that from joint torques."""
+"""Compare the normal force that an identified surface predicts for presses with that from joint torques."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ import numpy as np
 from r2s.identification.contact.problem import ContactProblem
 
 PAUSE_S = 1.0  # s without contact that separates two presses; a slide may lose contact for a moment
-GUARD_S = 0.2  # s before and after a press, longer than a window
-KNOWN = 0.05  # of the largest force (1 N of a Panda's 20 N): largest standard error of a force from torques
+GUARD_S = 0.2  # s added before and after a press, longer than a window
+KNOWN = 0.05  # largest standard error of a force from torques, of the largest force (1 N of a Panda's 20 N)
 
 
 @dataclass(frozen=True)
 class Press:
-    """Normal force predicted by the surface, and measured by joint torques, at moments when joints slide.
+    """Normal force predicted by the surface and measured by joint torques, at M moments when joints slide.
 
     Attributes:
-        t: (M,) s. force, seen: (M,) N, normal force predicted by the surface, and from joint torques.
+        t: (M,) s. force: (M,) N, predicted by the surface. seen: (M,) N, measured by joint torques.
         depth, rate: (M,) m, m/s, penetration depth and its rate.
         error: (M,) N, standard error of `seen`. row_s: s, time between moments.
     """
@@ -30,7 +30,7 @@ class Press:
     row_s: float
 
     def summary(self) -> dict[str, float]:
-        """Return the entry of summary.json: seconds compared, and RMSE of force, N, also by loading and unloading."""
+        """Return the entry of summary.json: seconds compared, force RMSE in N, and RMSE in loading and unloading."""
         sides = {"loading": 1.0, "unloading": -1.0}
         errors = {f"{name}_force_rmse_N": self.rmse(side) for name, side in sides.items()}
         return {"seconds": len(self.t) * self.row_s, "force_rmse_N": self.rmse(), **errors}
@@ -42,7 +42,7 @@ class Press:
 
 
 def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
-    """Return a mask (T,) per press on a surface u (8,), in order of time; it includes GUARD_S before and after."""
+    """Return a mask (T,) for each press on a surface u (8,), in order of time, with GUARD_S before and after it."""
     motion = problem.motion
     at = motion.instants[_depth(problem, u) > 0]
     if not len(at):
@@ -55,8 +55,8 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
     """Return the forces predicted by a surface u (8,) and those from joint torques, at the moments in `parts`.
 
-    The force from torques is the predicted one times a factor, which weighted least squares fits to the torques of
-    the sliding joints. So it has the direction that the surface predicts.
+    The force from torques is the predicted force times a factor, which weighted least squares fits to the torques of
+    the sliding joints. So its direction is the predicted one.
     """
     motion = problem.motion
     tau, force, depth, rate = problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))

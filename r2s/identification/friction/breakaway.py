@@ -1,9 +1,9 @@
-"""Breakaway torque of each joint from recorded ramps: the paper's Table II.
+"""Estimate the breakaway torque of each joint from recorded ramps (the paper's Table II).
 
 A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). By then the joint has
 accelerated for 10 to 150 ms while the command kept rising. A real joint also creeps before its release: its bristles
 bend by millirads, ever faster. Neither a threshold nor a parabola through the first motion separates creep from
-release. So r2s fits a motion with creep and release to the positions; its release command U is a parameter:
+release. So r2s fits a motion with creep and release to the positions; the release command U is one parameter:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
@@ -13,9 +13,9 @@ After release, friction is less than U (in eq. 6 of the paper it is 0, and z = 0
 acceleration. This free fit needs no model of the arm.
 
 If friction falls over a range of velocities (Stribeck), motion begins slowly, and a fit with a sudden `jump` puts the
-release too late: by 4 to 22 mNm on an arm of known truth. `Slide`, the sliding motion of an identified arm, replaces
-it by jump (1 - exp(-(v / fall)^2)), with U as the main unknown; on that arm U was then within 0.2 mNm. r2s uses this
-second fit if it explains the motion as well as the free fit.
+release too late: by 4 to 22 mNm on an arm of known truth. `Slide`, the sliding motion of an identified arm, has
+jump (1 - exp(-(v / fall)^2)) instead, with U as the main unknown; on that arm U was then within 0.2 mNm. r2s uses
+this second fit if it explains the motion as well as the free fit.
 """
 
 from collections.abc import Iterator
@@ -39,11 +39,11 @@ HIGH = np.log(1e4), np.log(3e-3), np.log(1e3), 1e3, 0.1, 0.1
 RIGID = 1e-8  # rad, creep length of a joint that does not creep
 DRIFT = 3e-4  # rad/s, prior sigma of a slow drift: a resting joint may still settle
 SIDES = "negative", "positive"
-KAPPA_SIGMA = 0.1  # prior sigma of log kappa about an identified arm's value
-WORSE = 1.01  # ratio of misfits, above which an identified slide describes a joint worse than the free fit
+KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
+WORSE = 1.01  # ratio of misfits, above which an identified slide describes a ramp worse than the free fit
 BACK = 0.0, 0.03, 0.1  # starts of U below the last command, as shares of the ramp
 DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, as the motion may be too short to determine it
-STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # of free fits: creep length, rad; time since release over its guess
+STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # free fits start at: creep length, rad; share of guessed slide time
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,9 @@ class Breakaway:
     """Commands (without gravity) at which n joints broke away in K ramps.
 
     Attributes:
-        command: (n, 2) Nm, mean over ramps in negative and positive direction; NaN without a release. The breakaway
-            torque is this command plus the offset: ramps alone determine the dead zone's width, not its centre.
-        spread: (n, 2) Nm, standard deviation over ramps; NaN for fewer than two.
+        command: (n, 2) Nm, mean command at release in negative and positive direction; NaN without a release. The
+            breakaway torque is `command` plus offset; ramps determine the dead zone's width, but not its centre.
+        spread: (n, 2) Nm, standard deviation over ramps; NaN for fewer than two ramps.
         count: (n, 2), number of ramps with a release. ramped: (n, 2), number of all ramps.
         held: (n, 2) Nm, the largest command without motion if no ramp released the joint; 0 otherwise.
         resolution: (n, 2) Nm, accuracy of the fit to one ramp: `RELEASE_S` times the ramp's rate.
@@ -88,12 +88,12 @@ class Breakaway:
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """Parameters of the sliding after release in K ramps, in each ramp's direction, from an identified arm.
+    """Motion after release in K ramps, in each ramp's direction, as parameters that an identified arm supplies.
 
     Attributes:
         kappa: (K,) rad/s^2 per Nm, inverse inertia of the joint while the other joints rest.
         level: (K,) Nm, command that sustains slow sliding above `fall`: Coulomb friction minus other torques.
-        viscous: (K,) Nm s/rad.
+        viscous: (K,) Nm s/rad, viscous friction.
         fall: (K,) rad/s, velocity over which friction falls from breakaway to `level`, as exp(-(v / fall)^2).
         misfit: (K,) rad RMS of the previous fit to each ramp (`Breakaway.misfit`), for comparison.
     """
@@ -108,15 +108,15 @@ class Slide:
 def estimate_breakaway(
     ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, slide: Slide | None = None
 ) -> Breakaway:
-    """Estimate the command at which each ramped joint broke away, from t, q and tau; `slide` is optional.
+    """Estimate the command at which each ramped joint broke away, from t, q and tau.
 
-    The value is NaN if the joint does not move by MOVED in the ramp's direction, or moves before the command rises.
+    The command is NaN if the joint does not move by MOVED in the ramp's direction, or moves before the command rises.
 
     Args:
         ramps: commands that rise (fall for sign -1) from rest, at any rate. The error is the rate times 0.5 to 3 ms
             for an encoder noise of 2e-5 rad; it is largest for the largest inertia.
-        delay, lag: s, latency of the command beyond its hold; each shifts the result.
-        slide: sliding after release, from an identified arm.
+        delay, lag: s, latency of the command in addition to its hold; each shifts the result.
+        slide: sliding after release, from an identified arm; None: only the free fit.
 
     Raises:
         UserError: delay or lag out of range.
@@ -155,7 +155,7 @@ def _in_direction(ramps: Ramps) -> Iterator[tuple[np.ndarray, np.ndarray, np.nda
 def _summarize(
     ramps: Ramps, value: np.ndarray, misfit: np.ndarray, held_by: np.ndarray, blur: np.ndarray
 ) -> Breakaway:
-    """Return `Breakaway`, by joint and direction, from the fits to K ramps."""
+    """Summarize the fits to K ramps by joint and direction."""
     n = ramps.recording.n_joints
     command, spread, held, resolution = (np.full((n, 2), x) for x in (np.nan, np.nan, 0.0, 0.0))
     count, ramped = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
@@ -176,7 +176,7 @@ def _summarize(
 
 
 def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:
-    """Return the command u (T,) Nm as it acts on the joint at t (T,) s; before, u had its first value."""
+    """Return the command u (T,) Nm as it acts on the joint at t (T,) s; before t[0] it is u[0]."""
     late = np.interp(t - delay, t, u)
     if lag == 0:
         return late
@@ -222,7 +222,7 @@ def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, fl
 def _fit_slide(
     t: np.ndarray, x: np.ndarray, u: np.ndarray, kappa: float, level: float, viscous: float, fall: float
 ) -> tuple[float, float]:
-    """Fit the motion with a known `Slide` to x (T,) rad under u (T,) Nm; return U, Nm, and misfit, rad."""
+    """Fit the motion with a known `Slide` to x (T,) rad under u (T,) Nm; return U in Nm and misfit in rad."""
     span = u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan

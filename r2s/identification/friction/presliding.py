@@ -1,7 +1,7 @@
-"""Presliding distance, over which the bristles of friction with memory bend after a reversal.
+"""Estimate the presliding distance, over which the bristles of friction with memory bend after a reversal.
 
 Torque rows begin where bristles are already bent, so they contain no information on bending. Replays of short windows
-show it at every reversal. So the torque fit determines all other parameters, and replays determine this one.
+show it at every reversal. So replays determine the presliding distance, and the torque fit all other parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,9 +20,9 @@ from r2s.physics.dynamics import Dynamics
 from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
-WINDOW_S, STRIDE = 0.2, 5  # s; ms; of the replays: friction reverses within some 50 ms
-ROUNDS, STEPS, FTOL = 2, 4, 1e-3  # number of reweighted fits; steps and relative gain at the end of each
-MIN_SIGMA = 1e-3  # lower limit of sigma, of the logarithm
+WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, as friction reverses within about 50 ms
+ROUNDS, STEPS, FTOL = 2, 4, 1e-3  # reweighted fits; per fit, most steps and least relative gain
+MIN_SIGMA = 1e-3  # lower limit of the logarithm's standard deviation
 
 
 def estimate_presliding(
@@ -39,9 +39,9 @@ def estimate_presliding(
     """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of its logarithm}, estimated from replays.
 
     Args:
-        dynamics: values of all other parameters. torque_data: the torque residual that determined them.
-        bounds, prior: of all parameters, of which only this one's are used.
-        seed: of the posterior's draws.
+        dynamics: fitted values of the other parameters. torque_data: torque residual of that fit.
+        bounds, prior: bounds and prior of all parameters; only those of presliding are used.
+        seed: seed of the posterior's draws.
     """
     robot = torque_data.space.robot
     space = parameter_space(robot, dynamics, {NAME: bounds[NAME]})
@@ -57,7 +57,7 @@ def estimate_presliding(
 
 
 class Presliding:
-    """Residual of log presliding about the result of `estimate_presliding`, in standard deviations."""
+    """Deviation of log presliding from the result of `estimate_presliding`, as a residual in standard deviations."""
 
     def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
         self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)

@@ -1,10 +1,10 @@
-"""Standard error of breakaway commands from repeated ramps.
+"""Compute the standard error of breakaway commands from repeated ramps.
 
 Friction scatters from ramp to ramp, with posture, load and cable. Two ramps per joint and direction hardly determine
-a variance (in Student's t with one degree of freedom, a 95 % interval has +-12.7 standard errors). So each variance
-is averaged with that of joints of the same size, which counts as `PRIOR_REPEATS` repeats (Smyth, Stat. Appl. Genet.
-Mol. Biol. 3(1), 2004). This number is small, because even joints of the same size differ in scatter, on twins by
-factors of 3 and more. If no ramp was repeated, the scatter is `REPEATS`.
+a variance (for Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors). So each variance
+is averaged with that of joints of the same size, which has the weight of `PRIOR_REPEATS` repeats (Smyth, Stat. Appl.
+Genet. Mol. Biol. 3(1), 2004). The weight is small, because even joints of the same size differ in scatter, on twins
+by factors of 3 and more. If no ramp was repeated, r2s assumes the scatter `REPEATS`.
 """
 
 from typing import NamedTuple
@@ -18,14 +18,14 @@ REPEATS = 1e-3  # of tau_max, standard deviation between repeated ramps; 0.8e-3 
 
 
 class Certainty(NamedTuple):
-    """Standard error sigma (n, 2) Nm of mean commands (NaN without a release), and Student's degrees of freedom."""
+    """Standard error `sigma` (n, 2) Nm of mean commands (NaN without a release), and Student's degrees of freedom."""
 
     sigma: np.ndarray
     freedom: np.ndarray
 
 
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
-    """Return the certainty of the mean commands; joints with the same torque limit tau_max (n,) Nm share a scatter.
+    """Return the certainty of the mean commands; joints with equal torque limit tau_max (n,) Nm share a scatter.
 
     If no joint with this limit has a repeat, the scatter of all other joints is used, in proportion to tau_max.
     """

@@ -1,4 +1,4 @@
-"""A rigid body as ten coordinates, with a prior for bodies that arms carry; any positive mass is consistent."""
+"""Coordinates of a rigid body, with a prior for bodies that arms carry; any positive mass is a possible body."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ NAMES = ("mass", "x", "y", "z", "d1", "d2", "d3", "s12", "s13", "s23")
 # standard deviations of the prior: of the logarithm of a body's size along an axis, relative to a ball of water of
 # the same mass (a steel block is half as large, an empty box of 2 kg three times as large); of its shear
 SIZE, SHEAR = 0.7, 0.5
-HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: mass over rated mass; distance, and shape, over their sigma
+HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: mass over rated mass; distance and shape over their prior sigma
 STEP = 1e-6  # finite-difference step, of the width of the bounds
 
 
@@ -20,11 +20,11 @@ class BodySpace:
     """Coordinates z (10,) of a body in the end effector's frame: mass, centre of mass, shape of the second moment.
 
     The second moment about the centre is mass gyration^2 V V^T, V = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]]
-    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). So every z with positive mass is a body that can exist.
+    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). So every z with positive mass is physically possible.
 
     Attributes:
-        heaviest: kg, mass that the arm may carry. far: m, prior standard deviation of the centre's coordinates.
-        gyration: m, size parameter of a ball of water with about the body's mass.
+        heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the centre's coordinates.
+        gyration: m, size parameter: that of a ball of water with about the body's mass.
     """
 
     heaviest: float
@@ -49,7 +49,7 @@ class BodySpace:
         return -reach, reach + HEAVIEST * self.heaviest * np.eye(10)[0]
 
     def body(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mass (...) kg, centre (..., 3) m and tensor about it (..., 3, 3) kg m^2 of bodies z (..., 10)."""
+        """Return mass (...) kg, centre (..., 3) m and tensor about the centre (..., 3, 3) kg m^2 for z (..., 10)."""
         v = np.zeros((*z.shape[:-1], 3, 3))
         for i in range(3):
             v[..., i, i] = np.exp(z[..., 4 + i])
@@ -68,5 +68,5 @@ class BodySpace:
         return ((self.standard(z + h) - self.standard(z - h)) / (2 * h.diagonal()[:, None])).T
 
     def prior(self, z: np.ndarray) -> np.ndarray:
-        """Return the prior's residual (9,) for all coordinates but the mass, in standard deviations."""
+        """Return the prior's residual (9,) for all coordinates except the mass, in standard deviations."""
         return z[1:] / self.sigma[1:]

@@ -1,4 +1,4 @@
-"""Identification of a loaded arm's payload: mass, centre of mass and inertia tensor, with intervals."""
+"""Identify the payload of a loaded arm: mass, centre of mass and inertia tensor, with intervals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from r2s.physics.rigid_body import tensor_elements
 from r2s.recordings.recording import Recording
 
 ROUNDS = 5  # number of fits, each with weights from the residual of the previous one
-LEAST_SHARE = 0.02  # of the rated mass: least mass that sets the size of the prior's ball of water
+LEAST_SHARE = 0.02  # of the rated mass: least mass of the prior's ball of water
 COVERED = 2.5, 97.5  # %, percentiles of a 95 % interval
 ELEMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
@@ -28,10 +28,10 @@ class PayloadEstimate:
 
     Attributes:
         mass: kg. centre: (3,) m. tensor: (3, 3) kg m^2 about the centre, physically consistent.
-        draws: {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)} of the posterior; inertia in the order of ELEMENTS.
-        identifiable: {name: bool, or one per element}, whether the recording determines it.
-        t: (T,) s. measured: (T, n) Nm, recorded torque, filtered. without, predicted: (T, n) Nm, torque of the
-            identified arm without and with payload. seen: (T, n) bool, rows that count.
+        draws: posterior draws {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)}; inertia in the order of ELEMENTS.
+        identifiable: {name: bool, or one bool per element}, whether the recording determines the value.
+        t: (T,) s. measured: (T, n) Nm, filtered recorded torque. without, predicted: (T, n) Nm, torque of the
+            identified arm without and with payload. seen: (T, n) bool, rows used in the fit.
     """
 
     mass: float
@@ -67,7 +67,7 @@ class PayloadEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _Linearized:
-    """The problem of a loaded recording, linearized at its fit, for `posterior`; u contains body and arm."""
+    """A payload problem linearized at its fit, for `posterior`; its u contains body z and arm uncertainty w."""
 
     rows: Rows
     space: BodySpace
@@ -108,11 +108,11 @@ def identify_payload(
     """Estimate the payload of an arm from a loaded recording.
 
     Args:
-        arm: identified without the payload from the same kind of torque; its uncertainty widens the intervals.
+        arm: the arm identified without payload, from the same kind of torque; its uncertainty widens the intervals.
         recording: motion of the arm with the payload.
         declared: payload that gravity compensation assumed (commanded torque).
-        cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: of the posterior's draws.
-        report: called with the share of work that is done, and the next task.
+        cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: seed of the posterior's draws.
+        report: function that is called with the share of finished work and the name of the next task.
 
     Raises:
         UserError: no joint moves fast enough, or the payload exceeds HEAVIEST times the rated mass.
@@ -152,7 +152,7 @@ def _fit(rows: Rows, space: BodySpace) -> np.ndarray:
 
 
 def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEstimate:
-    """Return the estimate at a fit, with the draws of its posterior."""
+    """Return the payload estimate at a fit, with posterior draws."""
     rng, (low, high) = np.random.default_rng(seed), fit.space.bounds
     u = fit.u
     if u[0] > 1 - EDGE:
@@ -163,7 +163,7 @@ def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEsti
     drawn = np.clip(u + posterior(fit, u, seed).steps, 0.0, 1.0)[:, :10] * (high - low) + low
     mass, centre, tensor = fit.space.body(drawn)
     draws = {"mass": mass, "centre": centre, "inertia": tensor_elements(tensor)}
-    # spread by the prior alone at this mass: a value is identifiable if its interval is far narrower
+    # spread of the prior alone at this mass: a value is identifiable if its interval is far narrower
     alone = np.where(
         np.isinf(fit.space.sigma), fit.z, rng.normal(size=drawn.shape) * np.nan_to_num(fit.space.sigma, posinf=0.0)
     )

@@ -1,4 +1,4 @@
-"""payload.yaml and payload_posterior.npz: an identified payload for arms, other stages and libfranka."""
+"""Write payload.yaml and payload_posterior.npz: an identified payload for arms, other stages and libfranka."""
 
 import json
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mappi
     `arm.payload`, `arm.declared_payload` and `data.declared_payload` read payload.yaml; `robot.tool` reads tool.json.
 
     Args:
-        path: of payload.yaml. robot: that carried it. source: origin of the estimate (recording, calibration, run).
+        path: the payload.yaml to write. robot: the loaded arm. source: recording, calibration and run.
     """
 
     def numbers(values: np.ndarray) -> Any:
@@ -36,11 +36,11 @@ def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mappi
         entry = {"unit": UNITS[name], "value": numbers(value)}
         entry |= {"interval95_low": numbers(low), "interval95_high": numbers(high)}
         document["parameters"][name] = entry | {"identifiable": np.asarray(found.identifiable[name]).tolist()}
-    # all digits: a thin body's tensor may become inconsistent by rounding
+    # with all digits, because rounding may make a thin body's tensor inconsistent
     document["payload"] = {name: np.asarray(value).tolist() for name, value in found.values.items()}
     columns = found.tensor.T.ravel().tolist()
     document["libfranka"] = {"load_mass": found.mass, "F_x_Cload": found.centre.tolist(), "load_inertia": columns}
-    with atomic_write(path.with_name("payload_posterior.npz")) as part:  # first: payload.yaml must not exist alone
+    with atomic_write(path.with_name("payload_posterior.npz")) as part:  # first, so payload.yaml never exists alone
         np.savez_compressed(part, **found.draws)  # type: ignore[arg-type]
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))

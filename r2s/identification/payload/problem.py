@@ -1,4 +1,4 @@
-"""Torque residual of a loaded arm, linear in the payload's standard parameters and in the arm's uncertainty."""
+"""Set up the torque residual of a loaded arm, linear in the payload's parameters and the arm's uncertainty."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -14,11 +14,11 @@ from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass
 from r2s.physics.rigid_body import LinkInertia, nominal_torque
 from r2s.recordings.recording import Recording
 
-# standard deviations of changes since the calibration: of friction, relative (warming changes it as much in minutes,
-# WARMED in adaptation); of offsets, relative to friction; of link-side offsets, to the largest torque (conf/identify)
+# standard deviations of changes since the calibration: friction, relative (warming changes friction by as much within
+# minutes, WARMED in adaptation); offset over friction; link-side offset over the largest torque (conf/identify)
 FRICTION_DRIFT, OFFSET_DRIFT, SENSOR_DRIFT = 0.07, 0.02, 7e-4
 LOAD_FRICTION = 0.015  # Nm of gear friction per Nm of load (adaptation/tuning.py: PAYLOAD_FRICTION)
-RATE_HZ, LONG_S = 100.0, 240.0  # rows per second, fewer for recordings longer than LONG_S
+RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; recordings longer than LONG_S (s) have fewer
 REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
 
 
@@ -29,7 +29,7 @@ class LoadedSpace(ParameterSpace):
     payload: Payload | None = None
 
     def dynamics(self, x: np.ndarray) -> Dynamics:
-        """Return the dynamics of x (..., P) with the payload."""
+        """Return the dynamics that x (..., P) describes, plus the payload."""
         return dynamics_with_payload(self.robot, super().dynamics(x), self.payload)
 
 
@@ -38,8 +38,8 @@ class Rows:
     """Residual rows of a loaded recording, in standard deviations: error + body phi + arm w.
 
     Attributes:
-        error: (R,), without payload. body: (R, 10), per standard parameter phi of the payload about the end effector.
-        arm: (R, r), per coordinate w of the arm's uncertainty, standard normal. clusters: (R,), independent blocks.
+        error: (R,), rows without payload. body: (R, 10), slope for the payload's standard parameters phi about the
+            end effector. arm: (R, r), slope for standard normal w, the arm's uncertainty. clusters: (R,), blocks.
     """
 
     error: np.ndarray
@@ -49,14 +49,14 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10) and constant (r,): the best w for a payload phi is gain @ phi + constant."""
+        """Gain (r, 10) and constant (r,); the w that fits a payload phi best is gain @ phi + constant."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,): sum((slope @ phi + constant)^2) is all rows' at best w, up to a number."""
+        """Slope (K, 10), constant (K,); sum((slope @ phi + constant)^2) is the cost at best w, up to a number."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -76,7 +76,7 @@ class LoadedTorque:
     """The torque residual of an arm with an unknown payload.
 
     Args:
-        arm: identified without the payload. recording: with the payload and the same kind of torque.
+        arm: the arm identified without payload. recording: loaded recording of the same kind of torque.
         declared: payload that gravity compensation assumed (commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque.
     """
@@ -97,15 +97,15 @@ class LoadedTorque:
         self._sign = m.filtered(sliding_sign(self.torque))
 
     def with_payload(self, payload: Payload | None, unexplained: np.ndarray | float = 0.0) -> TorqueResidual:
-        """Return the residual of the arm with a payload, reweighted by its error.
+        """Return the residual of the arm with a payload, reweighted by the residual's error.
 
-        unexplained: (T, n) Nm, torque that is subtracted from this error because the arm's uncertainty explains it.
+        unexplained: (T, n) Nm, torque that the arm's uncertainty explains; it is subtracted from this error.
         """
         own = self.torque.on(replace(self._space, payload=payload)).with_external(self._declared + unexplained)
         return own.reweighted(self.arm.x, fitted=True)
 
     def body_torque(self, torque: TorqueResidual, payload: Payload | None) -> np.ndarray:
-        """Return (T, n, 10) Nm per standard parameter of a body at the end effector, in addition to `payload`."""
+        """Return torque (T, n, 10) Nm per standard parameter of a body at the end effector, added to `payload`."""
         d, robot = self.arm.space.dynamics(self.arm.x), self.arm.robot
         d = dynamics_with_payload(robot, d, payload)
         # ten bodies of 1 kg whose standard parameters are linearly independent
@@ -121,14 +121,14 @@ class LoadedTorque:
         return np.stack(moved, -1) @ np.linalg.inv(LinkInertia(np.ones(10), centre, tensor).standard()).T
 
     def load_friction(self, payload: Payload | None) -> np.ndarray:
-        """Return the change of friction (T, n) Nm by a payload's weight, for 1 Nm of friction per Nm of load."""
+        """Return the change of friction (T, n) Nm due to a payload's weight, at 1 Nm of friction per Nm of load."""
         m = self.torque.motion
         carried = mass_and_moment(self.arm.robot, payload)
         loaded = self._weight + np.array([self._load(q, carried) for q in m.q])
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Return the rows, linearized and weighted at a payload (its standard parameters: phi (10,)) and an arm w."""
+        """Return the rows, linearized and weighted at a payload (standard parameters phi (10,)) and at arm w (r,)."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

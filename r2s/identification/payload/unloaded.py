@@ -1,4 +1,4 @@
-"""Removal of a known payload's torque from a recording."""
+"""Remove a known payload's torque from a recording."""
 
 from dataclasses import replace
 
@@ -15,11 +15,11 @@ from r2s.recordings.recording import Recording
 def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff_hz: float) -> Recording:
     """Return the recording with the payload's torque subtracted from tau.
 
-    Rigid-body torque is linear in the inertial parameters of a payload. Measured and motor torque contain its weight;
-    commands do not, because gravity compensation, to which the payload was declared, carries the weight.
+    Rigid-body torque is linear in the inertial parameters of a payload. Measured and motor torque contain the weight
+    of the payload. Commands do not: gravity compensation, to which the payload was declared, carries the weight.
 
     Args:
-        payload: as `payload_of` returns it. cutoff_hz: of the identification; accelerations have a higher cutoff.
+        payload: see `payload_of`. cutoff_hz: cutoff of the identification; accelerations here have a higher one.
     """
     grid = recording.resample(SIM_DT)
     smooth = grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 * recording.rate_hz))

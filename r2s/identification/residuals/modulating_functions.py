@@ -1,9 +1,9 @@
-"""Weighted means of a recording over short windows in which a joint slides in one direction.
+"""Average a recording, with weights, over short windows in which a joint slides in one direction.
 
 Friction at standstill and at a reversal is not a function of velocity, and a low-pass spreads such moments over a
 tenth of a second. So each row of a joint is a weighted mean over a window that ends before the joint stops or
 reverses (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command get the same
-weights. Close reversals make windows shorter and rows noisier; how much noisier is computed from the encoder noise.
+weights. Close reversals make windows shorter and rows noisier; r2s computes this noise from the encoder noise.
 """
 
 from collections.abc import Sequence
@@ -21,14 +21,14 @@ from r2s.recordings.parts import concatenated
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 250  # rate at which torques are evaluated before averaging
-CUTOFF_HZ = 40.0  # of angles before differentiation: with a curved friction law, velocity noise causes bias
+CUTOFF_HZ = 40.0  # cutoff for angles before differentiation: velocity noise biases a curved friction law
 NORMAL = 0.6745  # median magnitude of a normal variable over its standard deviation
 SHORTEST, LONGEST = 0.024, 0.1  # s, half the length of a window
-GUARD = 8e-3  # s, distance to a stop, which the low-pass spreads this far
+GUARD = 8e-3  # s between a window and a stop, because the low-pass spreads the stop over this time
 STEADY = 0.2  # relative change of velocity allowed over PRESLIDING, for a friction law with memory
-STEADY_ROWS = 101  # rows of the polynomial fit that tests this; over five rows, noise looks like acceleration
+STEADY_ROWS = 101  # rows of the polynomial fit to test STEADY; over five rows, noise looks like acceleration
 MAX_LATENCY = 0.04  # s, longest latency of a command
-HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of the step for which a command is held
+HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of eighths of the step for which a command is held
 LAG_POINTS, LAG_WEIGHTS = np.polynomial.laguerre.laggauss(16)  # quadrature of a first-order lag, over exp(-x)
 
 
@@ -39,7 +39,7 @@ class SlidingMotion:
     Attributes:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2. bristle: (F, n), the presliding state.
         means: n sparse matrices (T, F), the window weights of each joint; rows without a window are empty.
-        seen: (T, n) bool, whether the moment has a window, in which the joint slides in one direction.
+        seen: (T, n) bool, whether the moment has a window in which the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of the mean acceleration per rad of white encoder noise.
         encoder: (n,) rad, standard deviation of the encoder noise.
         delayed: (T, L, n) Nm, window means of the command with L delays: -1 ms, 0, 1 ms, ...
@@ -70,7 +70,7 @@ class SlidingMotion:
         """Find windows, centred every 1 / `rate_hz` s, in which a joint is faster than `slowest` rad/s.
 
         For a friction law with memory (`slid` > 0), a window starts only after the joint has slid `slid` rad since
-        its reversal, because bristles bend first, over `presliding_rad`, one distance or (n,). The velocity must also
+        its reversal, because bristles first bend over `presliding_rad`, a number or (n,). The velocity must also
         be steady over PRESLIDING, because bristles remember the friction of earlier velocities.
 
         Raises:
@@ -139,10 +139,10 @@ class SlidingMotion:
         """Return the means (T, n, ...) of x (F, n, ...) over the windows of each joint."""
         return _averaged(self.means, x)
 
-    rows = filtered  # functions of q, dq, ddq are averaged, too
+    rows = filtered  # unlike in `SmoothMotion`, functions of q, dq, ddq are averaged, too
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return window means (T, n) Nm of the command that acts at the joints after hold, delay and lag, both in s.
+        """Return window means (T, n) Nm of the command that acts after the hold, `delay` and `lag`, both in s.
 
         This is the mean of u(t - delay - hold - x), with hold uniform over a step and x exponential with mean lag.
         """
@@ -156,7 +156,7 @@ class SlidingMotion:
 
 
 def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
-    """Return a derivative (T, n) of the angles, by polynomials of at most fourth order through up to `most` rows."""
+    """Return a derivative (T, n) of the angles from polynomials of at most fourth order over at most `most` rows."""
     out = np.zeros_like(recording.q)
     for s in recording.stretches:
         rows = min(most, s.stop - s.start - (s.stop - s.start + 1) % 2)
@@ -166,7 +166,7 @@ def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
 
 
 def _block_diagonal(parts: Sequence[csr_array]) -> csr_array:
-    """Return the block-diagonal matrix of some matrices; scipy's function takes several times the memory."""
+    """Return the block-diagonal matrix of `parts`; scipy's function needs several times the memory."""
     rows, columns = (np.cumsum([0, *(m.shape[k] for m in parts)]) for k in (0, 1))
     entries = np.cumsum([0, *(m.nnz for m in parts)])
     data = np.concatenate([m.data for m in parts])
@@ -180,7 +180,7 @@ def _averaged(means: tuple[csr_array, ...], x: np.ndarray) -> np.ndarray:
 
 
 def _weights(half: int) -> np.ndarray:
-    """Return the weights (2 half + 1,) of a window; they and their first two derivatives vanish at its ends."""
+    """Return the weights (2 half + 1,) of a window; the weights and two derivatives vanish at the window's ends."""
     weights = (1.0 - (np.arange(-half, half + 1) / (half + 1)) ** 2) ** 3
     return weights / weights.sum()
 

@@ -1,4 +1,4 @@
-"""A planned motion in place of a recording; it is exact and needs no filter."""
+"""Represent a planned motion in place of a recording; it is exact and needs no filter."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,11 @@ from r2s.physics.robot import Robot
 
 @dataclass(frozen=True)
 class PlannedMotion:
-    """Samples of B motions, concatenated, with the interface of `SmoothMotion`.
+    """Concatenated samples of B planned motions, with the interface of `SmoothMotion`.
 
     Attributes:
-        t: (T,) s. q, dq, ddq, tau: (T, n); tau is the nominal arm's torque. change: (T, n) Nm/s, its time derivative.
-        torque: kind of tau, as in `Recording`.
+        t: (T,) s. q, dq, ddq, tau: (T, n); tau is the nominal arm's torque. change: (T, n) Nm/s, d tau/dt.
+        torque: kind of torque in tau, as in `Recording`.
     """
 
     t: np.ndarray
@@ -47,7 +47,7 @@ class PlannedMotion:
 
     @property
     def bristle(self) -> np.ndarray:
-        """(T, n), presliding state; all joints count as sliding."""
+        """(T, n), presliding state of joints that all slide."""
         return np.sign(self.dq)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:

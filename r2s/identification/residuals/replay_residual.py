@@ -16,7 +16,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-USUAL = 0.9  # share of the windows from which noise is estimated; the worst are left out
+USUAL = 0.9  # noise is estimated from this share of the windows, without the worst
 HUBER = 1.5  # ratio of a window's RMS residual to the median, above which the window is down-weighted
 Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite-difference steps
 TORQUE_SIGMA, MIN_TORQUE_SIGMA = 0.05, 1e-4  # Nm, first guess and lower limit of a window's unexplained torque
@@ -26,14 +26,14 @@ BAYES_ROUNDS = 30  # fixed-point iterations of `_random_effects`
 class ReplayResidual:
     """Replay residual, averaged over `stride` ms and whitened. Immutable: `reweighted` returns a copy.
 
-    The error of a window is modelled as Z b + e. b ~ N(0, diag(d)) has each joint's errors of start angle and start
-    velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise. Generalized
-    least squares weights the rows accordingly. Z is computed by finite differences at a candidate; d and s come first
-    from the recording and later from the residual. `clusters` (R,) is the block of each row, at first its window.
+    The error of a window is modelled as Z b + e. The vector b ~ N(0, diag(d)) contains, for each joint, the errors of
+    start angle and start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is
+    encoder noise. Generalized least squares whitens rows accordingly. Z comes from finite differences at a candidate,
+    d and s first from the recording, later from the residual. `clusters` (R,) are blocks, at first the windows.
 
     Args:
         space: the parameters. recording, windows: the data, see `cut_windows`.
-        stride: ms. batch: candidates that are simulated at once. nthread: 0 uses all cores.
+        stride: ms, see above. batch: candidates that are simulated at once. nthread: threads; 0 uses all cores.
     """
 
     def __init__(
@@ -122,10 +122,10 @@ class ReplayResidual:
             block = blocks_of(w.t, w.q0, self._period, mean, seconds)
             self.clusters = np.repeat(block, self._target[0].size)
         self._trust = np.ones(self.count)
-        moves = self._seen.any((1, 2))  # windows without a row that counts are all padding
+        moves = self._seen.any((1, 2))  # windows without a seen row are all padding
         if fitted and moves.any():
             usual = moves
-            for _ in range(2):  # an outlier window must not set the noise of the others
+            for _ in range(2):  # an outlier window must not raise the noise of other windows
                 self._sigma, self._noise = _random_effects(
                     z[usual], at_x[0, usual], self._seen[usual], self._sigma, self._noise, self._min_sigma
                 )
@@ -136,12 +136,12 @@ class ReplayResidual:
         self._whiten(z)
 
     def _window_rms(self, error: np.ndarray) -> np.ndarray:
-        """Return (W,) the RMS of each window's whitened residual over the rows that count."""
+        """Return the RMS (W,) of each window's whitened residual, without padding rows."""
         r = self._white(error[None])[0]
         return np.sqrt((r**2).sum(1) / np.maximum(self._seen.reshape(self.count, -1).sum(1), 1))
 
     def _white(self, error: np.ndarray) -> np.ndarray:
-        """Return an error (C, W, R') rad whitened, in standard deviations."""
+        """Return the whitened `error` (C, W, R') rad, in standard deviations."""
         r = error / np.tile(self._noise, self._target.shape[1])
         part = (r[..., None, :] @ self._axes) * self._shrink[:, None] @ self._axes.transpose(0, 2, 1)
         return r - part[..., 0, :]
@@ -164,7 +164,7 @@ def _random_effects(
 
     The fixed-point iteration of MacKay, Neural Computation 4(3), 1992, from `sigma` and `noise`: the variance of b is
     sum(mean^2) / (number of well-determined b). A mean of b over all windows comes from a wrong parameter, mostly an
-    offset; it does not count as noise, so that the next fit can correct it. `min_sigma` (K,) is b's lower limit.
+    offset; it is not treated as noise, so the next fit can correct it. `min_sigma` (K,) limits b's sigma from below.
     """
     _, rows, k = z.shape
     n = len(noise)

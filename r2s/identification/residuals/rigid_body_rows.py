@@ -1,4 +1,4 @@
-"""Rigid-body torque at the moments of a torque residual, linear in the links' standard inertial parameters."""
+"""Compute rigid-body torque at a torque residual's moments, linear in the links' standard inertial parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -18,11 +18,11 @@ class RigidBodyRows:
 
     Attributes:
         q: (T, n) rad.
-        rest: (T, n) Nm, torque that does not come from links or rotors: damping and springs of the robot's file.
+        rest: (T, n) Nm, torque of damping and springs in the robot's file.
         y: (T, n, 10 n), regressor of the torque.
-        compensation: (T, n, 10 n), regressor of the gravity compensation's error; empty unless commanded.
+        compensation: (T, n, 10 n), regressor of gravity compensation's error; empty unless torque is commanded.
         load: (T, n) Nm, magnitude of the nominal gravity torque.
-        rotors: (T, n) rad/s^2, rotor acceleration; 0 if the recorded torque does not accelerate the rotors.
+        rotors: (T, n) rad/s^2, rotor acceleration; 0 if recorded torque excludes the torque on the rotors.
         encoder: (T, n) Nm per unit of `SlidingMotion.noise`, torque error due to encoder noise.
     """
 
@@ -36,10 +36,10 @@ class RigidBodyRows:
 
     @staticmethod
     def of(robot: Robot, m: SmoothMotion | SlidingMotion, torque: str) -> "RigidBodyRows":
-        """Return the rows for the motion m of a recording with this kind of torque."""
+        """Return the rows for the motion m of a recording with the kind of torque `torque`."""
         commanded, still, shape = torque == "commanded", np.zeros_like(m.q), (*m.q.shape, -1)
         rest, y = rigid_body(robot, m.q, m.dq, m.ddq, None if commanded else robot.gravity)
-        rest = m.rows(rest - robot.armature * m.ddq)  # the candidate adds its own rotors
+        rest = m.rows(rest - robot.armature * m.ddq)  # candidates add their own rotor torque
         weight = m.rows(regressor(robot, m.q, still, still, robot.gravity).reshape(shape))
         nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         encoder = np.zeros_like(rest)
@@ -49,7 +49,7 @@ class RigidBodyRows:
             q=m.rows(m.q),
             rest=rest,
             y=m.rows(y.reshape(shape)),
-            compensation=weight if commanded else weight[:0].copy(),  # a view would not free the array
+            compensation=weight if commanded else weight[:0].copy(),  # a copy, because a view keeps the whole array
             load=np.abs(weight @ nominal),
             # a link-side sensor does not measure the torque that accelerates the rotors
             rotors=np.zeros_like(rest) if torque == "measured" else m.rows(m.ddq),
@@ -58,6 +58,6 @@ class RigidBodyRows:
 
     @staticmethod
     def joined(parts: "Sequence[RigidBodyRows]") -> "RigidBodyRows":
-        """Join consecutive parts of a recording; the parts lose their arrays, so that no second copy takes memory."""
+        """Join consecutive parts of a recording; the parts lose their arrays to avoid a second copy in memory."""
         names = [f.name for f in fields(RigidBodyRows)]
         return RigidBodyRows(**{name: concatenated(parts, name) for name in names})

@@ -1,6 +1,6 @@
 """Torque residual (equation error): torque predicted at the measured motion minus recorded torque.
 
-It is the only residual of link-side and motor torque, because these are no commands that can be replayed. For
+It is the only residual of link-side and motor torque, because these are not commands and cannot be replayed. For
 commanded torque it is a fast start of a fit. Each row is divided by its standard deviation, see `reweighted`.
 """
 
@@ -26,9 +26,9 @@ from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, small against the residual's curvature
-MAX_CORRELATION = 40  # rows, upper limit: a slowly drifting residual still counts as more than one row
+MAX_CORRELATION = 40  # rows, longest correlation length: a slowly drifting residual is worth more than one row
 MIN_SIGMA = 1e-9  # Nm
-MOST_ROWS = 30_000  # of longer recordings (from 5 min at 100 Hz) fewer rows per s; the cutoff needs 20 per s
+MOST_ROWS = 30_000  # longer recordings (from 5 min at 100 Hz) get fewer rows per s; the cutoff needs 20 per s
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
 PART = 2048  # number of moments whose Jacobian is in memory at once
 FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
@@ -41,11 +41,11 @@ class TorqueResidual:
     higher cutoff and then filtered like the torque, because the filter rounds friction's step at a reversal.
 
     Args:
-        space: the parameters. recording: the data, or a planned motion, which needs no filter.
-        cutoff_hz: cutoff of the filter. rate_hz: rows per second.
-        presliding_rad: distance over which bristles bend, one or (n,).
+        space: the parameters. recording: the data, or a planned motion, which is not filtered.
+        cutoff_hz: cutoff of the zero-phase filter. rate_hz: rows per second.
+        presliding_rad: distance over which bristles bend, a number or (n,).
         slowest: rad/s. If positive, rows are means over windows in which a joint is faster and does not reverse
-            (modulating_functions.py); the encoder noise in each window contributes to the row's weight.
+            (modulating_functions.py); a row's weight then includes the encoder noise in the window.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class TorqueResidual:
             if slowest:
                 of: Any = partial(SlidingMotion.of, slowest=slowest, slid=slid)
             else:
-                # with commands, velocity is the slope of q: logged dq lags by a filter or a step
+                # with commands, velocity is the slope of q, because logged dq lags by a filter or a step
                 late = from_q(robot.n) if self.commanded else lateness(recording, cutoff_hz)
                 late = late.as_logged if space.nominal.late_alike else late
                 of = partial(SmoothMotion.of, cutoff_hz=cutoff_hz, late=late)
@@ -85,19 +85,19 @@ class TorqueResidual:
         self._sign = {False: np.sign(dq) if slowest else np.tanh(dq / WIDTH_DQ), True: m.bristle}
         self._mean_sign = {memory: m.filtered(sign) for memory, sign in self._sign.items()}
         self.block = blocks_of(m.t, self._rigid.q, self._period)
-        # block of a held-out row in selections; rows at equal clock share one, or short trajectories would decide
+        # blocks for held-out rows; rows at equal clock share a block, or else short trajectories would dominate
         self.half_second: np.ndarray = np.unique(np.floor(m.t / BLOCK_S), return_inverse=True)[1]
         self.lead_s, self._external = 0.0, np.zeros(1)
         self._weights = self._weights_at(self._seen_errors(space.start), fitted=False)
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each row; errors in different blocks count as independent."""
+        """(R,) block of each row; errors in different blocks are treated as independent."""
         return np.repeat(self.block, self.space.n)
 
     @property
     def row_s(self) -> float:
-        """s, median time between rows, rounded to milliseconds."""
+        """Median time between rows in s, rounded to milliseconds."""
         return SIM_DT * max(1, round(float(np.median(np.diff(self.motion.t))) / SIM_DT))
 
     def _with(self, **changes: Any) -> "TorqueResidual":
@@ -110,7 +110,7 @@ class TorqueResidual:
         return self._with(space=space).reweighted(space.start, fitted=False)
 
     def with_lead(self, lead_s: float) -> "TorqueResidual":
-        """Return this residual for implicit friction, evaluated `lead_s` ahead (problem.py: `implicit_friction`)."""
+        """Return this residual for implicit friction, `lead_s` seconds ahead (problem.py: `implicit_friction`)."""
         return self._with(lead_s=lead_s)
 
     def within(self, kept: np.ndarray) -> "TorqueResidual":
@@ -118,13 +118,13 @@ class TorqueResidual:
         return self._with(seen=self.seen & kept[:, None])
 
     def with_external(self, tau: np.ndarray) -> "TorqueResidual":
-        """Return this residual for an arm on which its environment exerts the joint torques tau (T, n) Nm."""
+        """Return this residual for an arm on which the environment exerts joint torques tau (T, n) Nm."""
         return self._with(_external=tau)
 
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: parts of a prediction for a similar arm; parts that do not differ are reused.
+        known: parts of a prediction for a similar arm; parts with equal parameters are reused.
         """
         d, own = dynamics, self._known(dynamics, known)
         # a link-side sensor's gain does not scale friction
@@ -137,7 +137,7 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None) -> "_Known":
-        """Return the expensive parts of a prediction; those with the same parameters as `like` are taken from it."""
+        """Return the expensive parts of a prediction; parts of `like` with equal parameters are reused."""
         m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
         if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
             torque, compensation = like.rigid, like.compensation
@@ -160,8 +160,8 @@ class TorqueResidual:
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
         """Return friction before filtering, Nm, in `rows` of the F instants.
 
-        A simulator with implicit friction evaluates it at the velocity of the previous step, `lead_s` earlier, and
-        corrects it if friction rises with speed.
+        A simulator with implicit friction evaluates friction at the velocity `lead_s` earlier (the previous step). It
+        then corrects the result if friction rises with speed.
         """
         dq, sign = self.motion.friction_dq[rows], self._sign[d.family.has_memory][rows]
         if not self.lead_s:
@@ -205,11 +205,11 @@ class TorqueResidual:
             yield r[first * self.space.n :][: PART * self.space.n], self._assembled(changes, rows, len(x)) / h
 
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
-        """Return (R, P): in column k the residual's change if only value k moves from x (P,) to `stepped` (P,)."""
+        """Return the residual's change (R, P); for column k, only value k moves from x (P,) to `stepped` (P,)."""
         return self._assembled(self._changes(x, stepped), slice(None), len(x))
 
     def _changes(self, x: np.ndarray, stepped: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return (block, indices in x, change): of torque (T, n), or for L link values of parameters (n, 10 n, L).
+        """Return (block, indices in x, change): of torque (T, n), or of parameters (n, 10 n, L) for L link values.
 
         A dozen evaluations suffice: friction acts on its own joint only, and torque is linear in standard parameters.
         """
@@ -234,7 +234,7 @@ class TorqueResidual:
         return out
 
     def _assembled(self, changes: list, rows: slice, count: int) -> np.ndarray:
-        """Return the change (., P) of the residual in standard deviations, for the moments in `rows`."""
+        """Return the change (rows n, P) of the residual in standard deviations, for the moments in `rows`."""
         n, weight = self.space.n, (self.seen[rows] / self.scale[rows])[..., None]
         reach = self._rigid.y[rows] + self._rigid.compensation[rows] if self.commanded else self._rigid.y[rows]
         out = np.zeros((len(reach), n, count))
@@ -249,18 +249,18 @@ class TorqueResidual:
         return (out * weight).reshape(-1, count)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
-        """Return this residual divided by the standard deviation of an independent row, from its error at x (P,).
+        """Return this residual in standard deviations of an independent row, estimated from the error at x (P,).
 
-        For each joint it is the RMS if x was `fitted`, else half the RMS, times the square root of the correlation
-        length. In sliding windows, encoder noise (larger in short windows) and a constant share the RMS. If x was
-        `fitted`, the residual also sets the length of independent blocks.
+        The standard deviation of each joint is the RMS if x was `fitted`, else half the RMS, times the square root of
+        the correlation length. In sliding windows, the RMS consists of encoder noise (larger in short windows) and
+        a constant. If x was `fitted`, the error also sets the length of independent blocks.
         """
         r = self._seen_errors(x)
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
         return self._with(_weights=self._weights_at(r, fitted), **own)
 
     def rigid_body_of_last_link(self) -> np.ndarray:
-        """Return (T, n, 10): torque per standard parameter of an additional, undeclared body on the last link."""
+        """Return torque (T, n, 10) per standard parameter of an additional, undeclared body on the last link."""
         y, weight = self._rigid.y[..., -10:], self._rigid.compensation[..., -10:]
         return y + weight if self.commanded else y
 
@@ -284,7 +284,7 @@ class TorqueResidual:
 
 
 class _Known(NamedTuple):
-    """Parts of a prediction, rigid, compensation and friction (T, n) Nm, and the parameters that they belong to."""
+    """Parts of a prediction: rigid, compensation and friction (T, n) Nm, with the parameters that produced them."""
 
     standard: np.ndarray
     armature: np.ndarray
@@ -295,7 +295,7 @@ class _Known(NamedTuple):
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
-    """Return the motion that `of` computes from a recording, piece by piece, and its rigid-body torque."""
+    """Return the motion that `of` computes from a recording piece by piece, and the motion's rigid-body torque."""
     motions = [of(piece) for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     give_back(recording)
@@ -311,7 +311,7 @@ def _standard(d: Dynamics) -> np.ndarray:
 
 
 def _constant_sigma(r: np.ndarray, noise: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the constant sigma (n,) Nm such that r (T, n) over sqrt(sigma^2 + noise^2) has an RMS of 1."""
+    """Return the constant sigma (n,) Nm with which r (T, n) / sqrt(sigma^2 + noise^2) has an RMS of 1."""
     count = np.maximum(seen.sum(0), 1)
     high = np.maximum((r**2).sum(0) / count, MIN_SIGMA**2)
     low = np.full_like(high, MIN_SIGMA**2)
@@ -323,7 +323,7 @@ def _constant_sigma(r: np.ndarray, noise: np.ndarray, seen: np.ndarray) -> np.nd
 
 
 def _correlation_length(r: np.ndarray) -> np.ndarray:
-    """Return (n,) the lag, in rows, at which the autocorrelation of r (T, n) first falls below 1/e."""
+    """Return the lag (n,), in rows, at which the autocorrelation of r (T, n) first falls below 1/e."""
     centred = r - r.mean(0)
     out = np.ones(r.shape[1])
     for j, x in enumerate(centred.T):

@@ -1,7 +1,7 @@
-"""Short windows of a commanded recording, which candidates replay from measured states: eq. (8) of the paper.
+"""Cut a commanded recording into short windows, and replay them from measured states: eq. (8) of the paper.
 
-Windows are short because a simulated arm without feedback drifts: after seconds the error shows this drift rather
-than the parameters.
+Windows are short because a simulated arm without feedback drifts: after some seconds the error shows drift rather
+than wrong parameters.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from r2s.recordings.recording import Recording
 
 STATE_SAMPLES = 31  # ms, length of the local fit for a window's start state
 HALF = STATE_SAMPLES // 2
-SHORTEST = 0.25  # of the window length: shorter windows cost more than they contribute
-MOVED = 0.02  # rad, least range of a joint that counts as moving
-# of the largest tau_max, 0.1 Nm for a Panda's 87 Nm: scatter of breakaway commands between postures
+SHORTEST = 0.25  # least share of the full window length: shorter windows cost more than they contribute
+MOVED = 0.02  # rad, least range of motion of a moving joint
+# scatter of breakaway commands between postures, of the largest tau_max (0.1 Nm for a Panda's 87 Nm)
 SCATTER = 0.1 / 87.0
 MAX_LATENCY_STEPS = 11  # ms, odd: longest latency of a command
-HISTORY = 40  # ms of commands before a window, which delay and lag bring into the window
+HISTORY = 40  # ms of commands before a window, which delay and lag shift into the window
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Windows:
     """W windows of a recording: start states, commands and the joint angles that followed.
 
     Attributes:
-        t: (W,) s, start. q0, dq0: (W, n) rad, rad/s, at the start. tau: (W, S, n) Nm, commands, a row per 1 ms step.
+        t: (W,) s, start. q0, dq0: (W, n) rad, rad/s, at the start. tau: (W, S, n) Nm, commands, one row per 1 ms.
         before: (W, HISTORY, n) Nm, commands before the start. bristle: (W, n), presliding state at the start.
         q: (W, S, n) rad, recorded angles after each step.
-        length: (W,) number of steps that count; later rows are padding.
+        length: (W,) number of steps in the window; later rows are padding.
     """
 
     t: np.ndarray
@@ -50,7 +50,7 @@ class Windows:
     length: np.ndarray
 
     def delayed(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
-        """Return the torques (W, S, n) Nm that act on the joints, behind a `delay` and a `lag`, s."""
+        """Return the torques (W, S, n) Nm that act on the joints after a `delay` and a `lag`, both in s."""
         motors = Motors(len(self.t), self.tau.shape[-1], delay, lag)
         motors.reset(tau=self.before[:, 0])
         return motors(np.concatenate([self.before, self.tau], 1))[:, HISTORY:]
@@ -63,15 +63,15 @@ def cut_windows(
     slowest: float = 0.0,
     edges: np.ndarray | None = None,
 ) -> Windows:
-    """Cut a commanded recording into consecutive windows of at most `seconds`, none across two trajectories.
+    """Cut a commanded recording into consecutive windows of at most `seconds`, each within one trajectory.
 
     Args:
-        limit: largest number of windows; those that are kept are evenly spread.
-        slowest: rad/s. A window ends when a joint becomes slower, and the next one starts when all joints are faster
-            again. If a joint rests, the smallest change of a parameter shifts its release by a step, which disturbs
-            all joints. Joints that never move are ignored.
-        edges: (n, 2) Nm, commands at which resting joints break away, widened by their scatter. A joint counts as
-            slow only while its command lies between them.
+        limit: largest number of windows; if there are more, evenly spread windows are selected.
+        slowest: rad/s. A window ends when a joint becomes slower, and the next window starts when all joints are
+            faster again, because the least change of a parameter can shift the release of a resting joint by a step,
+            which disturbs all joints. Joints that never move are ignored.
+        edges: (n, 2) Nm, commands at which resting joints break away, widened by their scatter. A joint is
+            slow only while its command lies between these.
 
     Raises:
         UserError: no trajectory is as long as a window, or all joints hardly ever move at the same time.
@@ -126,7 +126,7 @@ def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, 
     """Return (start, length) of windows of at most `steps` rows between the `slow` rows of a stretch of `count`."""
     out = []
     for a, b in pairwise([-1, *slow.tolist(), count - 1]):
-        run = b - a - 2 - HALF  # the start state is fitted to rows without a slow joint
+        run = b - a - 2 - HALF  # start states are fitted to rows without slow joints
         if run < SHORTEST * steps:
             continue
         parts = -(-run // steps)
@@ -136,13 +136,13 @@ def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, 
 
 @dataclass(frozen=True)
 class StartState:
-    """Start state of a replay: a cubic fitted to 31 ms of measured angles and velocities, weighted by their noise.
+    """Start state of a replay, from a cubic fitted to 31 ms of measured angles and velocities, weighted by noise.
 
-    Logged velocities are late, by half a step in a simulator or by a filter on an arm. Their lateness is estimated
+    Logged velocities are late, by half a step in a simulator or by a filter on an arm. This lateness is estimated
     for each joint from the derivative of the angles.
 
     Attributes:
-        noise: (n,) rad, robust estimate of the angles' noise. kernel: (n, 2, 2 STATE_SAMPLES), maps measured angles
+        noise: (n,) rad, robust estimate of angle noise. kernel: (n, 2, 2 STATE_SAMPLES), matrix from measured angles
             and velocities to q and dq. sigma: (2, n) rad, rad/s, standard deviation of the start state.
     """
 
@@ -185,7 +185,7 @@ class StartState:
 
 
 def windows_or_none(recording: Recording, seconds: float, limit: int | None = None) -> Windows | None:
-    """Return `cut_windows`, or None if no trajectory is long enough, such as blocks of a short period."""
+    """Return the result of `cut_windows`, or None if no trajectory is long enough, as in short blocks."""
     try:
         return cut_windows(recording, seconds, limit)
     except UserError:
@@ -193,7 +193,7 @@ def windows_or_none(recording: Recording, seconds: float, limit: int | None = No
 
 
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
-    """Return the angles q (W, S, n) rad of an arm with these dynamics, simulated over each window."""
+    """Return the angles q (W, S, n) rad of an arm with `dynamics`, simulated over each window."""
     sim = Simulator(robot, dynamics, len(windows.q0), nthread)
     sim.reset(windows.q0, windows.dq0, bristle=windows.bristle)
     return sim.rollout(windows.delayed(dynamics.delay, dynamics.lag))["qpos"]

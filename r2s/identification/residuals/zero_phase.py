@@ -1,4 +1,4 @@
-"""A recording after a zero-phase low-pass, for differentiation; friction passes through the same filter."""
+"""Low-pass a recording with zero phase for differentiation; friction passes through the same filter."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
 HOLD_STEPS = 0.5  # mean latency of a command that is held for one step, in steps
-FRICTION_CUTOFF = 4.0  # velocity's cutoff in the friction law over that of torque, for sharp reversals
-SHIFT = 0.05  # step of stored time shifts, in cutoff periods; cubic interpolation between them errs by 2e-4
+FRICTION_CUTOFF = 4.0  # cutoff of the friction law's velocity over that of torque, for sharp reversals
+SHIFT = 0.05  # step between stored time shifts, in cutoff periods; cubic interpolation then errs by 2e-4
 SHIFTS = -0.03, 0.05  # s, range of the stored time shifts of torque
-MOST_SHIFT = 20  # ms, largest step: SHIFTS then contains the four shifts for an interpolation
+MOST_SHIFT = 20  # ms, largest such step, with which SHIFTS contains the four shifts for interpolation
 AT_ONCE = 1024  # moments that are filtered at once, to limit memory
 EDGE_S = 0.05  # s, dropped at both ends of a trajectory, where the filter has transients
 
@@ -30,9 +30,9 @@ class SmoothMotion:
 
     Attributes:
         t: (T,) s. q, dq, ddq, tau: (T, n), low-passed forward and backward.
-        friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), its presliding state. Both
-            are padded with their end values at both ends of a trajectory, by half the kernel.
-        kernel: (K,), weights of `filtered`. spans: for runs of moments, the first of the F rows under each kernel.
+        friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), presliding state. Both are
+            padded with their end values at both ends of a trajectory, by half the kernel.
+        kernel: (K,), weights of `filtered`. spans: for runs of moments, the first of the K rows per moment.
         delayed: (T, L, n) Nm, tau with L time shifts over the range SHIFTS, `shift_s` s apart.
     """
 
@@ -107,9 +107,9 @@ class SmoothMotion:
         return SmoothMotion(kernel=parts[0].kernel, spans=tuple(spans), shift_s=parts[0].shift_s, **arrays)
 
     def filtered(self, x: "np.ndarray | Callable[[slice], np.ndarray]") -> np.ndarray:
-        """Return x low-passed at the moments, (T, n); x is (F, n), or a function that returns a slice of these rows.
+        """Return x low-passed at the moments, (T, n); x is (F, n) or a function from a slice of the F rows to values.
 
-        A function is evaluated span by span: writing all rows of an hour to memory and reading them is slower.
+        A function is evaluated span by span, which is faster than storing all rows of an hour in memory first.
         """
         parts = []
         for s in self.spans:
@@ -119,7 +119,7 @@ class SmoothMotion:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def rows(self, x: np.ndarray) -> np.ndarray:
-        """Return x (T, n, ...), a function of q, dq and ddq at the moments, unchanged: these are already filtered."""
+        """Return x (T, n, ...) unchanged: it is a function of q, dq and ddq, which are already filtered."""
         return x
 
     def command(self, delay: float, lag: float) -> np.ndarray:
@@ -127,7 +127,7 @@ class SmoothMotion:
         return self.earlier(delay + lag + HOLD_STEPS * SIM_DT)
 
     def earlier(self, seconds: float) -> np.ndarray:
-        """Return tau (T, n) Nm at `seconds` before each moment; a negative time means after it."""
+        """Return tau (T, n) Nm at `seconds` before each moment, or after each moment if negative."""
         at = (seconds - SHIFTS[0]) / self.shift_s
         k = int(np.clip(at, 1, self.delayed.shape[1] - 3))
         weights = cubic(min(max(at - k, -1.0), 2.0))
@@ -140,7 +140,7 @@ def too_short(recording: Recording) -> UserError:
 
 
 def cubic(x: float | np.ndarray) -> np.ndarray:
-    """Return (4, ...) the weights of samples at -1, 0, 1 and 2 in a cubic Lagrange interpolation at x in [0, 1]."""
+    """Return the weights (4, ...) of samples at -1, 0, 1 and 2 for cubic Lagrange interpolation at x in [0, 1]."""
     return np.stack([
         -x * (x - 1) * (x - 2) / 6,
         (x + 1) * (x - 1) * (x - 2) / 2,
@@ -150,7 +150,7 @@ def cubic(x: float | np.ndarray) -> np.ndarray:
 
 
 def _impulse_response(cutoff_hz: float, rate_hz: float) -> np.ndarray:
-    """Return the two-sided impulse response of `Recording.smooth` at a rate, truncated and scaled to a sum of 1."""
+    """Return the two-sided impulse response of `Recording.smooth` at `rate_hz`, truncated and scaled to sum 1."""
     reach = int(3.0 * rate_hz / cutoff_hz)  # a shorter kernel biases friction by 0.3 % of its level
     pulse = np.zeros(8 * reach + 1)
     pulse[4 * reach] = 1.0

@@ -23,11 +23,11 @@ class Genetic:
 
     Attributes:
         population: number of individuals, all simulated at once.
-        generations: G_max. minutes: time limit.
-        spread: standard deviation of the first population about the start, on the unit cube; at most the prior's.
+        generations: largest number of generations, G_max. minutes: time limit.
+        spread: standard deviation of the first population about the start, on the unit cube; limited to the prior's.
         patience, tolerance: the search ends if the best cost improved by less than `tolerance` (relative) over
             `patience` generations.
-        seed: of all random draws.
+        seed: seed of all random draws.
     """
 
     population: int = 72
@@ -40,7 +40,7 @@ class Genetic:
     local = False
 
     def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-        """Return the best u (P,) of a search from `start` (P,)."""
+        """Return the best u (P,) that a search from `start` (P,) finds."""
         rng = np.random.default_rng(self.seed)
         spread = np.minimum(self.spread, problem.prior_width)
         first = np.clip(start + spread * rng.normal(size=(self.population, len(start))), 0, 1)

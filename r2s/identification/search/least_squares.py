@@ -1,4 +1,4 @@
-"""Least-squares search on replays or on torque (solver: levenberg_marquardt.py)."""
+"""Search for the least-squares solution on replays or on torque (solver: levenberg_marquardt.py)."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class LeastSquares:
     """The least-squares search.
 
     Attributes:
-        max_evaluations: largest number of Jacobians. ftol: least relative gain to go on. minutes: time limit.
+        max_evaluations: most Jacobians. ftol: least relative gain for another step. minutes: time limit.
         level: "residual" to fit the problem's data, or "torque" to fit its torque residual, which takes seconds.
     """
 

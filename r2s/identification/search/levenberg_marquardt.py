@@ -1,4 +1,4 @@
-"""Bounded least squares on the unit cube: Levenberg-Marquardt with several damping factors tried in one batch.
+"""Solve bounded least squares on the unit cube by Levenberg-Marquardt, trying several damping factors in one batch.
 
 scipy's trust-region solver factors the whole Jacobian (14,000 rows, 110 columns) by SVD at every step, which costs
 more than the physics, and tries one step at a time.
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 DAMPING = 1e-3  # first damping factor, relative to the diagonal of J^T J (Marquardt's scaling)
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # in double precision: a pure Gauss-Newton step, and no step
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # limits with the effect of a pure Gauss-Newton step, and of no step
 TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful one
 RETRIES = 3  # batches of trials per Jacobian
 
@@ -28,9 +28,9 @@ def minimize(
     """Return a local minimum u (P,) of the sum of squares in the unit cube, near `start` (P,).
 
     Args:
-        residual: (C, P) -> (C, R). linearize: (P,) -> parts of the residual and its Jacobian, (r,) and (r, P).
+        residual: maps (C, P) to (C, R). linearize: maps (P,) to parts of residual and Jacobian, (r,) and (r, P).
         start, max_evaluations, ftol, minutes: see r2s/identification/search/least_squares.py.
-        report: called with a row of progress after every step. name: name of the search in these rows.
+        report: function that receives a row of progress after every step. name: name of the search in these rows.
     """
     u, damping, began = np.clip(start, 0.0, 1.0), DAMPING, time.perf_counter()
     r = residual(u[None])[0]

@@ -13,7 +13,7 @@ from r2s.identification.terms import blocks_of
 
 
 def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequence[str]) -> dict[str, list[bool]]:
-    """Return {"needed": [whether prediction needs each of the `terms`]}; removal is tried only for `prunable` ones.
+    """Return {"needed": [whether prediction needs the term, for each of `terms`]}; only `prunable` terms are tried.
 
     The term with the most parameters is tried first. A term is removed unless the model without it predicts clearly
     worse than the best model so far.

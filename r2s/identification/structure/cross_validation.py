@@ -1,4 +1,4 @@
-"""Cross-validation within a recording: whole blocks of time, or of phase if motion repeats, are held out."""
+"""Cross-validate within a recording by holding out whole blocks of time, or of phase if motion repeats."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,11 +18,11 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 50.0  # rows per second for comparing structures: half as many as in a fit
-GUARD_S = 0.1  # s, gap between fitted rows and a held-out block, because the low-pass spreads motion so far
+GUARD_S = 0.1  # s, gap between fitted rows and a held-out block, as the low-pass spreads motion over this time
 
 
 def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
-    """Return (fitted part, held-out part) of each fold, which holds out `blocks` blocks with gaps of GUARD_S."""
+    """Return (fitted part, held-out part) for each fold; a fold holds out `blocks` blocks with gaps of GUARD_S."""
     period = recording.period or np.inf
     clock = recording.t % period if recording.period else recording.t
     edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
@@ -56,7 +56,7 @@ class Fold(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Data and settings that the selections of family and terms share.
+    """Data and settings for selecting family and terms by cross-validation.
 
     Attributes:
         robot, nominal: the arm, and the dynamics at which every fit starts.
@@ -64,7 +64,7 @@ class CrossValidation:
         bounds, prior: see `search_space` and `Problem.of`.
         folds: number of folds.
         cutoff_hz: cutoff of the zero-phase filter.
-        report: called with rows of progress. stated: the user's statements, of which fixed values are used.
+        report: function that receives rows of progress. stated: user's statements; only fixed values are used.
     """
 
     robot: Robot
@@ -92,7 +92,7 @@ class CrossValidation:
 
 
 def per_joint(squares: np.ndarray) -> np.ndarray:
-    """Return the factors (n,) that give joints with mean square errors `squares` (n,) equal weight.
+    """Return factors (n,) that weight joints with mean square errors `squares` (n,) equally.
 
     A joint whose error is 0 has no held-out rows, because it never slides faster than `slowest`; its factor is 0.
     """

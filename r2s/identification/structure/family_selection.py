@@ -1,4 +1,4 @@
-"""Selection of the friction family by how well it predicts held-out torque."""
+"""Select the friction family that predicts held-out torque best, or nearly as well with fewer parameters."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,18 +10,18 @@ from r2s.identification.structure.cross_validation import CrossValidation, clear
 from r2s.physics.dynamics import with_family
 from r2s.physics.friction import FAMILIES, Family
 
-# largest error of a simpler family over the least one, on windows of sliding. On simulated arms (independent_arms.py,
-# seeds 1 to 31) it was 1.00 to 1.20 if Coulomb friction was the truth, 1.86 to 6.8 if friction fell with velocity
+# largest ratio of a simpler family's error to the least, in sliding windows. On simulated arms (independent_arms.py,
+# seeds 1 to 31) it was 1.00 to 1.20 for true Coulomb friction, 1.86 to 6.8 if friction fell with velocity
 CLOSE = 1.45
 
 
 def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float = 0.0) -> dict[str, Any]:
-    """Return {"error": (F,) error of held-out torque over the least one, "best": index} for the F friction families.
+    """Return {"error": (F,) held-out torque error over the least error, "best": index} for the F friction families.
 
     A family with more parameters is chosen only if it predicts clearly better. Slow sliding shows whether friction
-    falls with velocity, but a filter spreads stops and reversals over slow rows, and no family explains these. So if
+    falls with velocity, but a filter spreads stops and reversals over slow rows, which no family explains. So if
     `slowest` > 0, rad/s, families without memory are compared again on windows of faster sliding
-    (modulating_functions.py); their "error" is then from these. Families with memory need other windows.
+    (modulating_functions.py), and this comparison sets their "error". Families with memory need other windows.
 
     Raises:
         UserError: the recording is too short to hold out motion.
@@ -41,9 +41,9 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
 def _compare(
     cv: CrossValidation, families: Sequence[Family], terms: Sequence[str], slowest: float = 0.0, close: float = 1.0
 ) -> tuple[np.ndarray, int] | None:
-    """Return the errors (F,) over the least one, and the first family that is within `close` or not clearly worse.
+    """Return errors (F,) over the least error, and the first family within `close` of it or not clearly worse.
 
-    Return None if no joint has a held-out row, such as with `slowest` in a recording of a few seconds.
+    Return None if no joint has a held-out row, for example with `slowest` in a recording of a few seconds.
     """
     spaces = [cv.space(terms, with_family(cv.nominal, f.name)) for f in families]
     scores: list[list[np.ndarray]] = [[] for _ in spaces]

@@ -1,7 +1,7 @@
 """Forward selection: add terms that clearly improve the prediction of held-out torque.
 
 Terms are correlated (an offset with cable drag, a mass with a centre of mass). So a fit assigns a value even to a
-term that the arm lacks, and distorts the others. A term is therefore added only if it improves the prediction.
+term that the arm lacks, and distorts the other values. A term is therefore added only if it improves prediction.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from r2s.identification.terms import blocks_of, scaled_bounds
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
-BLOCKS = 4  # held-out blocks per fold, so that they have fast and slow parts like the rest
+BLOCKS = 4  # held-out blocks per fold, so that held-out motion is fast and slow like the fitted motion
 CLEARLY = 2.0  # least mean improvement in standard errors, about 95 % confidence
 
 
@@ -25,7 +25,7 @@ def select_terms(
     """Return {"entered": [whether each of the `candidates` is added to a model with `terms`]}.
 
     The best candidate is added if it lowers the error by more than CLEARLY standard errors over half-second blocks;
-    then the remaining ones are tried. Torque is linear in most parameters, so each fold is fitted once without
+    then the remaining candidates are tried. Torque is linear in most parameters, so each fold is fitted once without
     candidates, and a trial with candidates is one Gauss-Newton step from this fit.
     """
     space, folds = cv.space(terms), []
@@ -53,7 +53,7 @@ def select_terms(
 
 
 class _LinearizedFold:
-    """The fit to a fold, linearized in its own parameters and in those of the candidate terms."""
+    """The fit to a fold, linearized in the fitted parameters and in the parameters of the candidate terms."""
 
     def __init__(self, cv: CrossValidation, fold: Fold, candidates: Sequence[str]):
         fit, test = fold

@@ -1,10 +1,10 @@
-"""Choice of the lateness that an identification corrects: of link-side torque, and of the logged dq.
+"""Choose whether an identification corrects the lateness of link-side torque and of the logged dq.
 
-The lateness of dq behind q follows from the log alone (r2s/recordings/lateness.py); that of torque needs a fit. An
-arm may filter both in the same way, and then correcting only one does harm. On a physical Panda dq is 5.3 ms late and
-torque about 2 ± 0.5 ms. Correcting dq but not these uncertain 2 ms raised the error of motion held out within the
+The lateness of dq relative to q follows from the log alone (r2s/recordings/lateness.py); that of torque needs a fit.
+An arm may filter both in the same way, and then correcting only one does harm. On a physical Panda, dq is 5.3 ms late
+and torque about 2 ± 0.5 ms. Correcting dq but not these uncertain 2 ms raised the error of motion held out within the
 training part, while the training residual did not show it. If both are equally late, no correction is needed:
-inertial torque and friction then refer to the same time.
+inertial torque and friction then refer to one time.
 """
 
 from collections.abc import Sequence
@@ -20,14 +20,14 @@ from r2s.identification.structure.cross_validation import RATE_HZ, CrossValidati
 from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
-SURE = 4.0  # standard deviations: 3, plus a third, because with model error 95 % intervals covered only 85 %
-BLOCKS = 4  # held-out blocks per fold, so that they have fast and slow parts like the rest
+SURE = 4.0  # standard deviations: 3, plus a third, as 95 % intervals covered only 85 % under model error
+BLOCKS = 4  # held-out blocks per fold, so that held-out motion is fast and slow like the fitted motion
 
 
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
-    """Return {"delayed": whether torque is clearly late, "alike": whether torque and dq count as equally late}.
+    """Return {"delayed": whether torque is clearly late, "alike": whether to treat torque and dq as equally late}.
 
-    1. Fit the delay of torque with a corrected dq; if the delay is clearly not 0, correct both.
+    1. Correct dq and fit the delay of torque; if this delay is clearly not 0, correct both signals.
     2. Otherwise correct only dq if this improves the prediction of held-out torque by more than a standard error; if
        it does not, treat both as equally late and use them as logged.
     """
@@ -42,7 +42,7 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
         squares.append(np.concatenate([fold.score(space, cv.prior) for fold in cv.split(space, blocks=BLOCKS)]))
         row = {"search": "lateness", "evaluations": 0, "cost": float(squares[-1].mean())}
         cv.report(row | {"done": len(squares), "total": 2})
-    logged, corrected = (square / squares[0].mean(0) for square in squares)  # joints count alike
+    logged, corrected = (square / squares[0].mean(0) for square in squares)  # joints have equal weight
     return {"delayed": False, "alike": not clearly_worse((logged - corrected).sum(1))}
 
 

@@ -1,1 +1,1 @@
-"""Comparison of trainings over seeds, and of adapters over transfers."""
+"""Compare trainings over seeds, and adapters over transfers."""

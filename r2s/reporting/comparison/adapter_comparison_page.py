@@ -1,4 +1,4 @@
-"""Tables, figure and report of an adapter comparison."""
+"""Write tables, figure and report of an adapter comparison."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,7 +38,7 @@ def tables(found: AdapterComparison) -> dict[str, pd.DataFrame]:
 
 
 def _cells(scores: pd.DataFrame, m: Measure) -> pd.DataFrame:
-    """Return a table of one measure; each cell has a mean and, below it, the interval."""
+    """Return a table of one measure; each cell shows a mean and, in a second line, the 95 % interval."""
 
     def cell(mean: float, low: float, high: float) -> str:
         return m.cell(mean) + (f"\n[{m.cell(low)}, {m.cell(high)}]" if np.isfinite(low) else "")
@@ -55,7 +55,7 @@ def _square(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def lines(found: AdapterComparison) -> list[str]:
-    """Return the lines about the tables: a verdict per row, names of policies, and episodes that are not averaged."""
+    """Return lines about the tables: a verdict per row, names of policies, and episodes that the means omit."""
     s = found.scores
     out = [verdict(found, row) for row in found.runs]
     if len(s) and not s["stopped"].any():

@@ -1,11 +1,11 @@
-"""Test conditions of an arm in words: payload, friction of a warm arm, delayed commands."""
+"""Describe the test conditions of an arm in words: payload, friction of a warm arm, delayed commands."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 NOMINAL = "nominal"
 IDENTITY = ("_target_", "name", "variant", "seed", "noise")  # keys of conf/arm that identify the arm
-SETTINGS: dict[str, tuple[Any, str]] = {  # keys that set a condition: nominal value, words
+SETTINGS: dict[str, tuple[Any, str]] = {  # keys of conf/arm that set a condition -> nominal value, words
     "payload": (0.0, "{} kg"),
     "declared_payload": (0.0, "{} kg declared"),
     "friction_scale": (1.0, "friction x {}"),
@@ -18,7 +18,7 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     """Return the settings of conf/arm that differ from nominal: {"payload": 1.0}.
 
     Args:
-        arm: its config. typed: overrides such as "arm.live", which count as settings too.
+        arm: config of the arm. typed: overrides such as "arm.live"; their keys are settings, too.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
@@ -31,19 +31,19 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
 
 
 def in_words(settings: Mapping[str, Any]) -> str:
-    """Return a `condition` in words, as "1.0 kg, 0.005 s later"; NOMINAL if it is empty."""
+    """Return the words for a `condition`, such as "1.0 kg, 0.005 s later"; NOMINAL for an empty condition."""
     return ", ".join(_words(k, v) for k, v in settings.items()) or NOMINAL
 
 
 def order(settings: Mapping[str, Any]) -> tuple:
-    """Return the sort key of a `condition`: by number of settings, so nominal is first, then by setting and size."""
+    """Return the sort key of a `condition`: number of settings (so nominal is first), then setting and size."""
     keys = list(SETTINGS)
     each = [(keys.index(k) if k in keys else len(keys), k, _size(v), str(v)) for k, v in settings.items()]
     return len(each), each
 
 
 def _plain(value: Any) -> Any:
-    """Return 1.0 for 1 and for {"mass": 1}, which are the same condition."""
+    """Return a setting in its simplest form: 1 and {"mass": 1} become 1.0, because they are the same condition."""
     if isinstance(value, Mapping) and set(value) == {"mass"}:
         value = value["mass"]
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value

@@ -1,4 +1,4 @@
-"""Groups of trainings: the seeds of one setting, named by their overrides."""
+"""Group trainings: all seeds with the same settings form a group, which is named by its overrides."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,15 +7,15 @@ from typing import Any
 
 from r2s.reporting.comparison.trainings import Trained
 
-LONGEST = 40  # most letters of a label; a longer one would take space from the figure
+LONGEST = 40  # largest number of letters in a label; longer labels would take space from the figure
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Runs by setting.
+    """Runs by their settings.
 
     Attributes:
-        members: {"tqc, dr=paper": [seeds ...]}; no label is longer than `LONGEST` letters.
+        members: {"tqc, dr=paper": [a run per seed ...]}; no label is longer than `LONGEST` letters.
         key: {"tqc #1": "tqc, calibration=..., dr=identified"}, full names of the numbered labels.
     """
 
@@ -24,10 +24,10 @@ class Groups:
 
 
 def group(runs: Sequence[Trained]) -> Groups:
-    """Return the runs grouped by settings, all seeds together.
+    """Return the runs grouped by settings: the runs of a group differ only in their seeds.
 
-    A label is the algorithm and the overrides of the settings that differ; all others are default. A label too long
-    for figures is replaced by a number, which `Groups.key` explains.
+    A group's label is the algorithm and the overrides of the settings that differ among groups; all other settings
+    are default. A label that is too long for figures is replaced by a number, which `Groups.key` explains.
     """
     sets: dict[str, list[Trained]] = {}
     for run in runs:
@@ -70,7 +70,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: settings that differ}: those of algo= among its own runs, all others among all runs."""
+    """Return {algorithm: settings that differ}: settings of algo= among its runs, other settings among all runs."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}
@@ -81,7 +81,7 @@ def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys whose values differ or are missing somewhere."""
+    """Return the keys whose values differ or that some settings lack."""
     keys = dict.fromkeys(k for s in settings for k in s)
     return [k for k in keys if len({repr(s.get(k)) for s in settings}) > 1]
 

@@ -1,4 +1,4 @@
-"""The page of stage=compare for trainings: tables, learning curves and scores of groups of seeds."""
+"""Write the page of stage=compare for trainings: tables, learning curves and scores of groups of seeds."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -42,7 +42,7 @@ def comparison_page(
     """Write tables (CSV), figures, report.md and recording.rrd of a comparison of trainings.
 
     Args:
-        run: run folder of the comparison. robot: the arm. grouped: trainings. apart: {run: why not comparable}.
+        run: run of the comparison. robot: the arm. grouped: trainings. apart: {run: why it is not comparable}.
         others: {folder: why it is no finished training}.
 
     Returns:
@@ -96,15 +96,15 @@ def _sections(
 
 
 def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]:
-    """Return a section per heading of {heading: {run: reason}}; headings without runs are left out."""
+    """Return a report section for each heading in {heading: {run: reason}}; headings without runs are left out."""
     return {heading: [[f"{k}: {v}" for k, v in why.items()]] for heading, why in parts.items() if why}
 
 
 def bands_figure(path: Path, groups: Groups) -> Path:
     """Draw interquartile mean and range of the seeds over env steps, updates and minutes, one row per measure.
 
-    If there are more groups than colours, only the best groups of the last evaluation are drawn. A model-based
-    controller is a dotted line.
+    If there are more groups than colours, only the groups with the best last evaluation are drawn. A model-based
+    controller is drawn as a dotted line.
     """
     grouped, table = groups.members, measures_in(groups.members)
     by = table[table.selection[-1]]

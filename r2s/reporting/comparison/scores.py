@@ -1,4 +1,4 @@
-"""Scores of groups of trainings by their last evaluation; a group has all seeds of one setting."""
+"""Score groups of trainings by their last evaluation; a group has all seeds of one setting."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,7 +19,7 @@ def measures_in(grouped: Grouped) -> MeasureTable:
 
 
 def scores(group: Sequence[Trained], measure: str) -> np.ndarray:
-    """Return a measure (S,) of the last evaluation of every seed."""
+    """Return a measure (S,) in the last evaluation of each of S seeds."""
     return np.array([r.last[measure] for r in group])
 
 
@@ -36,7 +36,7 @@ def summary_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def improvement_table(grouped: Grouped) -> pd.DataFrame:
-    """Return per pair of groups the probability that a run of the first is better than one of the second."""
+    """Return, per pair of groups, the probability that a run of the first group is better than one of the second."""
     rows, table = [], measures_in(grouped)
     pairs = [(first, second) for first in grouped for second in grouped if first != second]
     for first, second in pairs:
@@ -52,9 +52,9 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
     """Return per algorithm how much a measure depends on its settings; empty if no algorithm has two settings.
 
-    best, median and worst are over the interquartile means of the settings. best is optimistic: the same seeds choose
-    and score it. For held_out, each seed scores the setting that the other seeds choose; mean over seeds.
-    spread is held_out minus the median setting at the same seed, with a 95 % interval over seeds; nan if the settings
+    Columns: best, median and worst of the settings' interquartile means. best is optimistic, because the same seeds
+    choose and score the setting. held_out: each seed scores the setting that the other seeds choose; mean over seeds.
+    spread: held_out minus the median setting at the same seed, with a 95 % interval over seeds; nan if the settings
     share fewer than two seeds. A small spread means little need for tuning.
 
     Args:
@@ -79,11 +79,11 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return, at each held-out seed (S,), the score of the best setting by the other seeds, and the median setting's.
+    """Return two scores (S,) per held-out seed: of the setting that is best at the other seeds, and the median.
 
     Args:
-        settings: {seed: score} of each, where larger is better. Only seeds that all settings have are used; the
-            result is None if there are fewer than two.
+        settings: {seed: score} per setting; larger is better. Only seeds that all settings have are used; the result
+            is None if fewer than two seeds remain.
     """
     seeds = sorted(set.intersection(*(set(s) for s in settings)))
     if len(seeds) < 2:
@@ -108,7 +108,7 @@ def at_edges(grouped: Grouped) -> list[str]:
 
 
 def edge(what: str, key: str, value: float, largest: bool) -> str:
-    """Return a line about a best value at the edge of the tried values."""
+    """Return a line about a best value that is the largest or the smallest of the tried values."""
     return f"{what}: {key}={value:g} is the {'largest' if largest else 'smallest'} tried; a better one may lie beyond"
 
 
@@ -118,7 +118,7 @@ def is_number(value: object) -> bool:
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return one measure of an `improvement_table` as strings: probability that row beats numbered column."""
+    """Return one measure of an `improvement_table` as strings: probability that the row beats the numbered column."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}
@@ -128,9 +128,9 @@ def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid of x (points,), and y (3, points): interquartile mean, minimum, maximum over seeds.
+    """Return a grid of x (points,), and y (3, points): interquartile mean, minimum and maximum over seeds.
 
-    The curves of the seeds are interpolated on the range of x that all of them cover.
+    The seeds' curves are interpolated over the range of x that all curves cover.
     """
     curves = [r.curve for r in group]
     grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)

@@ -1,4 +1,4 @@
-"""Statistics for few seeds: interquartile mean, stratified bootstrap, probability of improvement.
+"""Compute statistics of few seeds: interquartile mean, stratified bootstrap, probability of improvement.
 
 Source: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice (NeurIPS 2021).
 """
@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.stats import trim_mean
 
-DRAWS = 2000  # of a bootstrap, as in Agarwal et al.
+DRAWS = 2000  # number of draws of a bootstrap, as in Agarwal et al.
 
 
 def interquartile_mean(x: np.ndarray) -> np.ndarray:
     """Return the mean over the last axis of x (..., S) without the lowest and the highest quarter.
 
-    A quarter is S / 4 rounded down, as in rliable: with fewer than four values this is the mean.
+    A quarter is S / 4 rounded down, as in rliable; so with fewer than four values the result is the mean.
     """
     return np.asarray(trim_mean(x, 0.25, axis=-1))
 
@@ -25,8 +25,8 @@ def interval(
     """Return the 95 % interval of a statistic by a stratified bootstrap; nan if a stratum has only one score.
 
     Args:
-        strata: arrays (S,), a score per seed. seed: of the bootstrap.
-        statistic: maps the draws (D, S) of each stratum to (D,).
+        strata: an array (S,) per stratum, with a score per seed. seed: random seed of the bootstrap.
+        statistic: function that maps a list of draws (D, S), one array per stratum, to (D,).
     """
     if min(map(len, strata)) < 2:
         return np.nan, np.nan
@@ -41,10 +41,10 @@ def interval(
 
 
 def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return the means (DRAWS, A) of a bootstrap over arms, and over episodes of each drawn arm, paired among the A.
+    """Return bootstrap means (DRAWS, A) of A rows. A draw takes arms, and episodes of each arm, alike for all rows.
 
     Args:
-        each: per arm (E, A): values of E episodes in A rows of a comparison. rng: of the draws.
+        each: an array (E, A) per arm: values of E episodes in A rows of a comparison. rng: random generator.
     """
     draws = []
     for _ in range(DRAWS):
@@ -54,7 +54,7 @@ def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
 
 
 def improvement(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the probability (...) that a value of x (..., S) exceeds one of y (..., T); a tie counts half."""
+    """Return the probability (...) that a value of x (..., S) exceeds a value of y (..., T); a tie adds one half."""
     above = x[..., :, None] > y[..., None, :]
     same = x[..., :, None] == y[..., None, :]
     return (above + 0.5 * same).mean((-1, -2))

@@ -16,12 +16,12 @@ from r2s.reporting.trackers.tracker import flat
 from r2s.runs import parts_of
 from r2s.tasks.measures import MeasureTable
 
-# config groups that a training reads besides its seed; runs with equal values form one group of seeds
+# config groups that a training reads, besides its seed; runs with equal values in them form one group of seeds
 READ = (
     *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
 )
-ALIKE = ("robot", "task")  # config groups that comparable runs share
-# origin, equal for comparable runs: the code affects what is learned, the machine how much is learned per minute
+ALIKE = ("robot", "task")  # config groups with equal values in comparable runs
+# origin -> why runs of another origin are not comparable: code affects what is learned, the machine how fast
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
@@ -34,15 +34,15 @@ class Trained:
     """One finished run of stage=train.
 
     Attributes:
-        folder, seed, algo: of the run.
-        settings: config values that it read: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
+        folder, seed, algo: run folder, random seed, name of the algorithm.
+        settings: config values that the run read: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
         alike: config values that are equal in comparable runs: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
         origin: commit, machine, threads and device, None where meta.json has none; for a controller only the commit.
-        typed: overrides of its settings, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
-        toy: whether it ran with +experiment=toy, which is too short to learn.
-        minutes: its budget, None if the budget is in env_steps.
-        measures: of its task. curve: evaluations.csv, on the goals by which its best policy was selected.
-        last: measures of its last policy, from summary.json, on goals not used for selection.
+        typed: overrides of these settings, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
+        toy: whether the run used +experiment=toy, which is too short to learn.
+        minutes: budget of the run in minutes; None if the budget is in env_steps.
+        measures: measures of the task. curve: evaluations.csv, on the goals that selected the best policy.
+        last: measures of the last policy, from summary.json, on goals that were not used for selection.
     """
 
     folder: Path
@@ -78,7 +78,7 @@ def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[s
 
 
 def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
-    """Return the same as `read_trainings`, but allow an empty list."""
+    """Return the same as `read_trainings`, but an empty list instead of an error."""
     trained, others = [], {}
     for folder in map(Path, folders):
         if why := why_not(folder, "train", FILES):
@@ -92,7 +92,7 @@ def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[
 
 
 def why_not(folder: Path, stage: str, files: Iterable[str]) -> str:
-    """Return why a folder is no finished run of `stage` with these files, "" if it is one."""
+    """Return why a folder is not a finished run of `stage` with these files; "" for such a run."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
         seen, status = meta.get("stage", "train"), meta["status"]
@@ -156,15 +156,15 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 
 def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, Any]:
-    """Return the values in these groups of a config, {"dr.phi_relative": 0.1, ...}, without `_target_`."""
+    """Return the values in some groups of a config, {"dr.phi_relative": 0.1, ...}, without `_target_`."""
     own = flat({group: node for group, node in config.items() if group in groups})
     return {key: value for key, value in own if not key.endswith("_target_")}
 
 
 def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, dict[str, float]]:
-    """Return evaluations.csv and the last policy's row; a missing value is infinite if lower is better.
+    """Return evaluations.csv and the last policy's measures; a missing value becomes infinite if lower is better.
 
-    Such a value is missing (null in summary.json) if the arm was stopped in all episodes.
+    A value is missing (null in summary.json) if the arm was stopped in all episodes.
 
     Raises:
         ValueError: a value of another measure is missing, or there is no evaluation.
@@ -189,7 +189,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
     Runs are comparable if robot, task, evaluation, commit and machine agree and budgets differ by at most the factor
     `MOST_BUDGETS`. Of sets of equal size, one without +experiment=toy is preferred, then one with more env steps. Of
-    two runs with equal settings and seed, the first counts: the second adds no evidence.
+    two runs with equal settings and seed, only the first is used, because the second adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -208,7 +208,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why a run is not comparable with `first`, the run with the smallest budget of a set; "" if it is."""
+    """Return why a run is not comparable with `first`, the run with the least budget in a set; "" if comparable."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]
@@ -230,7 +230,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """Return {name: reason} as ["a, b (failed)", "c (unfinished)"], `most` names per reason, each cut to `width`."""
+    """Format {name: reason} as ["a, b (failed)", "c (unfinished)"]: `most` names per reason, names cut to `width`."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

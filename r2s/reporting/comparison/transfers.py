@@ -20,7 +20,7 @@ from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
 FILES = ("config.yaml", "policy.yaml", "overrides.yaml", "summary.json")
-ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that depend on the arm and are no settings of the adapter
+ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that depend on the arm instead of being settings of the adapter
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Transferred:
     """One finished run of stage=transfer with an arm.
 
     Attributes:
-        folder: of the run. start: its start time, from meta.json. policy: absolute path of the policy's run folder.
-        adapter: name in conf/adapt. settings: of the adapter: {"filter_s": 0.087}.
-        arm: "twin, rigid, seed 0". condition: settings of the arm (`condition`). robot: its config in training.
-        measures: of the task. length: of an episode, with the policy's rate: "4 s at 100 Hz". goals: their number.
+        folder: run folder. start: start time, from meta.json. policy: absolute path of the policy's run folder.
+        adapter: name in conf/adapt. settings: settings of the adapter: {"filter_s": 0.087}.
+        arm: "twin, rigid, seed 0". condition: output of `condition`. robot: config of the robot in training.
+        measures: measures of the task. length: episode length, policy rate: "4 s at 100 Hz". goals: number of goals.
         us: median time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
         episodes: a row per episode, indexed by goal: `MeasureTable.transfer`, the gap, and arm_stopped (0 or 1).
     """
@@ -118,7 +118,7 @@ def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[st
     """Return the largest set of comparable transfers, and {name: reason} of the others.
 
     Transfers are comparable if robot, task and goals agree. Of several runs with equal policy, adapter, arm and
-    condition, the last counts.
+    condition, only the last is used.
     """
     first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
     apart = {r.folder.name: why for r in found if (why := _difference(r, first))}
@@ -132,7 +132,7 @@ def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[st
 
 
 def _difference(run: Transferred, first: Transferred) -> str:
-    """Return why a transfer is not comparable with `first`; "" if it is."""
+    """Return why a transfer is not comparable with `first`; "" if it is comparable."""
     if keys := [k for k in first.robot | run.robot if run.robot.get(k) != first.robot.get(k)]:
         return f"another robot: robot.{keys[0]} differs"
     one, other = (r.measures[r.measures.selection[0]].title for r in (run, first))

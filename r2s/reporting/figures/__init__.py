@@ -1,1 +1,1 @@
-"""Figures (PNG): panels and colours, learning curves, episodes."""
+"""Draw figures (PNG): panels and colours, learning curves, episodes."""

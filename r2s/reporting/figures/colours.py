@@ -1,4 +1,4 @@
-"""One colour per label, the same in figures and in the viewer."""
+"""Assign each label a colour, the same in figures and in the viewer."""
 
 from collections.abc import Iterable
 
@@ -13,8 +13,8 @@ OTHERS = (
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
-    The first label with "measured", "nominal" or "identified" in it ("twin, nominal") gets the colour of that word.
-    The other labels get the twelve colours of OTHERS in order, from the first again after the twelfth.
+    The first label with the word "measured", "nominal" or "identified" ("twin, nominal") gets that word's colour.
+    The other labels get the twelve colours of OTHERS in order, repeated after the twelfth.
     """
     found: dict[str, str] = {}
     others = 0

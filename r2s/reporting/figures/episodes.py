@@ -1,4 +1,4 @@
-"""Figures of episodes: error, reward and torque over time, and latencies."""
+"""Draw figures of episodes: error, reward and torque over time, and latencies."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from r2s.reporting.viewer.layout import Episode
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.rollout import Episodes
 
-SHOWN = 4  # most goals in a figure, as in the paper's
+SHOWN = 4  # largest number of goals in a figure, as in the paper
 
 
 def error_figure(path: Path, episodes: Mapping[str, Sequence[Episode]], measures: MeasureTable) -> Path:

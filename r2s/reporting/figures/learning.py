@@ -1,4 +1,4 @@
-"""Learning curves of single runs."""
+"""Draw the learning curves of single runs."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,7 +11,7 @@ from r2s.tasks.measures import Measure
 
 
 def learning_figure(path: Path, runs: Mapping[str, pd.DataFrame], measures: Iterable[Measure]) -> Path:
-    """Draw measures of {name: evaluations.csv} over wall-clock minutes, one panel each."""
+    """Draw measures from {run: evaluations.csv} over wall-clock minutes, one panel per measure."""
     shown, colour = list(measures), colours(runs)
     with panels(path, len(shown), min(len(shown), 2), "learning curves", height=3.0) as axes:
         for axis, m in zip(axes, shown, strict=True):

@@ -7,12 +7,12 @@ PAUSE = 0.1  # s, drawn length of a pause of any length
 
 
 def thin(count: int, most: int = MOST_POINTS) -> slice:
-    """Return a slice that keeps at most `most` of `count` rows."""
+    """Return a slice that selects at most `most` of `count` rows, evenly spaced."""
     return slice(None, None, max(1, -(-count // most)))
 
 
 def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
-    """Return indices of t (T,) s that sample it at about `rate` Hz; the first and the last row are included."""
+    """Return row indices that sample a log with times t (T,) s at about `rate` Hz, first and last row included."""
     grid = np.arange(t[0], t[-1], 1 / rate)
     return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
 

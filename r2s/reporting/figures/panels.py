@@ -1,4 +1,4 @@
-"""Panels with one shared legend, and logarithmic axes."""
+"""Draw figures of several panels with one shared legend; set up logarithmic axes."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -12,10 +12,10 @@ from r2s.tasks.measures import Measure
 
 DPI = 120
 WIDTH = 12.0  # inches
-LEGEND_WIDTH = 160  # letters of a legend's line that fit into WIDTH
+LEGEND_WIDTH = 160  # number of letters that fit into WIDTH, in one line of the legend
 # inches around and between panels: matplotlib's own layouts measure every text, which takes most of a figure's time
 LEFT, RIGHT, TOP, BOTTOM, ACROSS, DOWN, LINE = 0.8, 0.15, 0.75, 0.5, 0.85, 0.75, 0.22
-LETTER = 0.085  # inches per letter of a label beside the first panel
+LETTER = 0.085  # inches per letter of a tick label left of the first panel
 TITLE, AGAIN = 0.9, 0.2  # inches added to the heights of the rows: once, and for each row after the first
 
 

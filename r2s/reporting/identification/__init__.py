@@ -1,1 +1,1 @@
-"""The report of an identification: tables, figures and page."""
+"""Report an identification: tables, figures and page."""

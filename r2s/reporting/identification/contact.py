@@ -1,4 +1,4 @@
-"""Report of an identified surface: tables, and the normal force over the penetration depth."""
+"""Report an identified surface: tables, and a figure of the normal force over the penetration depth."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ FINE = "{:.4g}"
 
 
 def contact_table(found: ContactEstimate) -> pd.DataFrame:
-    """Return a row per parameter of the surface: value, 95 % interval, whether the recording determines it."""
+    """Return a row per parameter of the surface: value, 95 % interval, whether the data determine the parameter."""
     rows = {f"slope at {LOAD:g} N, N/m": (found.slope, found.interval("slope"), found.identifiable["slope"])}
     for name, unit in UNITS.items():
         value, known = getattr(found.surface, name), found.identifiable[name]
@@ -38,7 +38,7 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def press_table(found: ContactEstimate) -> pd.DataFrame:
-    """Return the RMS error of the surface's normal force against joint torques, on fitted and held-out presses."""
+    """Return the RMS error of the surface's normal force, against joint torques, in fitted and held-out presses."""
     parts = {"fitted presses": found.training, "held-out press": found.validation}
     cells = {
         name: [f"{part.summary()['seconds']:.1f}", *(number(part.rmse(side), "{:.2f}") for side in (0.0, 1.0, -1.0))]
@@ -77,7 +77,7 @@ def contact_figure(path: Path, found: ContactEstimate) -> Path:
 
 
 def _curves(found: ContactEstimate, depth: np.ndarray) -> np.ndarray:
-    """Return the force (S, D) N of S surfaces of the posterior, at depths (D,) m below the estimated plane."""
+    """Return the normal force (S, D) N of S posterior surfaces, at depths (D,) m below the estimated plane."""
     draws = found.draws
     shift = (draws["point"] - found.surface.point) @ found.surface.normal
     inside = 1e3 * np.maximum(depth + shift[:, None], 0.0)  # mm, the unit of the stiffness

@@ -1,4 +1,4 @@
-"""Figures of an identification: torque, open-loop position, friction, convergence."""
+"""Draw the figures of an identification: torque, open-loop position, friction, convergence."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ from r2s.reporting.figures.log_rows import thin, without_pauses
 from r2s.reporting.figures.panels import joint_panels, log_axis, panels
 
 LONGEST = 30.0  # s of torque in a figure; more would look like a solid band
-SCANS = {  # steps of the history whose costs are not comparable: title and colour of their shade
+SCANS = {  # searches in the history without comparable costs -> title and colour of the shaded area
     "family": ("comparison of friction families", "#9aa0a6"),
     "terms": ("choice of terms", "#57ab5a"),
     "breakaway": ("search for breakaway", "#c9a227"),
@@ -90,7 +90,7 @@ def friction_figure(
     """Draw friction over speed up to dq_max (n,) rad/s, and breakaway torques as bars at zero speed.
 
     Args:
-        path: of the PNG. dynamics: {label: model}. dq_max: range of the speed axis.
+        path: path of the PNG. dynamics: {label: model}. dq_max: range of the speed axis.
         data: speed (T, n) rad/s and friction torque (T, n) Nm of a recording.
         draws: (S, n, K) posterior draws of the last model's parameters, for its 95 % band.
     """

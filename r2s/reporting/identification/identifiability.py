@@ -10,7 +10,7 @@ MOST_LINES = 10  # most null directions that are listed
 
 
 def identifiability(found: IdentificationResult) -> list[Item]:
-    """Return sentences about parameters that are kept nominal or at a bound, and about null directions."""
+    """Return sentences about parameters at nominal values or at bounds, and about null directions."""
     space = found.space
     count, total = int(found.found.identifiable.sum()), len(space.names)
     items: list[Item] = [
@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """Return the combinations that the prior determines; those of parameters kept nominal are only counted."""
+    """List the combinations that the prior determines; for those of parameters kept nominal, only their number."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}
@@ -53,7 +53,7 @@ def _null_directions(found: IdentificationResult) -> list[Item]:
 
 
 def _place(name: str) -> tuple[str, str, str]:
-    """Return block, "joint" or "link", and number of a name such as phi1[3]; "" and "" for the whole arm."""
+    """Split a name such as phi1[3] into block, kind ("joint" or "link") and number; whole arm: kind, number ""."""
     block, _, number = name.rstrip("]").partition("[")
     kind = "link" if block in LINK or block == "inertia_scale" else "joint"
     return block.removeprefix("link_"), kind if number else "", number

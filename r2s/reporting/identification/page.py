@@ -1,4 +1,4 @@
-"""The page of an identification: Tables I to IV of the paper for this arm, identifiability, and figures.
+"""Write the page of an identification: Tables I to IV of the paper for this arm, identifiability, and figures.
 
 "Old" is the nominal model, "new" the identified one. Intervals are 95 %, from the joint posterior.
 """
@@ -48,16 +48,16 @@ TORQUE = {  # data.torque in words
     "measured": "link-side torque, with gravity",
     "motor": "motor torque, with gravity and all friction",
 }
-FIGURE_WINDOW_S = 0.5  # s, shortest open-loop window of the position figure, for long enough motion
+FIGURE_WINDOW_S = 0.5  # s, shortest open-loop window in the position figure, unless the motion is too short
 
 
 class Evidence(NamedTuple):
-    """Figures and tables of the page that are not part of the result.
+    """Figures and tables of the page that `IdentificationResult` does not contain.
 
     Attributes:
-        pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, speeds of the validation motion.
-        whiteness: `whiteness_table` of the torque residual of that motion. base: output of `base_table`.
-        window_s: length of a replay, s. cutoff_hz: of the low-pass of the torque fit.
+        pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, highest speeds of the validation motion.
+        whiteness: `whiteness_table` of the torque residual in the validation motion. base: output of `base_table`.
+        window_s: length of a replay, s. cutoff_hz: cutoff of the torque fit's low-pass.
     """
 
     pictures: Mapping[str, Path]
@@ -82,8 +82,8 @@ def identification_page(
     """Write figures, report.md, report.html, base_parameters.csv, torque.npz and recording.rrd, on validation motion.
 
     Args:
-        run: of the identification. nominal: model before it. found: its result. validation: held-out motion.
-        summary: content of summary.json. window_s: length of a replay, s. cutoff_hz: of the torque fit's low-pass.
+        run: run of the identification. nominal: nominal model. found: result. validation: held-out motion.
+        summary: content of summary.json. window_s: replay length, s. cutoff_hz: cutoff of the torque fit's low-pass.
         more: further sections {heading: items}, placed after the prediction errors.
     """
     robot, shown = found.space.robot, spread(validation, SCORED_S, SCORED_EACH_S)

@@ -1,4 +1,4 @@
-"""Tables I to IV of the paper for the identified arm, other parameters, and the comparison of friction families."""
+"""Build Tables I to IV of the paper for the identified arm, and tables of other parameters and friction families."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -44,7 +44,7 @@ def offset_table(robot: Robot, found: IdentificationResult) -> list[Item]:
 
 
 def breakaway_table(robot: Robot, nominal: Dynamics, found: IdentificationResult, commanded: bool) -> list[Item]:
-    """Return Table II: breakaway torques, as far as the data show them."""
+    """Return Table II: breakaway torques, and whether ramps or a search in the recording determined them."""
     d = found.dynamics
     if d.family.held is not None:
         return _presliding(robot, found, d.family.held)
@@ -76,7 +76,7 @@ def breakaway_table(robot: Robot, nominal: Dynamics, found: IdentificationResult
 
 
 def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.ndarray], np.ndarray]) -> list[Item]:
-    """Return Table II of a presliding family: the largest torque against which it keeps a joint at rest."""
+    """Return Table II for a presliding family: the largest torque at which its bristles hold a joint at rest."""
     space = found.space
     low, high = np.quantile(held(space.dynamics(found.found.samples).phi), [0.025, 0.975], axis=0)
     old, new = held(space.dynamics(space.start).phi), held(found.dynamics.phi)
@@ -89,7 +89,7 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
 
 
 def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
-    """Return the base parameters, a row per link; each is in the column of the first parameter that it combines."""
+    """Return the base parameters, a row per link; a combination is in the column of its first parameter."""
     columns: dict[str, list[str]] = {}
     rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
     for first, row in zip(base["parameter"], rows.tolist(), strict=True):
@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return a column of `get`; a cell is identifiable if all parameters of the link in `blocks` are."""
+        """Return a column with `get` per link; a value is identifiable if all its parameters in `blocks` are."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]
@@ -129,7 +129,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     if full:
         columns = {"mass, kg": cells(lambda x: x.mass, LINK[:1])}
         for k, axis in enumerate("xyz"):
-            # by row k of the upper triangular factor, the centre depends on the translation t_k and later ones
+            # the factor is upper triangular: coordinate k of the centre depends on t_k and later translations
             columns[f"centre {axis}, mm"] = cells(partial(_centre, k), LINK[7 + k :])
         words = (
             "Mass and centre of mass in the link's frame, old → new. A value is identifiable (no ?) if all its "

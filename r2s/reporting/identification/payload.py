@@ -1,4 +1,4 @@
-"""Report of an identified payload: tables, and the torque of the loaded arm, predicted with and without it."""
+"""Report an identified payload: tables, and the loaded arm's torque, predicted with and without the payload."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ FINE = "{:.4g}"
 
 
 def payload_table(found: PayloadEstimate) -> pd.DataFrame:
-    """Return a row per parameter of the payload: value, 95 % interval, whether the recording determines it."""
+    """Return a row per parameter of the payload: value, 95 % interval, whether the data determine the parameter."""
     cells = {}
     names = {"mass": ["mass, kg"], "centre": [f"centre {k}, m" for k in "xyz"]}
     names["inertia"] = [f"inertia {k}, kg m²" for k in ELEMENTS]

@@ -1,4 +1,4 @@
-"""Tables of an identification from several recordings, and of the drift since an earlier one."""
+"""Build tables of an identification from several recordings, and of the drift since an earlier identification."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ CONTRIBUTIONS = (
     "RMSE: torque of the fit to all training recordings, mean over joints; left out: of a fit to the others. The "
     "last column tells what a recording's information adds: how much wider intervals would be without it."
 )
-NARROWER = 1.02  # least ratio of two widths for which an interval counts as narrower
+NARROWER = 1.02  # a recording narrows an interval if the ratio of the widths without and with it is at least this
 
 
 def contribution_table(parts: Sequence[Contribution], names: Sequence[str]) -> pd.DataFrame:
@@ -36,7 +36,7 @@ def _narrower(p: Contribution, names: Sequence[str]) -> str:
 
 
 def contribution_entry(parts: Sequence[Contribution], names: Sequence[str]) -> dict[str, Any]:
-    """Return the entry of summary.json about the recordings."""
+    """Return the entry of summary.json about the contributions of the recordings."""
     out = {}
     for p in parts:
         own: dict[str, Any] = {

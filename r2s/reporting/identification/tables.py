@@ -1,4 +1,4 @@
-"""Tables of an identification for the terminal: parameters with intervals, links, prediction errors."""
+"""Build the tables of an identification for the terminal: parameters with intervals, links, prediction errors."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,7 +15,7 @@ from r2s.physics.robot import Robot
 from r2s.reporting.identification.values import SHORT, Value, of_whole_arm, per_joint, values
 from r2s.reporting.tables import number, print_table
 
-MOST = 7  # joints side by side in a terminal of 100 columns
+MOST = 7  # largest number of joints side by side in a terminal of 100 columns
 
 
 def identification_tables(robot: Robot, found: IdentificationResult, summary: Mapping) -> dict[str, pd.DataFrame]:
@@ -43,7 +43,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
 def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
     """Return the heading of a parameter's row and a cell per joint: value, ± half of its interval, nominal value.
 
-    If all joints share the nominal value, only the heading has it.
+    If the nominal value of all joints is the same, only the heading shows it.
     """
     unit = units()[block]
     if unit == "rad":

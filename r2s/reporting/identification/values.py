@@ -1,4 +1,4 @@
-"""Identified parameters as table cells: nominal → identified, 95 % interval, identifiability."""
+"""Format identified parameters as table cells: nominal → identified, 95 % interval, identifiability."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class Value(NamedTuple):
     fixed: bool = False
 
     def times(self, factor: float) -> "Value":
-        """Return the value in another unit: numbers multiplied by `factor`."""
+        """Return the value in another unit: all numbers are multiplied by `factor`."""
         old, new, low, high = (factor * x for x in self[:4])
         return Value(old, new, low, high, self.identifiable, self.kept, self.fixed)
 
@@ -62,14 +62,14 @@ class Value(NamedTuple):
 
 
 def values(space: ParameterSpace, found: ParameterEstimate, block: str, kept: Sequence[str] = ()) -> list[Value]:
-    """Return the values of a block, per joint or link or one of the whole arm; kept: names of those kept nominal."""
+    """Return a block's values, one per joint or link or one for the whole arm. kept: parameters kept nominal."""
     marks = (np.isin(space.names, list(names)) for names in (kept, space.fixed))
     parts = (space.start, found.x, found.low, found.high, found.identifiable, *marks)
     return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]
 
 
 def of_whole_arm(space: ParameterSpace, found: ParameterEstimate, kept: Sequence[str] = ()) -> dict[str, Value]:
-    """Return {"delay, ms": Value, "payload_mass, kg": Value, ...} of the parameters of the whole arm."""
+    """Return {"delay, ms": Value, "payload_mass, kg": Value, ...} for the parameters of the whole arm."""
     out = {}
     for block in (b for b in space.blocks if b in WHOLE_ARM):
         value = values(space, found, block, kept)[0]
@@ -85,5 +85,5 @@ def named(block: str) -> str:
 
 
 def per_joint(robot: Robot, columns: Mapping[str, Sequence[str]], index: str = "joint") -> pd.DataFrame:
-    """Return a table with a row per joint or link."""
+    """Return `columns` as a table with a row per joint or link, numbered from 1."""
     return pd.DataFrame(dict(columns), index=pd.Index([str(j + 1) for j in range(robot.n)], name=index))

@@ -1,4 +1,4 @@
-"""Tables of the verdict on a recording before the fit: checks, and expected widths of the intervals."""
+"""Build tables of the verdict on a recording before the fit: checks, and expected widths of the intervals."""
 
 from typing import Protocol
 
@@ -17,7 +17,7 @@ LEGEND = f"?: wider than {2 / SHARPER:g} standard deviations of the prior; prior
 
 
 class Widths(Protocol):
-    """Expected interval widths: `ExpectedWidths` of a recording or `PlannedWidths` of a motion; arrays are (P,)."""
+    """Expected interval widths of P parameters: `ExpectedWidths` of a recording or `PlannedWidths` of a motion."""
 
     @property
     def space(self) -> ParameterSpace: ...  # noqa: D102
@@ -36,7 +36,7 @@ def verdict_table(verdict: Verdict) -> pd.DataFrame:
 
 
 def width_table(expected: Widths, n: int) -> pd.DataFrame:
-    """Return a row per parameter and a column per joint or link; the first also has parameters of the whole arm."""
+    """Return a row per parameter and a column per joint or link; whole-arm parameters are in the first column."""
     space, unit, rows = expected.space, units(), {}
     for block in space.blocks:
         parts = (space.block(x, block) for x in (expected.width, expected.share, expected.identifiable))

@@ -1,4 +1,4 @@
-"""Whiteness test of the torque residual: comparison with white noise that passed the same filter."""
+"""Test the whiteness of the torque residual: compare it with white noise that passed the same filter."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -24,7 +24,7 @@ def whiteness_figure(
     """Draw the autocorrelation of torque residuals {label: (T, n) Nm} over t (T,) s.
 
     Args:
-        path: of the PNG. t, error: residuals. cutoff_hz: of the zero-phase low-pass. block_s: s, bootstrap block.
+        path: path of the PNG. cutoff_hz: cutoff of the zero-phase low-pass. block_s: length of a bootstrap block, s.
     """
     colour = colours(error)
     lags, white, band = _filtered_white(t, cutoff_hz)
@@ -42,7 +42,7 @@ def whiteness_figure(
 
 
 def whiteness_table(t: np.ndarray, error: np.ndarray, cutoff_hz: float) -> pd.DataFrame:
-    """Return mean and correlation of the torque residual (T, n) Nm over t (T,) s, a row per joint."""
+    """Return a row per joint: mean, standard deviation and correlation of the residual (T, n) Nm over t (T,) s."""
     lags, white, band = _filtered_white(t, cutoff_hz)
     far = lags > 2 / cutoff_hz
     rows = []
@@ -72,9 +72,9 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lags (L,) s up to `LAGS_S`, autocorrelation (L,) of filtered white noise, half of its 95 % band (L,).
+    """Return lags up to `LAGS_S`, s, autocorrelation of filtered white noise, half width of its 95 % band, (L,) each.
 
-    The filter is that of `Recording.smooth`. Sigma is Bartlett's for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
+    The filter is `Recording.smooth`. The band follows Bartlett for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
     """
     step = float(np.median(np.diff(t)))
     edges = np.array([0, *without_pauses(t)[1], len(t)])

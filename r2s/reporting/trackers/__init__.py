@@ -1,1 +1,1 @@
-"""Trackers show a run outside its folder while it is running; async_tracker.py calls them."""
+"""Show a run in other tools while it is running: async_tracker.py calls a tracker for each tool."""

@@ -1,6 +1,6 @@
 """Run each tracker in a thread of its own, so that no tracker can delay or end a run.
 
-A tracker that fails prints one warning and gets no more calls.
+If a tracker fails, r2s prints one warning and does not call it again.
 """
 
 import math
@@ -14,13 +14,13 @@ from typing import Any
 
 from r2s.reporting.trackers.tracker import Tracked, Tracker, flat
 
-MOST_WAITING = 10_000  # rows that wait for a slow tracker: some megabytes
+MOST_WAITING = 10_000  # largest number of rows that wait for a slow tracker: some megabytes
 LAST_S = 60.0  # s that a run waits for each tracker at its end
 FILES = ("recording.rrd", "report.html", "report.md", "parameters.yaml", "policy.onnx", "measures.json")
 
 
 class AsyncTracker:
-    """A tracker in its thread; `send` returns at once."""
+    """A tracker and the thread that calls it; `send` returns at once."""
 
     def __init__(self, name: str, tracker: Tracker):
         self._name, self._tracker, self._works = name, tracker, True
@@ -29,14 +29,14 @@ class AsyncTracker:
         self._thread.start()
 
     def send(self, call: Callable[[Tracker], None] | None) -> None:
-        """Queue a call; None ends the thread."""
+        """Queue a call of the tracker; None ends the thread."""
         try:
             self._queue.put_nowait(call)
         except Full:
             self._give_up(f"{MOST_WAITING} rows are waiting")
 
     def join(self, seconds: float) -> None:
-        """Wait for the queued calls, at most `seconds`, then give up."""
+        """Wait at most `seconds` s for the queued calls; then warn and drop the remaining calls."""
         self._thread.join(seconds)
         if self._thread.is_alive():
             self._give_up(f"not finished {seconds:.0f} s after the run")
@@ -69,7 +69,7 @@ class Trackers:
             one.send(call)
 
     def log(self, table: str, row: Mapping[str, Any]) -> None:
-        """Send a row of a table."""
+        """Send a row of a table to all trackers."""
         step = int(row.get("env_steps", self._rows[table]))
         self._rows[table] += 1
         numbers = {k: v for k, v in finite(row).items() if k != "env_steps"}
@@ -81,7 +81,7 @@ class Trackers:
         self._send(lambda tracker: tracker.summary(numbers))
 
     def finish(self, status: str) -> None:
-        """Send figures and files, and wait for the trackers, at most `LAST_S` each."""
+        """Send figures and files, and wait at most `LAST_S` for each tracker."""
         pictures = sorted((self._run.folder / "figures").glob("*.png"))
         files = [path for name in FILES if (path := Path(self._run.folder / name)).is_file()]
         self._send(lambda tracker: tracker.finish(status, pictures, files))

@@ -1,7 +1,7 @@
-"""tracker=mlflow: an SQLite store beside the run folders, or a server.
+"""Implement tracker=mlflow: write to an SQLite store next to the run folders, or to a server.
 
-`mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows it, in an environment with all of MLflow: the extra
-r2s[trackers] installs the writing part only.
+`mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows the store. This command needs the complete MLflow; the
+extra r2s[trackers] installs only the part that writes.
 """
 
 import logging
@@ -41,7 +41,7 @@ class Mlflow(LoggerTracker):
     """A run of an MLflow experiment.
 
     Args:
-        uri: of the store, sqlite:///FILE or http://HOST:PORT. experiment: name of the experiment.
+        uri: address of the store, sqlite:///FILE or http://HOST:PORT. experiment: name of the experiment.
     """
 
     def __init__(self, uri: str, experiment: str = "r2s"):
@@ -65,7 +65,7 @@ class Mlflow(LoggerTracker):
             store = Path(self._uri.removeprefix(SQLITE)).absolute()
             store.parent.mkdir(parents=True, exist_ok=True)
             lock, artifacts = FileLock(f"{store}.lock"), str(store.parent / "mlartifacts")
-        with lock:  # jobs of a sweep would create the tables at the same time
+        with lock:  # otherwise jobs of a sweep create the tables at the same time
             start = {"run_id": known} if known else {"run_name": run.name, "tags": tags}
             self._logger = Logger(self._experiment, self._uri, artifact_location=artifacts, start=start)
         run.keep("mlflow", self._logger.experiment.info.run_id)

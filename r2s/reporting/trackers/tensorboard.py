@@ -1,4 +1,4 @@
-"""tracker=tensorboard: event files in the run folder; `tensorboard --logdir runs` shows all runs."""
+"""Implement tracker=tensorboard: event files in the run folder; `tensorboard --logdir runs` shows all runs."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Tensorboard(LoggerTracker):
-    """A run as scalars, settings and figures; other files are only listed, because event files cannot store files."""
+    """A run as scalars, settings and figures; event files cannot store other files, so these are only listed."""
 
     def __init__(self) -> None:
         optional_import("tensorboard", "tracker=tensorboard", "trackers")
@@ -56,7 +56,7 @@ class Tensorboard(LoggerTracker):
             self._logger.experiment.file_writer.add_summary(summary)
 
     def _hide_from(self, step: int) -> None:
-        """Hide the rows of the stopped run from this step on, because the resumed run writes them again."""
+        """Hide the stopped run's rows from `step` on, because the resumed run writes these rows again."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         begin = Event(step=step, session_log=SessionLog(status=SessionLog.START))

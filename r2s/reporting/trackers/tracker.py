@@ -1,4 +1,4 @@
-"""The tracker interface. A tracker of your own is a class with this interface and a file in conf/tracker."""
+"""Define the tracker interface. To add a tracker, write a class with this interface and a file in conf/tracker."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,8 +11,8 @@ from r2s.files import write_json
 from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
-FILE = "trackers.json"  # in the run folder: ids that a resumed run continues
-WRITING = Lock()  # trackers run in threads of their own and share FILE
+FILE = "trackers.json"  # file in the run folder with the trackers' run ids, which a resumed run continues
+WRITING = Lock()  # each tracker runs in its thread, and all of them write FILE
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Tracked:
     """A run that trackers show.
 
     Attributes:
-        folder: runs/<stage>/<name>. stage: of the run. group: the sweep that it belongs to, or None.
+        folder: runs/<stage>/<name>. stage: the run's stage. group: the run's sweep, or None.
         config: composed config as dicts. meta: content of meta.json: git commit, versions, machine.
         resumed: whether the run continues a stopped one.
     """
@@ -46,25 +46,25 @@ class Tracked:
 
     @property
     def measures(self) -> MeasureTable:
-        """The measures of the run's task; trainings and transfers write them to the folder before their first row."""
+        """Measures of the run's task; trainings and transfers write these to the folder before their first row."""
         return measures_of(self.folder)
 
     def kept(self, key: str) -> str | None:
-        """Return what `keep` stored before the run was stopped, or None."""
+        """Return the value that `keep` stored for `key` before the run was stopped, or None."""
         path = self.folder / FILE
         return json.loads(path.read_text()).get(key) if path.is_file() else None
 
     def keep(self, key: str, value: str | None) -> None:
-        """Store `value` in the run folder for `kept` of the resumed run."""
+        """Store `value` for `key` in the run folder; a resumed run reads it with `kept`."""
         path = self.folder / FILE
         with WRITING:
             write_json(path, (json.loads(path.read_text()) if path.is_file() else {}) | {key: value})
 
 
 class Tracker(Protocol):
-    """Shows a run in another tool. Hydra creates it before the run folder. One thread makes all calls, in order.
+    """Shows a run in another tool. Hydra creates a tracker before the run folder. One thread calls it, in order.
 
-    After an exception the tracker gets no more calls; the run prints one warning and continues.
+    After an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
     """
 
     def start(self, run: Tracked) -> None:
@@ -81,7 +81,7 @@ class Tracker(Protocol):
 
 
 class LoggerTracker:
-    """A tracker that logs rows and summary with a logger of TorchRL; `start` sets this as `_logger`."""
+    """A tracker that logs rows and summary with a TorchRL logger; a subclass sets `_logger` in its method `start`."""
 
     _logger: Any
 
@@ -95,7 +95,7 @@ class LoggerTracker:
 
 
 def flat(node: Any, prefix: str = "", between: str = ".") -> Iterator[tuple[str, Any]]:
-    """Yield ("a.b", value) of nested dicts."""
+    """Yield ("a.b", value) for each value in nested dicts, with `between` instead of the dot."""
     for key, value in node.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{key}{between}", between)

@@ -1,4 +1,4 @@
-"""tracker=trackio: an SQLite file beside the run folders; `TRACKIO_DIR=runs/trackio trackio show` shows it."""
+"""Implement tracker=trackio, SQLite files by the run folders; `TRACKIO_DIR=runs/trackio trackio show` shows them."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ class Trackio:
     """A run in a Trackio project.
 
     Args:
-        folder: contains the databases, one per project; the environment variable TRACKIO_DIR overrides it.
+        folder: folder of the databases, one per project; the environment variable TRACKIO_DIR overrides it.
         project: name of the project.
     """
 

@@ -1,4 +1,4 @@
-"""tracker=wandb: Weights & Biases, offline in the run folder; upload: `wandb sync runs/*/*/wandb/offline-run-*`."""
+"""Implement tracker=wandb, offline in the run folder; `wandb sync runs/*/*/wandb/offline-run-*` uploads the runs."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ class Wandb(LoggerTracker):
     """A run in a W&B project.
 
     Args:
-        project, entity: names in W&B; entity None: your own. offline: store the run on this computer only.
+        project, entity: names in W&B; entity None: your account. offline: store the run on this computer only.
     """
 
     def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):

@@ -1,1 +1,1 @@
-"""The rerun recording: its data, its layout, and the viewer's process."""
+"""Write the rerun recording (data and layout), and run the rerun viewer."""

@@ -22,7 +22,7 @@ WORST_M = 0.01  # m, the trail on a path is red from this error on
 
 
 class _Arm(NamedTuple):
-    """An arm in the rerun recording; `frames` are the rows of each episode that are logged."""
+    """An arm in the rerun recording; `frames` are the logged rows, `starts` (s) the start times of the episodes."""
 
     stream: rr.RecordingStream
     base: str
@@ -33,12 +33,12 @@ class _Arm(NamedTuple):
     colour: str
 
     def clocks(self) -> list[np.ndarray]:
-        """Return the time of the logged rows of each episode, s."""
+        """Return, for each episode, the times of its logged rows on the timeline, s."""
         parts = zip(self.starts, self.episodes, self.frames, strict=False)
         return [start + e.t[f] - e.t[0] for start, e, f in parts]
 
     def send(self, name: str, style: rr.AsComponents, columns: Any, per_episode: bool) -> None:
-        """Log `columns`, which change at every logged row or, if `per_episode`, once per episode."""
+        """Log `columns`, which have a value per logged row or, if `per_episode`, a value per episode."""
         times = self.starts[: len(self.episodes)] if per_episode else np.concatenate(self.clocks())
         path = f"{self.base}/{name}"
         self.stream.log(path, style, static=True)
@@ -48,7 +48,7 @@ class _Arm(NamedTuple):
 def log_arms(
     stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Sequence[Episode]], error: Measure
 ) -> None:
-    """Log an arm per label side by side; `error` sets the scale of the distance plot."""
+    """Log the arms of all labels side by side; `error` sets the scale of the distance plot."""
     stream.log("arms", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     model, palette, starts = robot.model(gravity=False), colours(episodes), starts_of(episodes)
     for i, (label, sequence) in enumerate(episodes.items()):
@@ -80,7 +80,7 @@ def log_moving_robot(
 
 
 def _plots(arm: _Arm, label: str, error: Measure) -> None:
-    """Log the error and the torque of each joint; a nan after each episode interrupts the line."""
+    """Log the error and each joint's torque as lines; a nan after each episode interrupts a line."""
     ends = [np.append(clock, clock[-1] + 1 / FRAMES_HZ) for clock in arm.clocks()]
     index = [rr.TimeColumn("time", duration=np.concatenate(ends))]
 
@@ -123,7 +123,7 @@ def _boxes(arm: _Arm, up: np.ndarray) -> None:
 
 
 def _paths(arm: _Arm) -> None:
-    """Log the path of each episode, its current point, and the trail, coloured by its error."""
+    """Log each episode's path, the current goal on the path, and the end effector's trail, coloured by the error."""
     pairs = list(zip(arm.episodes, arm.frames, strict=True))
     grey = rr.LineStrips3D.from_fields(colors=[150, 150, 150], radii=0.0015)
     arm.send("path", grey, rr.LineStrips3D.columns(strips=[e.goal for e in arm.episodes]), per_episode=True)
@@ -154,7 +154,7 @@ def _shades(error: np.ndarray) -> np.ndarray:
 
 
 def _shown_geoms(model: mujoco.MjModel) -> np.ndarray:
-    """Return the geoms that MuJoCo's viewer shows (groups 0-2), without planes; if none is left, all geoms."""
+    """Return the geoms that MuJoCo's viewer shows (groups 0-2), without planes; if there are none, all geoms."""
     shown = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
     return shown if len(shown) else np.arange(model.ngeom)
 
@@ -173,7 +173,7 @@ def _height(model: mujoco.MjModel) -> float:
 
 
 def _poses(model: mujoco.MjModel, q: np.ndarray) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return {body: ((T, 3) m, (T, 4) quaternion x y z w)} in the base frame at q (T, n)."""
+    """Return {body: (position (T, 3) m, quaternion (T, 4) x y z w)} in the base frame at q (T, n) rad."""
     data = mujoco.MjData(model)
     position, quaternion = np.empty((len(q), model.nbody, 3)), np.empty((len(q), model.nbody, 4))
     for k, angles in enumerate(q):
@@ -184,7 +184,7 @@ def _poses(model: mujoco.MjModel, q: np.ndarray) -> dict[int, tuple[np.ndarray, 
 
 
 def _shapes(stream: rr.RecordingStream, model: mujoco.MjModel, body: int, path: str, colour: str) -> None:
-    """Log the geoms of one link in its frame; dark geoms (joints) take the arm's colour."""
+    """Log the geoms of one link in the link's frame; dark geoms (joints) get the arm's colour."""
     for geom in _shown_geoms(model)[model.geom_bodyid[_shown_geoms(model)] == body]:
         own = 255 * model.geom_rgba[geom, :3]
         own = rgb(colour) if own.mean() < 100 else own
@@ -198,7 +198,7 @@ def _shapes(stream: rr.RecordingStream, model: mujoco.MjModel, body: int, path: 
 
 
 def _shape(model: mujoco.MjModel, geom: int, colour: np.ndarray) -> rr.AsComponents | None:
-    """Return a geom as a shape of rerun in the geom's frame, None for a type without one (plane, height field)."""
+    """Return rerun's shape for a geom, in the geom's frame; None if rerun has no shape (plane, height field)."""
     radius, half, _ = size = model.geom_size[geom]
     kind = mujoco.mjtGeom
     solid: dict[str, Any] = {"colors": colour, "fill_mode": rr.components.FillMode.Solid}

@@ -1,4 +1,4 @@
-"""Content of a rerun recording: episodes, torques, learning curves, figures."""
+"""Define the content of a rerun recording: episodes, torques, learning curves, figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ class Episode:
     """One episode of one arm; positions are in the arm's base frame.
 
     Attributes:
-        t: (T,) s. q: (T, n) rad. ee: (T, 3) m. goal: (3,) m, or a path (T, 3) m. tau: (T, n) Nm, commanded.
+        t: (T,) s. q: (T, n) rad. ee: end effector (T, 3) m. goal: (3,) or path (T, 3), m. tau: (T, n) Nm, commanded.
         box: (T, 11), the box that the arm pushes, see `Task.boxes`; None: no box.
     """
 
@@ -51,7 +51,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Overlay:
-    """Measured (T, n) Nm and predicted {label: (T, n) Nm} torque over t (T,) s."""
+    """Torque over time t (T,) s: measured (T, n) Nm, and predicted {label: (T, n) Nm}."""
 
     t: np.ndarray
     measured: np.ndarray
@@ -69,12 +69,12 @@ class Content:
     """Content of a rerun recording; its layout has tabs only for the parts that are given.
 
     Attributes:
-        measures: of the task, for `episodes` and `curves`.
+        measures: the task's measures, needed for `episodes` and `curves`.
         episodes: {label: episodes}, one arm per label; the k-th episodes of all arms start together.
         overlays: {label: Overlay}; each gets a tab of torque plots.
-        curves: {run: evaluations.csv}, which share a tab.
-        figures: {name: PNG}; each gets a tab, but "learning" is in the tab of the curves.
-        torque: (n,) Nm, limits drawn beside the commanded torque.
+        curves: {run: evaluations.csv}; all curves share one tab.
+        figures: {name: PNG}; each has a tab, except that "learning" is in the tab of the curves.
+        torque: (n,) Nm, limits that the plots of commanded torque show.
     """
 
     measures: MeasureTable | None = None
@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """Measures of the learning figure and of comparisons that at least one run has."""
+        """Measures that the task shows in learning curves or comparisons and that at least one run has."""
         table = self.measures
         if table is None:
             return []
@@ -95,7 +95,7 @@ class Content:
 
 
 def external_overlay(r: Recording) -> dict[str, Overlay]:
-    """Return {label: external torque, and 1 where the arm reported contact}; empty without external torque."""
+    """Return an overlay of external torque and reported contact (0 or 1); {} if there is no external torque."""
     torque = r.signals.get("tau_ext_hat_filtered")
     if torque is None or not torque.any():
         return {}
@@ -110,7 +110,7 @@ def first(e: "Episodes") -> list[Episode]:
 
 
 def saved_episodes(run: Path) -> dict[str, list[Episode]]:
-    """Return {simulator or arm: its first episodes} of a run of stage=transfer; empty for other runs."""
+    """Return {simulator or arm: its first episodes} from a run of stage=transfer; {} for other runs."""
     from r2s.tasks.rollout import Episodes
 
     out = {}

@@ -1,4 +1,4 @@
-"""Layout and lines of a rerun recording: tabs of arms, of learning curves, of each torque overlay and figure."""
+"""Lay out a rerun recording: tabs for the arms, the learning curves, each torque overlay and each figure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -14,12 +14,12 @@ from r2s.tasks.measures import Measure, MeasureTable
 PAUSE = 0.5  # s between two episodes
 SPACING = 0.95  # m between two arms: beyond a Panda's reach of 0.855 m
 LEARNING = "learning"
-OVERLAY_OPENS = 15.0  # s of an overlay that are shown at first; more would look like a solid band
+OVERLAY_OPENS = 15.0  # s of an overlay that a plot shows when it opens; more would look like a solid band
 LINE = 1.6  # points, width of a line
 
 
 def entity(*parts: str) -> str:
-    """Return the path of an entity."""
+    """Return the path of a rerun entity with these parts."""
     return rr.new_entity_path(list(parts))
 
 
@@ -43,7 +43,7 @@ def log_series(
 
 
 def starts_of(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
-    """Return (K + 1,) s: the start of every k-th episode on the timeline, and the end of the last one."""
+    """Return times (K + 1,) s: the common start of all arms' k-th episodes, and the end of the last episode."""
     count = max((len(sequence) for sequence in episodes.values()), default=0)
     longest = [max(s[k].duration for s in episodes.values() if k < len(s)) + PAUSE for k in range(count)]
     return np.concatenate([[0.0], np.cumsum(longest)])
@@ -91,7 +91,7 @@ def _learning_tab(curves: Iterable[Measure], pictured: bool) -> rrb.Container:
 
 
 def _arms_tab(count: int, joints: Sequence[str], seconds: float, measures: MeasureTable) -> rrb.Container:
-    """Return a tab with the 3D view beside the plots or, with four arms or more, above them."""
+    """Return a tab with the 3D view left of the plots or, with four arms or more, above the plots."""
     width = SPACING * count
     away = 0.3 + 0.4 * width if count > 3 else max(1.5, 0.4 + 0.85 * width)
     eye = rrb.EyeControls3D(position=[away, -0.2 * away, 0.5 + 0.3 * away], look_target=[0.15, 0, 0.48])
@@ -109,7 +109,7 @@ def _arms_tab(count: int, joints: Sequence[str], seconds: float, measures: Measu
 def _plots(
     origins: Mapping[str, str], corner: rrb.Corner2D = rrb.Corner2D.RightTop, until: float | None = None
 ) -> list[rrb.View]:
-    """Return a plot per {title: origin}; the first has the legend."""
+    """Return a plot for each title and origin (an entity's path); only the first plot has a legend."""
     corners = [corner, *[None] * len(origins)]
     return [_plot(*origin, legend, until=until) for origin, legend in zip(origins.items(), corners, strict=False)]
 

@@ -1,4 +1,4 @@
-"""`r2s look`: show the recording.rrd of one run, or several runs in one rerun recording."""
+"""Show runs in the rerun viewer for `r2s look`: recording.rrd of a run, or several runs in one rerun recording."""
 
 import os
 import re
@@ -73,7 +73,7 @@ def show_in_browser(recordings: Sequence[Path], port: int) -> None:
     """Serve the viewer to browsers on this computer, at `port`, until Ctrl-C.
 
     Raises:
-        UserError: one of the two ports is in use, or the viewer failed.
+        UserError: `port` or `port` + 1 is in use, or the viewer failed.
     """
     if taken := [p for p in (port, port + 1) if _is_open(p)]:
         raise UserError(f"look: port {taken[0]} is in use; try --port {port + 2}")
@@ -97,13 +97,13 @@ def _is_open(port: int) -> bool:
 
 @contextmanager
 def _viewer(words: Iterable[str]) -> Iterator[subprocess.Popen]:
-    """Start the viewer and wait for its end; an interrupt or SIGTERM of this process ends it too.
+    """Start the viewer and wait until it ends; an interrupt or SIGTERM of this process also ends the viewer.
 
     Raises:
         UserError: the viewer failed.
     """
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    # its own session: `python -m rerun` starts a child process that a signal to it alone would not reach
+    # in a new session: a signal to `python -m rerun` alone would not reach the child process that it starts
     process = subprocess.Popen([sys.executable, "-m", "rerun", *words], start_new_session=True)
     try:
         yield process

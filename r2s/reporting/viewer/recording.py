@@ -1,4 +1,4 @@
-"""The rerun recording (.rrd): arms side by side, torques, learning curves and figures.
+"""Write the rerun recording (.rrd): arms side by side, torques, learning curves and figures.
 
 All content is in one file, because two rerun recordings share no timeline. Episodes and torque overlays are on the
 timeline `time`, learning curves on `env_steps` and `wall_clock`. `rerun FILE` opens the file and plays the episodes.
@@ -22,7 +22,7 @@ from r2s.reporting.viewer.data import Content, Overlay
 from r2s.reporting.viewer.layout import LEARNING, blueprint, entity, log_series, starts_of
 from r2s.tasks.measures import Measure
 
-OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times their low-pass
+OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times the low-pass of the torque
 
 
 def write_recording(path: str | os.PathLike, robot: Robot, content: Content) -> Path:
@@ -57,7 +57,7 @@ def _limits(stream: rr.RecordingStream, torque: np.ndarray, seconds: float) -> N
 
 
 def _overlay(stream: rr.RecordingStream, label: str, overlay: Overlay) -> None:
-    """Log one plot per joint; the viewer draws lines in order of their paths, so the broad measured one is first."""
+    """Log one plot per joint. The viewer draws lines in the order of paths; the broad measured line is first."""
     clock, _ = without_pauses(overlay.t)
     rows = at_rate(clock, OVERLAY_HZ)
     index = [rr.TimeColumn("time", duration=clock[rows])]
