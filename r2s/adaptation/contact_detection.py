@@ -10,7 +10,7 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def detect(threshold, floor, state):
-    """Test the force against its covariance. A contact only ends in motion, because friction hides forces at rest."""
+    """Test the force against its covariance. Release is detected in motion only: at rest, friction hides forces."""
     x, P, contact = state.x, state.P, state.contact
     square = floor**2
     a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]

@@ -45,7 +45,7 @@ class Estimate:
 
 
 class Estimator:
-    """Recursive estimate of one arm, cycle by cycle.
+    """Recursive estimator of one arm's payload, friction and offsets, cycle by cycle.
 
     Attributes:
         changes: s, times of detected payload changes.

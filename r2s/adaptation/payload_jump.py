@@ -56,7 +56,7 @@ def update_onsets(filter, residual, j, v, S):
 
 @njit(cache=True, error_model="numpy")
 def detect(filter, noise):
-    """Write the log odds of a jump; for one onset these are d (C + P0^-1)^-1 d / 2 - log(det(1 + P0 C)) / 2."""
+    """Write the log odds of a jump; per onset (C, d): d (C + P0^-1)^-1 d / 2 - log(det(1 + P0 C)) / 2, P0: prior."""
     best, at, mean, total = -np.inf, -1, -np.inf, 0.0
     A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
     logs = np.empty(ONSETS)

@@ -111,7 +111,7 @@ class PushLimit:
         return out, True
 
     def stop(self, held: np.ndarray, cycles: int) -> tuple[np.ndarray, float]:
-        """Return the target torque (n,) Nm for a cycle of a stop, and the share of the allowed speeds that it needs.
+        """Return the target torque (n,) Nm for a cycle of a stop, and the factor on all allowed speeds that it needs.
 
         Args:
             held: torque (n,) Nm that the driver adds to the target. cycles: number of cycles since the stop began.

@@ -2,7 +2,7 @@
 
 A plan has a row per control step: the point of the path on the nominal plane, the plane's normal, the depth of the
 target below the point, the desired force, the path's velocity, the start posture, and the controller's setpoint. This
-module imports no part of r2s that a bundle lacks: `r2s export` copies it into r2s_runtime.py of the bundle.
+module imports only what a bundle contains: `r2s export` copies it into r2s_runtime.py of the bundle.
 """
 
 from typing import Any

@@ -131,5 +131,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return `sizes` for the largest torque of each joint: its limit, or the recorded torque where that is larger."""
+    """Return `sizes` for each joint's torque limit, or its largest recorded torque where that is larger."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

@@ -1,8 +1,8 @@
 """Evaluation in simulation: 200 deterministic episodes, the same for every policy.
 
-There are two sets of goals, starts and dynamics. Set SELECTION selects the best policy during a training. Set REPORT
-yields the reported measures and selects no policy. But settings of conf/algo and conf/reward were compared on REPORT,
-so benchmarks/minutes.py uses a third set.
+There are two sets of goals, starts and dynamics. During a training, SELECTION chooses the best policy. REPORT yields
+the reported measures and selects no policy. But settings of conf/algo and conf/reward were compared on REPORT, so
+benchmarks/minutes.py uses a third set.
 """
 
 from collections.abc import Callable

@@ -32,7 +32,7 @@ class Fence(NamedTuple):
 
 
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return the number (E,) of the pair for which the driver would stop each motion q, dq (E, T, n), -1 for none.
+    """Return, per motion q, dq (E, T, n), the index (E,) of the pair at which the driver would stop it, -1: none.
 
     limits: (n, COLUMNS) from `filter_limits`.
     """

@@ -288,7 +288,7 @@ def make_controller(cfg, robot, task, dynamics):
 def open_run(cfg, overrides, inputs=(), parents=()):
     """Return the open run folder of this job, with its trackers started; a resumed run keeps its tracker group.
 
-    inputs: files that the job reads. parents: run folders that it uses. List only what the config does not name.
+    inputs: files that the job reads. parents: run folders that it uses. Both list only what the config does not name.
     """
     from omegaconf import OmegaConf
 

@@ -93,7 +93,7 @@ class Reward:
         return task.paper_weights
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> Any:
-        """Return the new factor after `env_steps` more steps, in which the terms had the means `seen` (k,)."""
+        """Return the factor for the next steps; the terms' means over the last `env_steps` are `seen` (k,)."""
         return factor
 
 

@@ -136,7 +136,7 @@ def _load_of(robot: Robot, s: Any) -> np.ndarray:
 
 
 def refuse(findings: Sequence[Finding], what: str) -> None:
-    """Raise UserError, with one line that lists all refused findings; do nothing if there are none."""
+    """Raise UserError, with one line that lists all findings that forbid motion; do nothing if there are none."""
     if wrong := [str(finding) for finding in findings if finding.refused]:
         raise UserError(f"{what}: {'; '.join(wrong)}")
 

@@ -27,7 +27,7 @@ IMPRATIO = 1000.0  # makes the impedance of friction 0.91
 def linearized(surface: Surface, load: float = LOAD) -> tuple[float, float, float]:
     """Return slope (N/m), damping (Ns/m) and depth (m) of the spring that is tangent to the force curve at `load` N.
 
-    The spring's force is 0 at `depth`, so the plane of the spring lies this much deeper than the surface.
+    The spring's force begins at `depth`, so its plane lies this much below the surface.
     """
     depth = float((load / surface.coefficient) ** (1.0 / surface.exponent))
     slope = load * float(surface.exponent) / depth

@@ -67,7 +67,7 @@ class Rows:
         return root / size, np.linalg.lstsq(root.T, size * b, rcond=None)[0]
 
     def best_arm(self, phi: np.ndarray) -> np.ndarray:
-        """Return the w (r,) that minimizes the sum of squares for a payload phi (10,)."""
+        """Return the arm's errors w (r,) that best explain the residual with a payload phi (10,)."""
         gain, constant = self._eliminated
         return gain @ phi + constant
 
