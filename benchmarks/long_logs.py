@@ -113,6 +113,8 @@ def main() -> None:
                 )
                 writer.start()
                 writer.join()
+                if writer.exitcode:
+                    sys.exit(f"the log of {minutes:g} min was not written: exit status {writer.exitcode}")
                 seconds, memory = identified(arm, torque, log)
                 rows.append({"torque": torque, "minutes": minutes, "s": round(seconds), "MB": round(memory)})
                 print(rows[-1], flush=True)

@@ -115,10 +115,8 @@ class SurfaceTask(TipTask):
         """
         Tip(robot)
         task = replace(self, model=InverseDynamics(robot, dynamics), speed_noise=self.noise_for(dynamics))
-        settings = {"torque_fraction": self.torque_fraction, "displacement": RESIDUAL_M} | {
-            "null_stiffness": NULL_STIFFNESS,
-            **self.own_settings,
-        }
+        settings: dict[str, Any] = {"torque_fraction": self.torque_fraction, "displacement": RESIDUAL_M}
+        settings |= {"null_stiffness": NULL_STIFFNESS} | self.own_settings
         own = cartesian_impedance(robot, task, dynamics, hybrid=True, **settings)
         task._check_force(own)
         return replace(task, own=own, parameters=own.parameters)
