@@ -123,7 +123,7 @@ class Recording:
     @property
     def stretches(self) -> list[slice]:
         """Slices of rows, one per trajectory, in the order of the log."""
-        edges = [0, *(np.flatnonzero(self.trajectory[1:] != self.trajectory[:-1]) + 1).tolist(), len(self.t)]
+        edges = [0, *(np.flatnonzero(np.diff(self.trajectory)) + 1).tolist(), len(self.t)]
         return [slice(start, stop) for start, stop in pairwise(edges)]
 
     @property
@@ -345,8 +345,6 @@ class Recording:
         return replace(self, trajectory=trajectory, signals=signals, **arrays)
 
     def _without_lone_rows(self) -> "Recording":
-        if all(s.stop - s.start > 1 for s in self.stretches):  # almost always; `select` numbered them without gaps
-            return self
         dense = np.unique(self.trajectory, return_inverse=True)[1]
         return self.rows(np.arange(len(self.t)), dense, drop_lone=True)
 

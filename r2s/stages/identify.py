@@ -6,7 +6,6 @@ from typing import Any
 
 from r2s.errors import UserError, check_number
 from r2s.files import located
-from r2s.recordings.parts import give_back
 from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
 from r2s.stages.contact import (
     calibrated_arm,
@@ -240,7 +239,6 @@ def fit_group(cfg, run, made, group, earlier, folder):
 
     found = run_identify(robot, nominal, train, made.searches, settings, ramps=made.ramps, report=report, memo=memo)
     progress.close()
-    give_back(train)
     for line in found.at_bounds:
         print(f"warning: {line}")
     how = {"window_s": settings.window_s, "cutoff_hz": settings.cutoff_hz, "nthread": cfg.threads}

@@ -17,7 +17,6 @@ from scipy.sparse import csr_array
 from r2s.identification.residuals.zero_phase import EDGE_S, cubic, too_short
 from r2s.physics.friction import PRESLIDING, presliding
 from r2s.physics.robot import SIM_DT
-from r2s.recordings.parts import concatenated
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 250  # rate at which torques are evaluated before averaging
@@ -120,7 +119,7 @@ class SlidingMotion:
         if len(parts) == 1:
             return parts[0]
         names = [f.name for f in fields(SlidingMotion) if f.name not in ("means", "encoder")]
-        arrays = {name: concatenated(parts, name) for name in names}
+        arrays = {name: np.concatenate([vars(m).pop(name) for m in parts]) for name in names}
         joints = list(zip(*(vars(m).pop("means") for m in parts), strict=True))
         means = [_block_diagonal(joints.pop(0)) for _ in range(len(joints))]
         return SlidingMotion(means=tuple(means), encoder=np.median([m.encoder for m in parts], axis=0), **arrays)

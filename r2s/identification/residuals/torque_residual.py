@@ -148,13 +148,7 @@ class TorqueResidual:
             friction = like.friction
         else:
             of = partial(self._friction, d)
-            if isinstance(m, SlidingMotion):  # in parts: intermediate results of an hour take 100 MB
-                full = np.empty_like(m.friction_dq)
-                for first in range(0, len(full), 16 * PART):
-                    full[first : first + 16 * PART] = of(slice(first, first + 16 * PART))
-                friction = m.filtered(full)
-            else:
-                friction = m.filtered(of) if isinstance(m, SmoothMotion) else m.filtered(of(slice(None)))
+            friction = m.filtered(of) if isinstance(m, SmoothMotion) else m.filtered(of(slice(None)))
         return _Known(standard, d.armature, torque, compensation, d.phi, friction)
 
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
@@ -298,7 +292,6 @@ def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any
     """Return the motion that `of` computes from a recording piece by piece, and the motion's rigid-body torque."""
     motions = [of(piece) for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
-    give_back(recording)
     joined = type(motions[0]).joined(motions)
     del motions
     give_back(recording)

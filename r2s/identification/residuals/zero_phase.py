@@ -11,7 +11,6 @@ from r2s.errors import UserError
 from r2s.physics.friction import PRESLIDING, presliding
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.lateness import Lateness
-from r2s.recordings.parts import concatenated
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
@@ -102,7 +101,7 @@ class SmoothMotion:
             return parts[0]
         names = ("t", "q", "dq", "ddq", "tau", "friction_dq", "bristle", "delayed")
         base = np.cumsum([0, *(len(m.friction_dq) for m in parts)]).tolist()
-        arrays = {name: concatenated(parts, name) for name in names}
+        arrays = {name: np.concatenate([vars(m).pop(name) for m in parts]) for name in names}
         spans = [range(b + s.start, b + s.stop, s.step) for b, m in zip(base, parts, strict=False) for s in m.spans]
         return SmoothMotion(kernel=parts[0].kernel, spans=tuple(spans), shift_s=parts[0].shift_s, **arrays)
 
