@@ -15,6 +15,7 @@ from r2s.identification.problem import Problem
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.search.levenberg_marquardt import normal_equations
 from r2s.identification.terms import search_space
+from r2s.physics.dynamics import with_family
 from r2s.recordings.recording import Recording
 
 RATE_HZ, SECONDS = 100.0, 12.0
@@ -101,6 +102,20 @@ def test_parts_are_the_whole(arm, wrong, clean, monkeypatch):  # noqa: F811
         both = [r.predict(wrong)[k] for r, k in ((cut, rows[near]), (whole, near))]
         assert near.mean() > 0.4
         assert np.median(np.abs(both[0] - both[1])) < 1e-3 * np.std(both[1])
+
+
+@pytest.mark.parametrize("slowest", [0.0, 0.02])
+def test_another_presliding_distance_changes_only_the_bristles(arm, wrong, clean, monkeypatch, slowest):  # noqa: F811
+    """A residual with another presliding distance equals one that is built with it, also in pieces."""
+    space = search_space(arm, with_family(wrong, "bristle"), BOUNDS, ["offset"], clean)
+    monkeypatch.setattr(torque_residual, "PIECE_S", 2.0)
+    distance = np.array([2e-3, 1e-3, 4e-3])
+    other = TorqueResidual(space, clean, slowest=slowest, presliding_rad=distance)
+    same = TorqueResidual(space, clean, slowest=slowest).with_presliding(clean, distance)
+    x = space.start[None]
+    np.testing.assert_array_equal(same(x), other(x))
+    np.testing.assert_array_equal(same.clusters, other.clusters)
+    assert not np.array_equal(other(x), TorqueResidual(space, clean, slowest=slowest)(x))
 
 
 def test_a_fit_needs_less_memory_than_a_jacobian(arm, wrong):  # noqa: F811

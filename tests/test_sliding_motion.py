@@ -26,7 +26,7 @@ def motion():
 
 def test_no_window_reaches_a_turn(motion):
     """Every weight is of an instant in which the joint is faster, and goes the way that it goes at the moment."""
-    for j, means in enumerate(motion.means):
+    for j, means in enumerate(motion.means[0]):
         assert motion.seen[:, j].any()
         assert not motion.seen[:, j].all()
         for row in np.flatnonzero(motion.seen[:, j]):
@@ -41,7 +41,7 @@ def test_no_window_reaches_a_turn(motion):
 def test_a_window_starts_where_the_joint_has_slid_far_enough(motion):
     """`slid` rad from where it turned, at 0.3 rad; rows are lost by it and none is new."""
     later = SlidingMotion.of(swinging(), 100.0, 0.02, slid=0.02)
-    for j, means in enumerate(later.means):
+    for j, means in enumerate(later.means[0]):
         for row in np.flatnonzero(later.seen[:, j]):
             first = means.indices[means.indptr[row]]
             turned = later.q[first, j] * later.dq[first, j] < 0

@@ -291,8 +291,7 @@ def fit_presliding(s: State) -> State:
     given = s.fitted(), spread(s.recording, REPLAYED_S), torque_data, how.bounds, s.prior
     rest: dict[str, Any] = {"report": s.history.add, "seed": how.seed, "nthread": how.nthread}
     found = s.history.step("presliding", lambda: estimate_presliding(*given, **rest))
-    rest = {"cutoff_hz": how.cutoff_hz, "slowest": s.slowest, "presliding_rad": found["presliding"]}
-    data = TorqueResidual(s.space, s.recording, **rest).with_lead(torque_data.lead_s)
+    data = torque_data.on(s.space).with_presliding(s.recording, found["presliding"])
     extra = (*s.problem.extra, Presliding(found["presliding"], found["sigma"]))
     return replace(s, problem=replace(s.problem, data=data, torque_data=data, extra=extra))
 

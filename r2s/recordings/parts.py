@@ -2,22 +2,40 @@
 
 import ctypes
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from r2s.recordings.recording import Recording
 
+M_MMAP_THRESHOLD, MAPPED = -3, 4 << 20  # option of glibc's mallopt(3); bytes
 LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of MB
 
 
 def give_back(recording: Recording) -> None:
     """Return freed memory to the system after work on a long recording; glibc would keep blocks of up to 32 MB."""
-    if recording.duration > LONG_S and sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # musl has none
-        if trim is not None:
-            trim(0)
+    if recording.duration > LONG_S:
+        _trim()
+
+
+def _trim() -> None:
+    """Return freed memory to the system; later blocks above MAPPED bytes return as soon as they are freed."""
+    libc: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if hasattr(libc, "malloc_trim"):  # musl has none
+        libc.mallopt(M_MMAP_THRESHOLD, MAPPED)
+        libc.malloc_trim(0)
+
+
+def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return {name: that array of all parts, joined}; the parts lose these arrays, so that no second copy remains."""
+    out = {}
+    for name in names:
+        out[name] = np.concatenate([vars(part).pop(name) for part in parts])
+        if out[name].nbytes > MAPPED:
+            _trim()
+    return out
 
 
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:

@@ -55,19 +55,26 @@ def make_robot(cfg):
 
 
 def make_dynamics(cfg, robot):
-    """Return the dynamics of conf/friction and conf/inertia, or the identified ones of `calibration=`.
+    """Return the dynamics of `base_dynamics` for the task of conf/task.
 
     Under a task that touches a surface, joints at rest hold contact forces, see `Dynamics.holding_contact`.
     """
+    dynamics = base_dynamics(cfg, robot)
+    return dynamics.holding_contact() if getattr(target(cfg.task, "task"), "touches", False) else dynamics
+
+
+def base_dynamics(cfg, robot):
+    """Return the dynamics of conf/friction and conf/inertia, or the identified ones of `calibration=`, for any task.
+
+    Unlike `make_dynamics`, it does not import the task, which imports torch (190 MB).
+    """
     from r2s.identification.parameter_file import load_parameters
 
-    if cfg.calibration:
-        typed = str(cfg.friction.get("family") or "").split(".")[0]
-        space, x = load_parameters(cfg.calibration, robot, (*modules(cfg.get("trust")), typed))
-        dynamics = space.dynamics(x)
-    else:
-        dynamics = dynamics_of(robot, plain(cfg.friction), plain(cfg.inertia))
-    return dynamics.holding_contact() if getattr(target(cfg.task, "task"), "touches", False) else dynamics
+    if not cfg.calibration:
+        return dynamics_of(robot, plain(cfg.friction), plain(cfg.inertia))
+    typed = str(cfg.friction.get("family") or "").split(".")[0]
+    space, x = load_parameters(cfg.calibration, robot, (*modules(cfg.get("trust")), typed))
+    return space.dynamics(x)
 
 
 def dynamics_of(robot, friction, inertia):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from r2s.errors import UserError
-from r2s.stages.build import console, make_dynamics, make_robot
+from r2s.stages.build import base_dynamics, console, make_robot
 from r2s.stages.data import check_other_motion, read_file
 from r2s.stages.prior import make_settings
 from r2s.stages.recordings import labels_of, of_one_reader, recording_files
@@ -42,7 +42,7 @@ def judged(cfg, robot, file, validation):
     recording = read_file(robot, file, file.path)
     settings = make_settings(cfg, recording.torque)
     recording = recording if file.period else recording.in_phase()
-    verdict = judge(robot, make_dynamics(cfg, robot), recording, settings)
+    verdict = judge(robot, base_dynamics(cfg, robot), recording, settings)
     for other in validation:
         error = None
         try:

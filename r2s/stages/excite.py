@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from r2s.errors import UserError, check_number, choices, nearest
-from r2s.stages.build import console, make_dynamics, make_robot, open_run
+from r2s.stages.build import base_dynamics, console, make_robot, open_run
 from r2s.stages.parts import called, plain
 
 WHY = {
@@ -67,7 +67,7 @@ def make_design(cfg, robot, how):
     from r2s.identification.planned_width import PlannedWidths
     from r2s.stages.prior import make_settings
 
-    nominal = make_dynamics(cfg, robot)
+    nominal = base_dynamics(cfg, robot)
     try:
         return PlannedWidths(
             robot, nominal, make_settings(cfg, how.torque), how.torque, noise=how.noise, chosen=how.parameters

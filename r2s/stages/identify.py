@@ -6,7 +6,7 @@ from typing import Any
 
 from r2s.errors import UserError, check_number
 from r2s.files import located
-from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
+from r2s.stages.build import base_dynamics, check_source, console, make_robot, open_run
 from r2s.stages.contact import (
     calibrated_arm,
     contact_data,
@@ -65,7 +65,7 @@ def make_parts(cfg):
 
     robot = make_robot(cfg)
     earlier = earlier_run(cfg, robot)
-    nominal = make_dynamics(cfg, robot)
+    nominal = base_dynamics(cfg, robot)
     searches = [part(node, f"search.{k}") for k, node in enumerate(cfg.search)]
     check_number("identify.validation_fraction", cfg.identify.validation_fraction, "(0, 1)")
     check_number("identify.drift", cfg.identify.get("drift", 0.0), "[0, inf)")
@@ -147,8 +147,6 @@ def identify(cfg, overrides):
         identify_with_known_arm(cfg, overrides, key)
         return
     from r2s.identification.arm_uncertainty import Arm
-    from r2s.reporting.identification.page import identification_page
-    from r2s.reporting.identification.tables import identification_table
 
     made = make_parts(cfg)
     with open_run(cfg, overrides, made.inputs) as run:
@@ -170,6 +168,10 @@ def identify(cfg, overrides):
             run.track("metrics", row)
         run.summary(summary)
         how = {"window_s": cfg.identify.window_s, "cutoff_hz": cfg.identify.cutoff_hz}
+        # after the fits, whose memory peaks: matplotlib and rerun take 70 MB
+        from r2s.reporting.identification.page import identification_page
+        from r2s.reporting.identification.tables import identification_table
+
         identification_page(run, nominal, found, fit.validation, summary, **how, more=fit.tables)
         identification_table(console(), made.robot, found, summary)
         arm = Arm(found.space, found.x, found.found.samples)

@@ -6,7 +6,7 @@ reverses (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torq
 weights. Close reversals make windows shorter and rows noisier; r2s computes this noise from the encoder noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 from r2s.identification.residuals.zero_phase import EDGE_S, cubic, too_short
 from r2s.physics.friction import PRESLIDING, presliding
 from r2s.physics.robot import SIM_DT
+from r2s.recordings.parts import joined_arrays
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 250  # rate at which torques are evaluated before averaging
@@ -37,7 +38,8 @@ class SlidingMotion:
 
     Attributes:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2. bristle: (F, n), the presliding state.
-        means: n sparse matrices (T, F), the window weights of each joint; rows without a window are empty.
+        means: for each piece of the recording, n sparse matrices (moments, instants) of the piece: the window weights
+            of each joint; rows without a window are empty.
         seen: (T, n) bool, whether the moment has a window in which the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of the mean acceleration per rad of white encoder noise.
         encoder: (n,) rad, standard deviation of the encoder noise.
@@ -50,7 +52,7 @@ class SlidingMotion:
     dq: np.ndarray
     ddq: np.ndarray
     bristle: np.ndarray
-    means: tuple[csr_array, ...]
+    means: tuple[tuple[csr_array, ...], ...]
     seen: np.ndarray
     noise: np.ndarray
     encoder: np.ndarray
@@ -110,19 +112,18 @@ class SlidingMotion:
         delayed = np.stack([_averaged(means, smooth.tau[rows]) for rows in ago], 1)
         return SlidingMotion(
             smooth.t[kept], q, dq[own], ddq[own], np.concatenate(bristle),
-            means, half > 0, gain[half], encoder, delayed, smooth.t[own], own == began,
+            (means,), half > 0, gain[half], encoder, delayed, smooth.t[own], own == began,
         )  # fmt: skip
 
     @staticmethod
     def joined(parts: "Sequence[SlidingMotion]") -> "SlidingMotion":
-        """Join consecutive parts of a recording; the parts lose their arrays, so that no second copy takes memory."""
+        """Join consecutive parts of a recording; the parts lose their arrays."""
         if len(parts) == 1:
             return parts[0]
         names = [f.name for f in fields(SlidingMotion) if f.name not in ("means", "encoder")]
-        arrays = {name: np.concatenate([vars(m).pop(name) for m in parts]) for name in names}
-        joints = list(zip(*(vars(m).pop("means") for m in parts), strict=True))
-        means = [_block_diagonal(joints.pop(0)) for _ in range(len(joints))]
-        return SlidingMotion(means=tuple(means), encoder=np.median([m.encoder for m in parts], axis=0), **arrays)
+        arrays = joined_arrays(parts, names)
+        means = tuple(own for m in parts for own in m.means)
+        return SlidingMotion(means=means, encoder=np.median([m.encoder for m in parts], axis=0), **arrays)
 
     @property
     def friction_dq(self) -> np.ndarray:
@@ -134,9 +135,17 @@ class SlidingMotion:
         """(T, n) Nm, window means of the command without delay."""
         return self.delayed[:, 1]
 
-    def filtered(self, x: np.ndarray) -> np.ndarray:
-        """Return the means (T, n, ...) of x (F, n, ...) over the windows of each joint."""
-        return _averaged(self.means, x)
+    def filtered(self, x: np.ndarray | Callable[[slice], np.ndarray]) -> np.ndarray:
+        """Return the means (T, n, ...) of x over the windows of each joint.
+
+        x is (F, n, ...), or a function from a slice of the F rows to values, which is evaluated piece by piece.
+        """
+        ends = np.cumsum([0, *(means[0].shape[1] for means in self.means)]).tolist()
+        parts = [
+            _averaged(means, x(slice(*rows)) if callable(x) else x[slice(*rows)])
+            for means, rows in zip(self.means, pairwise(ends), strict=True)
+        ]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     rows = filtered  # unlike in `SmoothMotion`, functions of q, dq, ddq are averaged, too
 
@@ -162,16 +171,6 @@ def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
         if rows > 2:
             out[s] = savgol_filter(recording.q[s], rows, min(rows - 1, 4), deriv=order, delta=SIM_DT, axis=0)
     return out
-
-
-def _block_diagonal(parts: Sequence[csr_array]) -> csr_array:
-    """Return the block-diagonal matrix of `parts`; scipy's function needs several times the memory."""
-    rows, columns = (np.cumsum([0, *(m.shape[k] for m in parts)]) for k in (0, 1))
-    entries = np.cumsum([0, *(m.nnz for m in parts)])
-    data = np.concatenate([m.data for m in parts])
-    indices = np.concatenate([m.indices + base for m, base in zip(parts, columns.astype(np.int32), strict=False)])
-    ends = np.concatenate([[0], *(m.indptr[1:] + base for m, base in zip(parts, entries, strict=False))])
-    return csr_array((data, indices, ends), shape=(rows[-1], columns[-1]))
 
 
 def _averaged(means: tuple[csr_array, ...], x: np.ndarray) -> np.ndarray:
@@ -210,7 +209,7 @@ def _windows(q: np.ndarray, way: np.ndarray, at: np.ndarray, slid: float) -> tup
     windows = {w: _weights(w) for w in range(least, most + 1)}
     some = np.flatnonzero(half)
     values = [windows[half[k]] for k in some]
-    columns = [np.arange(at[k] - half[k], at[k] + half[k] + 1) for k in some]
-    ends = np.concatenate([[0], np.cumsum(np.where(half > 0, 2 * half + 1, 0))])
-    entries = np.concatenate([np.zeros(0), *values]), np.concatenate([np.zeros(0, dtype=int), *columns]), ends
+    columns = [np.arange(at[k] - half[k], at[k] + half[k] + 1, dtype=np.int32) for k in some]
+    ends = np.concatenate([[0], np.cumsum(np.where(half > 0, 2 * half + 1, 0))]).astype(np.int32)
+    entries = np.concatenate([np.zeros(0), *values]), np.concatenate([np.zeros(0, dtype=np.int32), *columns]), ends
     return csr_array(entries, shape=(len(at), len(q))), half

@@ -9,6 +9,7 @@ from r2s.identification.residuals.modulating_functions import SlidingMotion
 from r2s.identification.residuals.zero_phase import SmoothMotion
 from r2s.physics.rigid_body import LinkInertia, mass_matrix, regressor, rigid_body
 from r2s.physics.robot import Robot
+from r2s.recordings.parts import joined_arrays
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,5 @@ class RigidBodyRows:
 
     @staticmethod
     def joined(parts: "Sequence[RigidBodyRows]") -> "RigidBodyRows":
-        """Join consecutive parts of a recording; the parts lose their arrays to avoid a second copy in memory."""
-        names = [f.name for f in fields(RigidBodyRows)]
-        return RigidBodyRows(**{name: np.concatenate([vars(p).pop(name) for p in parts]) for name in names})
+        """Join consecutive parts of a recording; the parts lose their arrays."""
+        return RigidBodyRows(**joined_arrays(parts, [f.name for f in fields(RigidBodyRows)]))

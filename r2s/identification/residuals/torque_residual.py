@@ -6,6 +6,7 @@ commanded torque it is a fast start of a fit. Each row is divided by its standar
 
 from collections.abc import Iterator
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -72,7 +73,8 @@ class TorqueResidual:
                 late = from_q(robot.n) if self.commanded else lateness(recording, cutoff_hz)
                 late = late.as_logged if space.nominal.late_alike else late
                 of = partial(SmoothMotion.of, cutoff_hz=cutoff_hz, late=late)
-            m, self._rigid = _joined(robot, recording, partial(of, rate_hz=rate_hz, presliding_rad=presliding_rad))
+            self._of = partial(of, rate_hz=rate_hz, presliding_rad=presliding_rad)
+            m, self._rigid = _joined(robot, recording, self._of)
         else:
             m, self._rigid = recording, RigidBodyRows.of(robot, recording, recording.torque)  # type: ignore[arg-type]
         self.motion: SmoothMotion | SlidingMotion | PlannedMotion = m
@@ -113,6 +115,19 @@ class TorqueResidual:
         """Return this residual for implicit friction, `lead_s` seconds ahead (problem.py: `implicit_friction`)."""
         return self._with(lead_s=lead_s)
 
+    def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
+        """Return this residual, unfitted, for bristles that bend over `presliding_rad` (n,); `recording` is its data.
+
+        Motion and regressors stay, so that a long recording has them in memory once.
+        """
+        of = partial(self._of, presliding_rad=presliding_rad)
+        bristle = np.concatenate([of(piece).bristle for piece in _pieces(recording, of)])
+        give_back(recording)
+        m = replace(self.motion, bristle=bristle)  # type: ignore[arg-type, type-var]
+        sign, mean = self._sign | {True: bristle}, self._mean_sign | {True: m.filtered(bristle)}
+        block = blocks_of(m.t, self._rigid.q, self._period)
+        return self._with(motion=m, _sign=sign, _mean_sign=mean, block=block).on(self.space)
+
     def within(self, kept: np.ndarray) -> "TorqueResidual":
         """Return this residual with only those moments for which `kept` (T,) is true."""
         return self._with(seen=self.seen & kept[:, None])
@@ -148,7 +163,7 @@ class TorqueResidual:
             friction = like.friction
         else:
             of = partial(self._friction, d)
-            friction = m.filtered(of) if isinstance(m, SmoothMotion) else m.filtered(of(slice(None)))
+            friction = m.filtered(of(slice(None))) if isinstance(m, PlannedMotion) else m.filtered(of)
         return _Known(standard, d.armature, torque, compensation, d.phi, friction)
 
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
@@ -290,12 +305,17 @@ class _Known(NamedTuple):
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
     """Return the motion that `of` computes from a recording piece by piece, and the motion's rigid-body torque."""
-    motions = [of(piece) for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])]
+    motions = [of(piece) for piece in _pieces(recording, of)]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     joined = type(motions[0]).joined(motions)
     del motions
     give_back(recording)
     return joined, rigid
+
+
+def _pieces(recording: Recording, of: "partial[Any]") -> Iterator[Recording]:
+    """Yield the pieces of a recording, with the overlap that `of` cuts off at both ends."""
+    return pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])
 
 
 def _standard(d: Dynamics) -> np.ndarray:

@@ -11,6 +11,7 @@ from r2s.errors import UserError
 from r2s.physics.friction import PRESLIDING, presliding
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.lateness import Lateness
+from r2s.recordings.parts import joined_arrays
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
@@ -96,12 +97,12 @@ class SmoothMotion:
 
     @staticmethod
     def joined(parts: "Sequence[SmoothMotion]") -> "SmoothMotion":
-        """Join consecutive parts of a recording; the parts lose their arrays, so that no second copy takes memory."""
+        """Join consecutive parts of a recording; the parts lose their arrays."""
         if len(parts) == 1:
             return parts[0]
         names = ("t", "q", "dq", "ddq", "tau", "friction_dq", "bristle", "delayed")
         base = np.cumsum([0, *(len(m.friction_dq) for m in parts)]).tolist()
-        arrays = {name: np.concatenate([vars(m).pop(name) for m in parts]) for name in names}
+        arrays = joined_arrays(parts, names)
         spans = [range(b + s.start, b + s.stop, s.step) for b, m in zip(base, parts, strict=False) for s in m.spans]
         return SmoothMotion(kernel=parts[0].kernel, spans=tuple(spans), shift_s=parts[0].shift_s, **arrays)
 
