@@ -1,4 +1,4 @@
-"""Entry point of `python -m r2s`, which does the same as `python run.py`."""
+"""Run the command line: `python -m r2s` does the same as `python run.py`."""
 
 from r2s.cli import main
 

@@ -1,4 +1,4 @@
-"""Run the command line `python run.py ...`, or `r2s ...` if installed: compose the config and call one stage.
+"""Run the command line, `python run.py ...` or the installed `r2s ...`: compose the config and call one stage.
 
 After a user's mistake, r2s prints one line on stderr and ends with exit status 2.
 """
@@ -109,7 +109,7 @@ def run_job(cfg):
 
 
 def check_paths(cfg):
-    """Check the options that name a file or folder, and convert them to strings: YAML reads some names as numbers."""
+    """Check the options that name a file or folder, and convert names that YAML reads as numbers to strings."""
     for key in PATHS:
         value = cfg[key]
         if value is not None and (isinstance(value, bool) or not isinstance(value, str | int | float) or value == ""):
@@ -121,7 +121,7 @@ def check_paths(cfg):
 
 
 def resumed(cfg, overrides):
-    """Return the config and overrides with which the run in the folder `resume=` continues."""
+    """Return the config and overrides of the run that `resume=FOLDER` continues."""
     from r2s.runs import is_done
 
     folder = Path(cfg.resume)
@@ -143,7 +143,7 @@ def resumed(cfg, overrides):
 
 
 def is_completed(cfg):
-    """Return whether the job's run is finished; if its folder exists unfinished, set `resume` to continue the run."""
+    """Return whether the job's run has finished; set `cfg.resume` if the job has to continue an unfinished run."""
     from r2s.runs import is_done
     from r2s.stages.build import unread
 
@@ -166,7 +166,7 @@ def is_completed(cfg):
 
 
 def differing(saved, cfg, most=3, counts=lambda key: True):
-    """Return lines on differences from the saved config, for the first `most` keys for which `counts` is true."""
+    """Return a line for each of the first `most` keys that differ from the saved config and satisfy `counts`."""
     from omegaconf import OmegaConf
 
     from r2s.reporting.trackers.tracker import flat
@@ -179,7 +179,7 @@ def differing(saved, cfg, most=3, counts=lambda key: True):
 
 
 def typed_overrides(folder):
-    """Return the overrides that the user typed to create a run folder."""
+    """Return the overrides with which the user started the run of a folder."""
     from r2s.runs import read_meta
 
     words = loaded(folder / "overrides.yaml")
@@ -193,7 +193,7 @@ def typed_overrides(folder):
 
 @contextmanager
 def errors_in_one_line():
-    """End the job with one line if the block fails by a user's mistake, a full disk, a stopped arm or Ctrl-C."""
+    """End the job with a one-line message after a user's mistake, a full disk, a stopped arm or Ctrl-C."""
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     try:
@@ -231,7 +231,7 @@ def end_workers():
 
 
 def end_job(error):
-    """Print an error and exit with status 2; in a sweep, append it to the file of errors instead of exiting."""
+    """Print an error and exit with status 2; in a sweep, append the error to the sweep's error file instead."""
     status = fail(error)
     if FAILED not in os.environ:
         sys.exit(status)
@@ -240,7 +240,7 @@ def end_job(error):
 
 
 def describe(error: OSError) -> str:
-    """Return the message of a system error, with the file that it concerns."""
+    """Return a system error's message with the name of the file that caused the error."""
     return f"{error.strerror}{f': {error.filename}' if error.filename else ''}"
 
 

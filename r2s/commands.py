@@ -1,7 +1,7 @@
 """Run the commands of r2s that make no run folder.
 
-`r2s list`, `look` and `export` read run folders. `convert` writes a recording for ROS 2 or LeRobot. `check` judges a
-recording or connects to an arm. `engines` lists the physics engines.
+`r2s list`, `r2s look` and `r2s export` read run folders. `r2s convert` writes a recording for ROS 2 or LeRobot.
+`r2s check` checks a recording or an arm. `r2s engines` lists the physics engines.
 """
 
 import os
@@ -28,7 +28,7 @@ class Parser(ArgumentParser):
 
 
 def run_command(words: Sequence[str]) -> None:
-    """Run a command: `words` are its name and its arguments.
+    """Run the command whose name and arguments are `words`.
 
     Raises:
         UserError: an argument or a run folder is wrong.
@@ -136,7 +136,7 @@ def export(typed: Namespace) -> None:
 
 
 def check(typed: Namespace) -> None:
-    """Judge recordings or an arm: print the findings; raise UserError if a check refuses them."""
+    """Check recordings or an arm: print the findings, and raise UserError if a check fails."""
     from r2s.stages.check_data import check_data
 
     if not any(word.split("=")[0].split(".")[0] == "data" for word in typed.override):
@@ -165,7 +165,7 @@ def composed(command: str, words: Sequence[str], groups: Sequence[str]) -> Any:
 
 
 def check_arm(typed: Namespace) -> None:
-    """Connect to an arm, which does not move, and print the findings; raise UserError if a check refuses the arm."""
+    """Check an arm without moving it: connect, print the findings, and raise UserError if a check fails."""
     from omegaconf import OmegaConf
     from pandas import DataFrame
 
@@ -238,7 +238,7 @@ def engines(typed: Namespace) -> None:
 
 
 def viewable(folder: Path) -> Path:
-    """Return the run folder; raise UserError if it has no recording for the viewer."""
+    """Return the run folder; raise UserError if the folder has no recording for the viewer."""
     if (folder / "recording.rrd").is_file():
         return folder
     if (folder / "meta.json").is_file():
@@ -247,7 +247,7 @@ def viewable(folder: Path) -> Path:
 
 
 def robot_of(folders: Sequence[Path], trust: str | None = None):
-    """Return the robot of the runs; raise UserError if their robots differ, or a config names untrusted parts."""
+    """Return the robot of the runs; raise UserError if the runs have different robots or untrusted modules."""
     from r2s.stages.build import make_robot
     from r2s.stages.run_config import run_config
 

@@ -2,9 +2,9 @@
 
 numba caches a compiled function and recompiles the function when its source file changes. But the cached code also
 contains all called functions, which may be in other files: after a change in physics/safety_filter.py, numba would
-run arm/driver.py with the old filter. So here a function is recompiled also when a compiled module of its room or of
-`physics` changes, or a module from which one of these imports constants. Compiled code must not call functions of
-any other room.
+run arm/driver.py with the old filter. With this module numba also recompiles a function after a change of a compiled
+module in the function's package, such as r2s/arm, or in r2s/physics, or of a module from which these import
+constants. Compiled code must not call functions of any other package.
 """
 
 import hashlib
@@ -27,8 +27,8 @@ LONG_S = 2.0  # s, duration of a compilation after which the user gets a message
 
 @cache
 def _sources(room: Path) -> bytes:
-    """Return a hash of all modules on which the compiled code of a function in the folder `room` may depend."""
-    if PACKAGE in room.parents:  # a folder inside a room is part of this room
+    """Return a hash of all modules on which compiled code in the package folder `room` may depend."""
+    if PACKAGE in room.parents:  # a subfolder belongs to its package
         names = room.relative_to(PACKAGE).parts[0], "physics"
         paths = {path for name in names for path in (PACKAGE / name).rglob("*.py")}
     else:
@@ -42,7 +42,7 @@ def _sources(room: Path) -> bytes:
 
 
 def _imports(path: Path) -> list[list[str]]:
-    """Return the names, split at the dots, of the r2s modules from which a module imports."""
+    """Return the r2s modules from which a file imports, as names split at the dots."""
     return [name.split(".") for name in re.findall(r"^from (r2s[\w.]+) import", path.read_text(), re.MULTILINE)]
 
 
@@ -56,15 +56,15 @@ class _Sources:
 
 
 class Provided(_Sources, UserProvidedCacheLocator):
-    """Cache in the folder that NUMBA_CACHE_DIR names."""
+    """Store compiled code in the folder of the environment variable NUMBA_CACHE_DIR."""
 
 
 class Beside(_Sources, InTreeCacheLocator):
-    """Cache in `__pycache__` in the folder of the source."""
+    """Store compiled code in the folder `__pycache__` beside the source file."""
 
 
 class UserWide(_Sources, UserWideCacheLocator):
-    """Cache in the user's cache folder, for a read-only installation."""
+    """Store compiled code in the user's cache folder, for a read-only installation."""
 
 
 _own = ",".join(f"{__name__}.{kind.__name__}" for kind in (Provided, Beside, UserWide))
@@ -72,7 +72,7 @@ config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # 
 
 
 class _Announce(event.Listener):
-    """Listener that prints a message, once per process, if a compilation takes long; the first takes minutes."""
+    """Listener that prints a message, once per process, if a compilation takes longer than LONG_S."""
 
     def __init__(self):
         self._printed = False

@@ -1,7 +1,7 @@
 """Make environments for Gymnasium (`gymnasium.make("r2s/PandaReach-v0", calibration=RUN)`) and TorchRL.
 
-If Gymnasium is installed, importing this module registers r2s/PandaReach-v0, and likewise PandaTrack, PandaPress,
-PandaWipe and PandaPush. `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports it automatically.
+If Gymnasium is installed, importing this module registers r2s/PandaReach-v0, r2s/PandaTrack-v0, and so on for Press,
+Wipe and Push. `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports this module automatically.
 """
 
 from collections.abc import Iterator, Sequence
@@ -51,7 +51,7 @@ def torchrl_env(num_envs: int = 32, *, seed: int = 0, overrides: Sequence[str] =
 
 
 def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any, Any, Any, int]:
-    """Return robot, task, domain randomization, reward and number of threads of a training with these options.
+    """Return robot, task, domain randomization, reward and number of threads for a training with these options.
 
     Args:
         settings: {option: value} of SETTINGS, such as {"task": "reach", "calibration": RUN, "dr": "identified"}.
@@ -79,7 +79,7 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
 
 
 def _word(name: str, value: Any) -> str:
-    """Return an option as typed on the command line; quote a path, because a path may have any character."""
+    """Return an option as a word of the command line; put quotes around a path, which may contain any character."""
     from hydra.core.override_parser.types import Quote, QuotedString
 
     is_path = name == "calibration"
@@ -98,7 +98,7 @@ def _composed(words: list[str]) -> Any:
 
 @contextmanager
 def _aside() -> Iterator[None]:
-    """Hide the Hydra state of the calling program, which may be a Hydra job, and restore the state at the end."""
+    """Hide the Hydra state of the calling program, which may itself be a Hydra job, while the block runs."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
     from hydra.core.utils import JobRuntime

@@ -12,11 +12,11 @@ FAILED = "R2S_FAILED"  # environment variable that a sweep sets: file for the er
 
 
 class UserError(ValueError):
-    """Error in the user's input. The message names option or file, expected value, actual value and nearest match."""
+    """A user's mistake. The message states option or file, expected value, actual value and nearest allowed name."""
 
 
 class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
-    """The arm stopped and the operator did not resume. The run ends with status stopped; its results remain."""
+    """The arm stopped, and the operator did not resume the run, which ends with its results and status `stopped`."""
 
 
 def nearest(name: object, allowed: Iterable[str]) -> str:
@@ -26,7 +26,7 @@ def nearest(name: object, allowed: Iterable[str]) -> str:
 
 
 def nearest_file(path: Path, pattern: str = "*") -> str:
-    """Return `nearest` for the name of a path, among the files in its folder that match a pattern."""
+    """Return the suggestion of `nearest` for a file name among the files of its folder that match `pattern`."""
     return nearest(path.name, (p.name for p in path.parent.glob(pattern)))
 
 
@@ -47,7 +47,7 @@ def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
         module: name such as "panda_py". needed_by: option or file that needs it. extra: name of the extra.
 
     Raises:
-        UserError: the module, or one that it imports, is not installed.
+        UserError: the module, or a module that it imports, is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -57,11 +57,11 @@ def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
 
 
 def import_failure(error: ImportError, package: str, install: str) -> str:
-    """Return why an import failed: the package, another package that it needs, or a shared library is missing.
+    """Return why an import failed: the package, a package that it needs, or a shared library is missing.
 
     Args:
-        error: error of the import: ModuleNotFoundError if a package is missing; ImportError with the extension's name
-            if an extension misses a shared library such as libGL.
+        error: exception of the import. ModuleNotFoundError: a package is missing. ImportError with the name of an
+            extension module: a shared library such as libGL is missing.
         install: argument of `pip install` that installs the packages.
     """
     if not isinstance(error, ModuleNotFoundError):
@@ -80,7 +80,7 @@ def check_number(name: str, value: object, interval: str, whole: bool = False) -
         whole: whether the value must be an integer.
 
     Raises:
-        UserError: the value is no number, or outside the interval.
+        UserError: the value is not a number, or is outside the interval.
     """
     low, high = (float(end) for end in interval[1:-1].split(","))
     if isinstance(value, Integral if whole else Real) and not isinstance(value, bool):

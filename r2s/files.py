@@ -31,7 +31,7 @@ def located(path: str | os.PathLike) -> Path:
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path; at the end of the block, rename that file to `path`.
 
-    If the block raises or the process is killed, the file at `path` keeps its old content.
+    If the block raises or the process is killed, the file at `path` does not change.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.part{path.suffix}")  # some libraries choose the format by the suffix

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from r2s.errors import UserError
 
-FIGURES_ONLY = "R2S_FIGURES"  # environment variable; if set, `look` shows figures instead of the viewer
+FIGURES_ONLY = "R2S_FIGURES"  # if this environment variable is set, `look` shows figures instead of the viewer
 
 
 def r2s(*words: str) -> Path:
-    """Run `r2s WORDS`, print the command's output, and return its run folder.
+    """Run the command `r2s WORDS`, print its output, and return its run folder.
 
     Raises:
         UserError: the command fails; the message is the command's last line on stderr.
@@ -37,7 +37,7 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
     """Show a run in the notebook: in the rerun viewer, or as figures if rerun-notebook is not installed.
 
     Args:
-        folder: run folder. figures: names such as "torque"; all if none is given.
+        folder: run folder. figures: names such as "torque"; without names, all figures.
         width, height: size of the viewer in pixels; figures also have this width.
     """
     from IPython.display import Image, display
@@ -58,7 +58,7 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
 
 
 def _small(path: Path, width: int) -> bytes:
-    """Return a figure as a small PNG (this width, 64 colors), because the notebook file will contain it."""
+    """Return a figure as a PNG with `width` and 64 colors, which is small enough to store in a notebook file."""
     from PIL import Image
 
     with Image.open(path) as picture:

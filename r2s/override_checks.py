@@ -1,4 +1,4 @@
-"""Check the overrides before Hydra runs, so that a mistake prints one line with the nearest match."""
+"""Check overrides before Hydra runs, so that a wrong override prints one line with the nearest valid name."""
 
 import re
 import shlex
@@ -14,9 +14,9 @@ COMMANDS = ("look", "list", "export", "check", "convert", "engines")
 OPTIONAL = ("tracker", "experiment")  # config groups that may remain without a selected option
 EXTENSIBLE = ("tune.space",)  # keys under which + may add new keys
 STATED = re.compile(r"identify\.prior\.(?!(?:commanded|measured|motor)\b)[A-Za-z_]\w*(?:\.\w+)?=")
-NO_OPTION = "base"  # file that a group's options share; `base` cannot be selected
+NO_OPTION = "base"  # file that a group's options share; `base` itself cannot be selected
 SEARCHPATH = "hydra.searchpath"
-# old names of keys and values, with the new ones
+# old names of keys and values: new names
 RENAMED = {
     "arm.friction": "arm.friction_scale",
     "arm.late": "arm.extra_delay_s",
@@ -45,7 +45,7 @@ SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweep
 
 
 def extended(words: Sequence[str]) -> list[str]:
-    """Return the overrides, with ++ before stated parameter values, whose keys are in no file of conf/."""
+    """Add ++ to overrides that state a prior (`identify.prior.*`), because no file in conf/ contains their keys."""
     return [f"++{w}" if STATED.match(w) else w for w in words]
 
 
@@ -56,7 +56,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
         words: overrides KEY=VALUE and GROUP=OPTION. config_dir: folder of --config-dir. multirun: whether -m is set.
 
     Raises:
-        UserError: an option is unknown or no job reads it, a grid has no -m, or a folder is missing.
+        UserError: an option is unknown, no job reads an option, a sweep lacks -m, or a folder is missing.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -93,11 +93,11 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
 def _check_configs(
     configs: Sequence[Any], jobs: Sequence[list[str]], names: Sequence[str], groups: Mapping[str, Any]
 ) -> None:
-    """Check stage, root and booleans of the jobs' configs; check that each option of `names` is read by some job."""
+    """Check the jobs' configs: a known stage, a valid root, correct booleans, and a job that reads each option."""
     from hydra import compose
     from omegaconf import OmegaConf
 
-    for cfg in configs:  # Hydra uses `root` before the job can check this option
+    for cfg in configs:  # Hydra uses `root` before a job could check it
         if cfg.get("stage") not in STAGES:
             raise UserError(f"stage: expected one of {choices(STAGES)}, got {cfg.get('stage')}")
         root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
@@ -116,9 +116,9 @@ def _check_configs(
 
 
 def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> None:
-    """Raise UserError if Hydra refuses one of its own options, or r2s does not support it.
+    """Raise UserError for an option of Hydra in `words` that Hydra refuses or that r2s does not support.
 
-    own: overrides that come first. If Hydra refuses one of these, do nothing: the check of all overrides reports it.
+    own: overrides to apply first. If Hydra refuses an override in `own`, do nothing; a later check reports it.
     """
     from hydra import compose
     from hydra.errors import HydraException
@@ -145,17 +145,17 @@ def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[st
 
 
 class UnknownOption(Exception):  # noqa: N818 (its message is made where the options are known)
-    """An override adds a key that no stage reads."""
+    """Error for an override that adds a new key, which no stage reads."""
 
 
 def _jobs(
     words: Sequence[str], own: list[str], groups: Mapping[str, Any], multirun: bool
 ) -> tuple[list[str], list[list[str]]]:
-    """Return the typed keys and groups, and a list of jobs in which every value of each sweep occurs at least once.
+    """Return the keys and groups in `words`, and a few jobs that together contain every value of each sweep.
 
     Raises:
-        UserError: a sweep has no -m, or the value of a group is wrong.
-        UnknownOption, HydraException: another mistake; `_first_mistake` makes the message for the user.
+        UserError: a sweep lacks -m, or the value of a group is wrong.
+        UnknownOption, HydraException: an override is wrong in another way; `_first_mistake` explains it to the user.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
@@ -191,14 +191,14 @@ def _check_switches(cfg: Any, names: Sequence[str], defaults: Any) -> None:
 
 
 def check_option(group: str, value: Any, options: Sequence[str]) -> None:
-    """Raise UserError if the value of a group is not a string, for which Hydra would later print a traceback."""
+    """Raise UserError if a group's value is no string; otherwise, Hydra would later print a traceback."""
     words = value if isinstance(value, list) else [value]
     if not all(isinstance(w, str) for w in words) or not (words or group in OPTIONAL):
         raise UserError(f"{group}: expected one of {choices(options)}, got {value}")
 
 
 def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]], multirun: bool) -> UserError:
-    """Return the error for the first override that Hydra refuses in addition to the previous ones."""
+    """Add the overrides one by one, and return the error for the first that Hydra refuses."""
     from hydra import compose
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -214,14 +214,14 @@ def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[
             name = word.lstrip("+~").split("=", 1)[0]
             return UserError(renamed(word) or f"unknown option '{name}'{nearest(name, known)}")
         except (HydraException, OmegaConfBaseException) as error:
-            return _mistake(job[-1], error, groups, known)  # in a sweep, job[-1] has the refused value
+            return _mistake(job[-1], error, groups, known)  # in a sweep, job[-1] contains the refused value
         if names[-1] in groups:
             known = [*_keys(cfg), *groups]
     raise AssertionError("Hydra accepts each override, but not all of them")
 
 
 def renamed(override: str) -> str | None:
-    """Return a message with the new name if an override has an old name, else None."""
+    """Return a message with the new name of an override's key or value; None if its name is not an old one."""
     word = override.lstrip("+~")
     if word in RENAMED:
         return f"{word} is now {RENAMED[word]}"
@@ -242,7 +242,7 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
-    """Return the error for an override that Hydra refuses with `error`."""
+    """Return the user's message for the override `word`, which Hydra refuses with `error`."""
     if "=" not in word:
         return UserError(f"'{word}' is not KEY=VALUE{nearest(word, [*groups, *COMMANDS])}")
     key, value = word.split("=", 1)
@@ -261,7 +261,7 @@ def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: S
 
 
 def _parses(word: str) -> bool:
-    """Return whether an override obeys Hydra's grammar."""
+    """Return whether Hydra can parse an override."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
@@ -273,7 +273,7 @@ def _parses(word: str) -> bool:
 
 
 def quoted(word: str) -> str:
-    """Return an override quoted for the shell so that its value is one string: 'data.path="a=b.csv"'."""
+    """Quote an override for the shell so that its value is a single string: 'data.path="a=b.csv"'."""
     key, _, value = word.partition("=")
     inner = value.replace("\\", "\\\\").replace('"', '\\"')
     return shlex.quote(f'{key}="{inner}"')

@@ -14,7 +14,7 @@ from rich.table import Column
 class Progress:
     """A progress bar on a terminal; without a terminal, a line of text every `every_s` seconds.
 
-    in_cycle: whether a control cycle calls the object. A thread then writes, as a cycle must not wait for a terminal.
+    in_cycle: whether a control cycle calls the object; if so, a thread writes, so that no cycle waits for a terminal.
     """
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
@@ -78,7 +78,7 @@ class Progress:
             self._print(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(now - self._began)}  {left}  {text}")
 
     def close(self, text: str = "") -> None:
-        """End the display; print the elapsed time and `text`, the result."""
+        """Close the progress bar, and print the elapsed time and the result `text`."""
         if self._calls is not None:
             self._calls.put(None)
             self._writer.join()

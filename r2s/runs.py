@@ -1,7 +1,7 @@
 """Make, resume and read run folders, runs/<stage>/<name>/: config, provenance, growing tables and the summary.
 
-meta.json has the status `running` from the start; a killed run still has it. A folder gets its final name only when
-its first files are complete. A lock on overrides.yaml lets only one process write; when this ends, so does the lock.
+The status in meta.json is `running` from the start, and remains `running` if the process is killed. A folder receives
+its final name when its first files are complete. A process that writes in the folder locks overrides.yaml.
 """
 
 import csv
@@ -33,10 +33,10 @@ NOTE_S = 30.0  # s, time between updates of the wall clock in meta.json, so that
 
 @dataclass(frozen=True)
 class Job:
-    """Description of a job, which its run folder records.
+    """Description of a job, which is stored in the job's run folder.
 
     Attributes:
-        stage, name: the folder is runs/<stage>/<name>, with a number if it exists. name None: `default_name`.
+        stage, name: the folder is runs/<stage>/<name>, numbered if it exists. If name is None: `default_name`.
         config: composed config as YAML text. overrides: overrides as the user typed them.
         seed: seed of the run. threads: requested number, 0: all cores. device: device of the learner.
         inputs: files that the run reads; the folder records their SHA-256. parents: run folders that the run uses.
@@ -57,12 +57,12 @@ class Run:
     """A run folder, open while its stage runs: `with Run(...) as run`.
 
     Attributes:
-        folder: path of the folder. tracker: r2s.reporting.trackers.async_tracker.Trackers, whose calls neither raise
-            nor block, or None.
+        folder: path of the folder. tracker: r2s.reporting.trackers.async_tracker.Trackers, whose methods neither
+            raise errors nor wait, or None.
 
     Args:
         root: folder of all runs. job: see `Job`. exact_name: whether to raise an error if the name exists.
-        resume: run folder to continue, instead of making a new one; inputs of the run must be unchanged.
+        resume: existing run folder to continue; the input files of the run must be unchanged.
 
     Raises:
         UserError: the folder cannot be made or resumed, or another process is using it.
@@ -165,7 +165,7 @@ class Run:
     def memo(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Return the arrays that `make` computes; if checkpoints/<name>.npz exists, read the arrays from it instead.
 
-        So a resumed run continues after the last complete step.
+        A resumed run therefore continues after the last complete step.
 
         Raises:
             UserError: the file is damaged.
@@ -185,9 +185,9 @@ class Run:
         return self.folder / "figures" / f"{name}.png"
 
     def log(self, table: str, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to <table>.csv and return the row, rounded as in the file. The first row defines the columns.
+        """Append a row to <table>.csv and return the row, rounded as in the file; the first row defines the columns.
 
-        Use the rounded row for decisions: then a resumed run, which reads the file (`rewind`), decides the same.
+        Base decisions on the rounded row, because a resumed run reads this row from the file (`rewind`).
         """
         rounded = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in row.items()}
         if table not in self._tables:
@@ -204,14 +204,14 @@ class Run:
         return rounded
 
     def track(self, table: str, row: Mapping[str, Any]) -> None:
-        """Send a row only to the tracker, for a table that `log` does not write."""
+        """Send a row of a table to the tracker without writing it to <table>.csv."""
         if self.tracker:
             self.tracker.log(table, row)
 
     def rewind(self, table: str, column: str, most: float) -> list[dict[str, float]]:
         """Truncate <table>.csv to the rows with `column` <= most, and return these; `log` then appends to the file.
 
-        An incomplete last row is removed. The other rows remain as written.
+        An incomplete last row is removed. The text of all other rows does not change.
         """
         path = self.folder / f"{table}.csv"
         if not path.is_file():
@@ -334,8 +334,8 @@ def is_locked(folder: Path) -> bool:
 def _lock(folder: Path) -> int:
     """Lock a run folder for this process; return the file descriptor of the lock.
 
-    The system releases the lock when the process ends. Some network file systems do not support locks; there, every
-    attempt succeeds.
+    The system releases the lock when the process ends. On a network file system without support for locks, every
+    attempt to lock succeeds.
 
     Raises:
         UserError: another process holds the lock.
@@ -360,7 +360,7 @@ def _lock(folder: Path) -> int:
 def status_of(meta: Mapping[str, Any]) -> str:
     """Return done, stopped, failed, running, or killed (meta.json says running, but the process has ended).
 
-    If the process is on another computer, it cannot be checked; return the status in meta.json.
+    A process on another computer cannot be checked: the result is then the status in meta.json.
     """
     process = meta.get("process", {})
     if meta["status"] != "running" or process.get("host") != platform.node():

@@ -1,1 +1,1 @@
-"""Adaptation of a working arm: estimates of payload, friction, offsets and wrench, and torque corrections."""
+"""Estimate payload, friction, offsets and external wrench while an arm works, and correct its torque."""

@@ -6,19 +6,19 @@ import numpy as np
 
 
 class Adapter(Protocol):
-    """A torque correction for one arm at 1 kHz; like the policy's torque, it passes through the safety filter.
+    """A torque correction for one arm at 1 kHz, which the driver adds before the safety filter.
 
-    Adapters are picklable: on a real-time arm the 1 kHz cycle runs in its own process.
+    An adapter must be picklable, because on a real-time arm it runs in another process than the policy.
     """
 
     def begin(self) -> None:
-        """Begin a motion from rest, with the identified model and no earlier estimates."""
+        """Start a motion from rest, and discard all earlier estimates."""
         ...
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Process one cycle; return the torque (n,) Nm to add from the next cycle on.
+        """Process one cycle; return the torque (n,) Nm that the driver adds in the next cycle.
 
         Args:
-            q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm without gravity, the command sent in this cycle.
+            q, dq: (n,) rad, rad/s, measured in this cycle. tau: (n,) Nm, command sent in this cycle, without gravity.
         """
         ...

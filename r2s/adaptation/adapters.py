@@ -1,6 +1,7 @@
-"""Adapters of conf/adapt, made from the result of an identification.
+"""Create the adapters of conf/adapt from the result of an identification.
 
-To add an adapter, write a function or class of an `AdapterContext` and settings, and name it in conf/adapt/*.yaml.
+A new adapter needs a function or class with an `AdapterContext` and settings as arguments, and a file in conf/adapt
+that names this function or class.
 """
 
 from dataclasses import dataclass
@@ -25,12 +26,11 @@ from r2s.recordings.recording import Recording
 
 @dataclass(frozen=True)
 class AdapterContext:
-    """The input of adapters for one arm: the result of its identification.
+    """The result of an arm's identification, from which the arm's adapter is made.
 
     Attributes:
-        robot, dynamics: the identified arm.
-        posterior: parameter space, and draws from the posterior; None if not available.
-        unloaded: two recordings with commanded torque and no payload; None if not available.
+        robot, dynamics: the identified arm. posterior: parameter space and posterior draws; None if not available.
+        unloaded: two recordings without a payload that contain commanded torque; None if not available.
     """
 
     robot: Robot
@@ -40,17 +40,17 @@ class AdapterContext:
 
     @cached_property
     def arm(self) -> ArmModel:
-        """The identified arm as arrays."""
+        """The identified arm as arrays for compiled functions."""
         return make_arm_model(self.robot, self.dynamics)
 
     @cached_property
     def corrected(self) -> tuple[ArmModel, Noise]:
-        """The arm with a correction fitted to `unloaded`, and the remaining uncertainty."""
+        """The arm with a model correction fitted to `unloaded`, and the uncertainty of the corrected model."""
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 
     def gated(self, adapter: Holdable) -> Adapter:
-        """Return the adapter; if the robot has a tool, inside a `ContactGate` that freezes the adapter in contact."""
+        """Return the adapter; for a robot with a tool, wrap it in a `ContactGate`, which freezes it in contact."""
         if self.robot.tool is None:
             return adapter
         wrench = WrenchObserver(self.robot, self.dynamics)
@@ -60,10 +60,10 @@ class AdapterContext:
 
 
 def observer(context: AdapterContext, filter_s: float) -> Adapter:
-    """Return a disturbance observer, `adapt=observer`; raise UserError if filter_s is not above 0."""
+    """Return the disturbance observer of `adapt=observer`; raise UserError unless filter_s is above 0."""
     return context.gated(Observer(context.arm, filter_s))
 
 
 def rls(context: AdapterContext) -> Adapter:
-    """Return the feedforward from a recursive estimate of payload, friction and offsets, `adapt=rls`."""
+    """Return the adapter of `adapt=rls`: feedforward from recursive estimates of payload, friction and offsets."""
     return context.gated(Feedforward(*context.corrected))

@@ -1,7 +1,7 @@
 """The identified arm as arrays for compiled functions: links, friction, latency.
 
-A table per joint lists the friction of any friction family over speed, in three rows: for each sliding direction, the
-part with the sign of this direction; and the part that depends on speed alone.
+Each joint has a friction table over speed, for any friction family. With the presliding deflection z in [-1, 1], the
+friction is z times the row FORWARD (for z >= 0) or BACKWARD (for z < 0), plus the row SPEED_ONLY.
 """
 
 from typing import NamedTuple
@@ -22,9 +22,9 @@ FORWARD, BACKWARD, SPEED_ONLY = range(3)  # rows of a table
 
 
 class ArmModel(NamedTuple):
-    """The arm of n joints without a payload, as float arrays.
+    """Model of an arm of n joints without a payload, as float arrays.
 
-    Identifications do not fit `angle_friction` and `compliance`; model_correction.py does.
+    `angle_friction` and `compliance` are 0 until `apply_correction` (model_correction.py) adds fitted values.
     """
 
     links: np.ndarray  # (n, LINK)
@@ -47,7 +47,7 @@ class ArmModel(NamedTuple):
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
-    """Return the arrays of one arm; its dynamics `d` have no batch shape."""
+    """Return the `ArmModel` of one arm; d: dynamics of this arm alone, without a batch dimension."""
     position, axes = ee_pose(robot)
     compensated = np.column_stack([robot.mass, robot.mass[:, None] * robot.com])
     compensated[-1] += d.declared_payload

@@ -1,6 +1,6 @@
-"""A gate that freezes an adapter in contact; the adapter would take the contact for a model error and push.
+"""Freeze an adapter in contact, because it would treat the contact force as a model error and push against it.
 
-In contact the added torque stays at its value before the contact began, and the adapter's estimate is frozen.
+In contact, the gate returns the adapter's torque of REWIND cycles earlier, and the adapter's estimate is frozen.
 """
 
 from typing import Protocol

@@ -1,11 +1,11 @@
-"""Estimates of payload, friction and offsets on a working arm, with 95 % intervals.
+"""Estimate payload, friction and offsets of a working arm, with 95 % intervals.
 
     estimator = Estimator(arm, noise)
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A cycle takes about 15 us, the last cycle of a span about 50 us, without `now`. The payload is reported as a physical
-body: mass, centre, and a non-negative second moment about the centre (Wensing, Kim, Slotine, RA-L 3(1), 2018).
+A call takes about 15 us, at the end of a span about 50 us; reading `now` takes longer. `now` reports a physical body,
+whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1), 2018).
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from r2s.physics.robot import SIM_DT
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimate at one moment; `_half` marks half widths of 95 % intervals."""
+    """The estimate at one time; fields ending in `_half` are half widths of 95 % intervals."""
 
     cycle: int  # cycles since the start
     t: float  # s since the start, pauses included
@@ -33,7 +33,7 @@ class Estimate:
     mass_half: float
     centre: np.ndarray  # (3,) m in the payload frame; nan if the mass is not significant
     centre_half: np.ndarray
-    tensor: np.ndarray  # (3, 3) kg m^2 about the centre, of a physical body
+    tensor: np.ndarray  # (3, 3) kg m^2 about the center, of a physical body
     friction: np.ndarray  # (n,), ratio to the model's friction
     friction_half: np.ndarray
     offset: np.ndarray  # (n,) Nm, difference from the model's offset
@@ -49,7 +49,7 @@ class Estimator:
 
     Attributes:
         changes: s, times of detected payload changes.
-        held: whether the estimate is frozen, because the arm touches something.
+        held: whether the estimate is frozen, for example while the arm is in contact.
 
     Args:
         arm: model of the arm. noise: uncertainty of the model.
@@ -69,19 +69,19 @@ class Estimator:
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Begin a motion from rest, `pause_s` after the last; the estimate remains, less certain after the pause."""
+        """Start a motion from rest, `pause_s` after the last motion; a pause increases the estimate's variance."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None
         self._state, self._residual = ResidualState.fresh(self._n), MomentumResidual.empty(self._n)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
-        """Process one cycle's q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether `now` is new.
+        """Process q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether the estimate is new.
 
-        A cycle with values that are not finite begins a motion anew.
+        Values that are not finite restart the motion, as `begin` does.
 
         Raises:
-            UserError: the arrays have another number of joints.
+            UserError: an array does not have one value per joint.
         """
         if q.shape != (self._n,) or dq.shape != (self._n,) or tau.shape != (self._n,):
             raise UserError(f"expected q, dq and tau of {self._n} joints, got {q.shape}, {dq.shape} and {tau.shape}")
@@ -89,7 +89,7 @@ class Estimator:
         if not (np.isfinite(q).all() and np.isfinite(dq).all() and np.isfinite(tau).all()):
             self.begin()
             return False
-        cycle = np.array(q), np.array(dq), np.array(tau)  # one type of arrays, so that numba compiles once
+        cycle = np.array(q), np.array(dq), np.array(tau)  # arrays of one type, so that numba compiles once
         if not update_residual(self._arm, self._state, *cycle, self._residual) or self.held:
             return False
         update(self._filter, self._noise, self._residual)
@@ -113,7 +113,7 @@ class Estimator:
     def _replaced_at_rest(self) -> bool:
         """Return whether the payload after a rest differs from the payload before that rest.
 
-        The payload's variance grows at rest, so the filter follows a change at rest without a jump.
+        At rest the payload's variance grows, so the Kalman filter follows a payload change without a detected jump.
         """
         if self._filter.counts[AT_REST] >= REST_SPANS:
             self._moved = 0
@@ -128,7 +128,7 @@ class Estimator:
 
     @property
     def now(self) -> Estimate:
-        """The estimate at the end of the last span; computed on demand, because it takes longer than a cycle."""
+        """The estimate at the end of the last span; computed when read, because this is slower than an update."""
         if self._now is None:
             self._now = self._report(self._changed)
         return self._now
@@ -141,7 +141,7 @@ class Estimator:
 
     @property
     def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:
-        """The filter, the residual's state and the last span's residual; read only."""
+        """Kalman filter, state of the residual's computation, and the last span's residual; read only."""
         return self._filter, self._state, self._residual
 
     def _report(self, changed: bool) -> Estimate:
@@ -171,10 +171,10 @@ class Estimator:
 
 
 def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the physical body nearest to x (10,): mass kg, centre (3,) m, tensor (3, 3) kg m^2 about the centre.
+    """Return the physical body nearest to x (10,): mass kg, center (3,) m, tensor (3, 3) kg m^2 about the center.
 
-    Mass and first moments stay as they are, because data determine both well. The second moment about the centre is
-    replaced by the nearest non-negative one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
+    Mass and first moments stay unchanged: the data determine them well. The nearest non-negative second moment about
+    the center replaces the estimated one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
     """
     m = float(x[0])
     if m <= 0.0:

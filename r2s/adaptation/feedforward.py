@@ -1,18 +1,18 @@
 """Feedforward of the estimated payload, friction and offsets.
 
-It uses the payload's mass and centre, within the limits of `plausible_payload`. For joint j, the estimate x
-means a torque c = h x, Nm. h contains the payload's ten columns (gravity, Coriolis, acceleration), the model's
-friction for the relative friction error, and 1 for the offset. The variance of c is s^2 = h P h^T. The feedforward is
-w c. Let c be an unbiased estimate of c*. Then E (w c - c*)^2 is least at w = c*^2 / (c*^2 + s^2), and c^2 - s^2 is an
-unbiased estimate of c*^2. Hence
+The feedforward uses the payload's estimated mass and center, clipped by `plausible_payload`. For joint j, the
+estimate x predicts a torque c = h x, Nm. The row h contains the payload's ten columns (gravity, Coriolis,
+acceleration), the model's friction, and 1 for the offset. The variance of c is s^2 = h P h^T, with the covariance P
+of x. The feedforward is w c. For the true torque c*, the mean square error E (w c - c*)^2 is least at
+w = c*^2 / (c*^2 + s^2). Since c^2 - s^2 is an unbiased estimate of c*^2, the weight is
 
-    w = max(0, 1 - s^2 / c^2),
+    w = max(0, 1 - s^2 / c^2).
 
-the positive part of James-Stein shrinkage (1961) for one number: a torque consistent with zero is not added.
+This is James-Stein shrinkage (1961, positive part) for one number: w = 0 if |c| is below its standard deviation s.
 
-The feedforward follows the motion at once, but a new estimate enters through a low-pass over one span. A torque step
-twists elastic gears, so motors run ahead of their links, and the filter interprets this as another payload. On a
-development twin (elastic variant), steps of 30 Nm sustained themselves at 25 Hz.
+The feedforward follows the motion without delay, but a low-pass over one span smooths the step at a new estimate. A
+torque step twists elastic gears, which the Kalman filter interprets as another payload. This causes the next
+step. On an elastic development twin, such steps of 30 Nm repeated at 25 Hz.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ from r2s.physics.robot import SIM_DT
 
 
 class Feedforward:
-    """The `Adapter` that adds the estimated torque, weighted by the certainty of the estimate.
+    """An `Adapter` that adds the estimated torque, with less weight if the estimate is uncertain.
 
     Args:
         arm: the corrected model. noise: uncertainty of the corrected model.
@@ -40,7 +40,7 @@ class Feedforward:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest with the identified model, without earlier estimates."""
+        """Start a motion from rest, and discard all earlier estimates."""
         n = self._n
         self.estimator = Estimator(self._arm, self._noise)
         self._payload, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))
@@ -72,10 +72,10 @@ class Feedforward:
 
 @njit(cache=True, error_model="numpy")
 def plausible_payload(x, most, out):
-    """Write the ten parameters of the payload nearest to the mass and centre of x (10,) within the arm's limits.
+    """Write the ten parameters of a payload with the mass and center of x (10,), clipped to the arm's limits.
 
-    most: (2,) kg, m, largest mass, and largest distance of its centre from the payload frame. The tensor is that of
-    a ball of water, because data hardly determine it, and a wrong tensor feeds back the acceleration.
+    most: (2,) kg, m, largest mass, and largest distance of the payload's center from its frame. The tensor is that
+    of a ball of water, because the data hardly determine it and a wrong tensor would feed back the acceleration.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0
@@ -110,7 +110,7 @@ def shrinkage_weights(filter, residual, payload, weight):
 
 @njit(cache=True, error_model="numpy")
 def _estimated_torque(x, state, payload, weight, slow, torque):
-    """Write the weighted torque (n,) Nm of the estimate x; `slow` (n, 10) is the low-passed `payload_p`."""
+    """Write the torque (n,) Nm of the estimate x times `weight`; update `slow` (n, 10), a low-pass of `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
         total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j]

@@ -1,15 +1,15 @@
 """Kalman filter of payload, friction and offsets; compiled.
 
-State of n joints, N = 10 + 4 n:
+The state of an arm with n joints has N = 10 + 4 n components:
 - the payload's mass, first moments and tensor about the payload frame: kg, kg m, kg m^2;
 - per joint the relative friction error, a random walk;
 - per joint a torque offset in Nm, a random walk;
 - per joint the model error in Nm, an Ornstein-Uhlenbeck process whose variance grows when friction changes;
 - per joint the relative error of the momentum rate, an Ornstein-Uhlenbeck process.
 
-Measurements are momentum residuals, one joint after the other. They have outliers: a breakaway or a vibrating gear
-causes large residuals for a span or two. Huber's function (Robust Statistics, 1981) reduces the weight of innovations
-beyond HUBER standard deviations; a payload change persists, so the filter still follows it.
+The filter processes the momentum residuals joint by joint. Breakaway or a vibrating gear causes large residuals for
+one or two spans. So Huber's function (Robust Statistics, 1981) reduces the weight of innovations beyond HUBER
+standard deviations. The filter still follows a payload change, because the innovations then stay large.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ SPANS, AT_REST = range(2)  # indices of `Filter.counts`; the others are in paylo
 
 
 class Noise(NamedTuple):
-    """Uncertainty of the model of n joints."""
+    """Uncertainty of the model of an arm with n joints."""
 
     white: np.ndarray  # (n,) Nm, white noise of a residual
     momentum_share: np.ndarray  # (n,), relative error of the momentum rate
@@ -56,7 +56,7 @@ class Noise(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """State of the filter and of its test for payload jumps."""
+    """State of the Kalman filter and of the test for payload jumps."""
 
     x: np.ndarray  # (N,), mean
     P: np.ndarray  # (N, N), covariance
@@ -73,7 +73,7 @@ class Filter(NamedTuple):
 
     @staticmethod
     def fresh(noise: Noise) -> "Filter":
-        """Return the filter before its first measurement."""
+        """Return the state before the first measurement."""
         prior, N = noise.prior, len(noise.prior)
         n = (N - BODY) // 4
         return Filter(
@@ -115,7 +115,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Widen the covariance for a pause of `seconds`, at most to the prior; the payload may have changed in it."""
+    """Increase the variances, at most to the prior's, because the payload may change in a pause of `seconds`."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:
@@ -124,7 +124,7 @@ def pause(filter, noise, seconds):
         else:
             drift = noise.friction_drift**2 if i < BODY + n else noise.offset_drift[i - BODY - n] ** 2
         P[i, i] = min(P[i, i] + drift * seconds, max(prior[i] ** 2, P[i, i]))
-    for i in range(BODY + 2 * n, len(prior)):  # forget the model errors of the last posture
+    for i in range(BODY + 2 * n, len(prior)):  # discard the model errors of the last posture
         filter.x[i] = 0.0
         P[i, :] = 0.0
         P[:, i] = 0.0

@@ -1,12 +1,12 @@
 """Correction of the identified model, fitted to recordings without a payload.
 
-An identification omits terms that improve the fit to the recording little. But small torques matter to a payload
-estimate: 0.1 Nm at 0.5 m are 20 g. So the correction has all terms named below for every joint, a mass and first
-moments for every link, and a compliance for every gear. Each parameter has a zero-mean prior of typical width: ridge
-regression, the posterior mean of a linear model (Bishop 2006, 3.3). Measurements are momentum residuals
+An identification omits terms that hardly improve its fit. A payload estimate needs them: 0.1 Nm at a lever arm of
+0.5 m is the weight of 20 g. So the correction fits all terms of a joint (`TERMS`), mass and first moments of every
+link, and the compliance of every gear. Each parameter has a prior with mean zero and a typical standard deviation,
+which makes the fit a ridge regression (Bishop 2006, 3.3). The data of the fit are momentum residuals
 (momentum_residual.py), which need no accelerations.
 
-Behind a compliant gear, the link's angle is the motor angle minus torque / K. A residual that equates both has an
+A compliant gear of stiffness K twists by torque / K. A residual that ignores the twist between motor and link has an
 error of M d2(torque)/dt2 / K: 0.7 Nm at 15 kNm/rad on a Panda whose torque varies by 4 Nm at 7 Hz.
 """
 
@@ -28,7 +28,7 @@ SHARE, OFFSET, LOAD, LAW, ANGLE, CABLE, TERMS = 0, 1, 2, 3, 7, 9, 11
 
 
 class ModelCorrection(NamedTuple):
-    """Correction of the model of n joints."""
+    """Correction of the model of an arm with n joints."""
 
     links: np.ndarray  # (n, 4) kg and kg m, mass and first moment
     compliance: np.ndarray  # (n,) rad/Nm, of the gears
@@ -38,12 +38,12 @@ class ModelCorrection(NamedTuple):
 
     @staticmethod
     def none(n: int) -> "ModelCorrection":
-        """Return a correction that changes nothing."""
+        """Return a correction with all values zero."""
         return ModelCorrection(*map(np.zeros, ((n, 4), (n,), (n, TERMS), (n, n), (n, n))))
 
 
 def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumResidual]) -> ModelCorrection:
-    """Return the correction from residuals of `arm` without a payload; zero for joints that hardly slid."""
+    """Return the correction fitted to residuals of `arm` without a payload; zero for joints that hardly slid."""
     n = robot.n
     shared, own, y, sliding = _columns(robot, arm, residuals)
     sliding = sliding & (sliding.sum(0) >= tuning.LEAST_SPANS)
@@ -73,7 +73,7 @@ def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumRe
 
 
 def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
-    """Return the arm with the correction, except those of inertia and latency, which `Noise` contains."""
+    """Return the arm with all corrections except `inertia` and `latency`, which `Noise` contains."""
     links, table = arm.links.copy(), arm.table.copy()
     before, has_mass = arm.links[:, MASS, None], arm.links[:, MASS] > 0.0
     mass = np.maximum(before + correction.links[:, :1], 0.5 * before)[has_mass]
@@ -98,7 +98,7 @@ def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
 def corrected_residuals(
     robot: Robot, arm: ArmModel, correction: ModelCorrection, residuals: list[MomentumResidual]
 ) -> list[MomentumResidual]:
-    """Return the residuals of the corrected arm, inertia and latency included, from the `residuals` of `arm`."""
+    """Return the `residuals` of `arm` after subtraction of all correction terms, inertia and latency included."""
     shared, own, y, _ = _columns(robot, arm, residuals)
     terms = own * np.concatenate([correction.joints, correction.inertia, correction.latency], 1)
     y = y - shared @ np.concatenate([correction.links.ravel(), correction.compliance]) - terms.sum(-1)
@@ -127,13 +127,13 @@ def _columns(
 
 
 def _link_prior(arm: ArmModel) -> np.ndarray:
-    """Return (n, 4) kg and kg m, prior standard deviations of masses and first moments."""
+    """Return the prior standard deviations (n, 4), kg and kg m, of the links' masses and first moments."""
     mass = np.maximum(arm.links[:, MASS, None], 1e-6)
     return np.concatenate([tuning.LINK_MASS_SHARE * mass, np.repeat(tuning.LINK_CENTRE_M * mass, 3, 1)], 1)
 
 
 def _joint_prior(arm: ArmModel) -> np.ndarray:
-    """Return (n, K), prior standard deviations of the joints' terms."""
+    """Return the prior standard deviations (n, K) of the joints' correction terms."""
     n, level = len(arm.level), np.maximum(arm.level, 1e-6)[:, None]
     one = np.ones((n, 1))
     parts = [

@@ -1,8 +1,8 @@
-"""Generalised momentum of an arm, and its derivatives by a payload's ten inertial parameters (columns); compiled.
+"""Generalized momentum of an arm, and its derivatives by a payload's ten inertial parameters (columns); compiled.
 
-p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q), without accelerations (De Luca and Mattone, ICRA 2003). Let S_j
-be joint j's screw about the base origin, and h_j the momentum of all bodies beyond joint j. Then p_j = S_j . h_j and
-(C^T dq)_j = dS_j/dt . h_j. Both are linear in each body's mass m, first moments h and tensor about its frame.
+p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q), without accelerations (De Luca and Mattone, ICRA 2003). Joint j
+has the screw S_j about the base origin and moves bodies with the total momentum h_j. Then p_j is S_j . h_j, and the
+j-th element of C^T dq is dS_j/dt . h_j. These two are linear in each body's mass, first moments and tensor.
 """
 
 from typing import NamedTuple
@@ -12,12 +12,12 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.physics.newton_euler import AXIS, COM, FRAME, MASS, PLACE, TENSOR, product, rotate, rotate_about
 
-BODY = 10  # inertial parameters: m, h, and xx, yy, zz, xy, xz, yz about the frame's origin
+BODY = 10  # inertial parameters: mass, first moments, and xx, yy, zz, xy, xz, yz about the frame's origin
 MOMENTUM_WORK = 18  # columns of the workspace, per joint
 
 
 class MomentumTerms(NamedTuple):
-    """Momentum of n joints, and the torques that change it, besides commands and friction."""
+    """Momentum of n joints, and the torques that change this momentum, except commands and friction."""
 
     p: np.ndarray  # (n,) Nm s
     coriolis: np.ndarray  # (n,) Nm, C^T dq

@@ -1,12 +1,12 @@
-"""Momentum residual over a few milliseconds: torque that commands, friction and links do not explain; compiled.
+"""Momentum residual: mean torque over 60 ms that commands, friction and links do not explain; compiled.
 
-The change of momentum equals the integral of all torques, so nothing is differentiated. A residual compares two means
-one span of T s apart: y = (m now - m before) / T, Nm. m is the mean of integrated model torque minus momentum.
-The residual is linear in the unknown parameters: y = H x + noise.
+The change of momentum equals the integral of all torques, so no signal is differentiated. Let m be a moving average
+of the integrated model torque minus the momentum. The residual y = (m(t) - m(t - T)) / T, Nm, compares two averages
+one span of T s apart, and is linear in the unknown parameters x: y = H x + noise.
 
-Each mean has triangular weights over two spans, so y weighs torque by a quadratic spline over three spans. Elastic
-gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm; sampled once per span, they would alias
-to torques of a few hertz. A triangle passes 2.4 % of a 60 Hz vibration, the spline 0.4 %.
+The moving average m has triangular weights over two spans, so y weights torque by a quadratic spline over three
+spans. Elastic gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm. Samples once per span
+would alias this vibration to a few hertz. The triangular weights pass 2.4 % of a 60 Hz vibration, the spline 0.4 %.
 """
 
 from typing import NamedTuple
@@ -25,14 +25,14 @@ CYCLE, COMMAND, ENDED = range(3)  # indices of `counts`: cycles of this span, al
 BEFORE, INTEGRAL = range(2)  # rows of `model`, `friction`, `payload`: value a cycle ago; integral over the span
 # rows of `sums`: residual Nm s, friction Nm s, momentum Nm s, q, dq, motor torque Nm
 RESIDUAL, FRICTION, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
-# triangle weights: ending with this span, beginning with it; begun with the last span, ended with the last span
+# first index of `sums`: falling, rising side in this span; rising side in the last span; triangle ended with it
 FALLING, RISING, LAST_RISING, LAST_WHOLE = range(4)
 RISING_SUM = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of a rising side; the falling side has SPAN - 1 to 0
 STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in spans 1 and 2
 
 
 class ResidualState(NamedTuple):
-    """State of the computation for n joints, from cycle to cycle."""
+    """State of the residual's computation for n joints, from cycle to cycle."""
 
     counts: np.ndarray  # (3,): CYCLE, COMMAND, ENDED
     commands: np.ndarray  # (SLOTS, n) Nm, delay line
@@ -51,7 +51,7 @@ class ResidualState(NamedTuple):
 
     @staticmethod
     def fresh(n: int) -> "ResidualState":
-        """Return the state of an arm before its first cycle."""
+        """Return the state of n joints before the first cycle."""
         shapes = [(SLOTS, n), (n,), (n,), (n,), (2, n), (2, n), (2, n, BODY), (4, SUMS, n), (4, n, BODY)]
         arrays = map(np.zeros, [*shapes, (2, n), (2, n)])
         work = np.zeros((n, max(MOMENTUM_WORK, WORK)))
@@ -59,12 +59,12 @@ class ResidualState(NamedTuple):
 
 
 class MomentumResidual(NamedTuple):
-    """Residual of one span of n joints, written by `update_residual`; means are over the span."""
+    """Residual of n joints at the end of a span, written by `update_residual`; means are over three spans."""
 
     y: np.ndarray  # (n,) Nm, the residual
     payload: np.ndarray  # (n, 10), the payload's columns of y
     friction: np.ndarray  # (n,) Nm, mean
-    friction_path: np.ndarray  # (n,) Nm, total variation of friction
+    friction_path: np.ndarray  # (n,) Nm, total variation of friction in the last span
     sliding: np.ndarray  # (n,), 1 if the joint slid throughout the three spans
     rate: np.ndarray  # (n,) Nm, mean rate of the momentum
     acceleration: np.ndarray  # (n,) rad/s^2, mean
@@ -75,7 +75,7 @@ class MomentumResidual(NamedTuple):
 
     @staticmethod
     def empty(n: int) -> "MomentumResidual":
-        """Return zeros for `update_residual` to overwrite."""
+        """Return initial values, which `update_residual` overwrites."""
         arrays = {name: np.zeros(n) for name in MomentumResidual._fields}
         arrays |= {"payload": np.zeros((n, BODY)), "sliding": np.ones(n), "gear": np.zeros((n, n))}
         return MomentumResidual(**arrays)
@@ -86,8 +86,8 @@ def update_residual(arm, state, q, dq, tau, out):
     """Process one cycle; return whether `out` holds the residual of a new span.
 
     Args:
-        arm: `ArmModel`. state: `ResidualState`. q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm without gravity,
-            the command sent in this cycle. out: `MomentumResidual`.
+        arm: `ArmModel`. state: `ResidualState`. q, dq: (n,) rad, rad/s, measured in this cycle.
+        tau: (n,) Nm, command sent in this cycle, without gravity. out: `MomentumResidual`.
     """
     counts = state.counts
     momentum(arm, q, dq, state.terms, state.work)
@@ -106,7 +106,7 @@ def update_residual(arm, state, q, dq, tau, out):
 
 @njit(cache=True, error_model="numpy")
 def _integrate(arm, state, q, dq, out):
-    """Integrate model torque, friction and the payload's columns over one cycle."""
+    """Add one cycle to the integrals of model torque, friction and the payload's columns (momentum.py)."""
     h, counts, terms = SIM_DT, state.counts, state.terms
     model, friction, payload, deflection = state.model, state.friction, state.payload, state.deflection
     path, sliding = out.friction_path, out.sliding
@@ -139,7 +139,7 @@ def _integrate(arm, state, q, dq, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_to_sums(state, q, dq):
-    """Add this cycle to the triangle that ends with this span and to the one that begins with it."""
+    """Add this cycle to two triangular averages: one ends with this span, the other begins with this span."""
     rising, p, payload_p = state.counts[CYCLE] + 1, state.terms.p, state.terms.payload_p
     for k, weight in ((FALLING, SPAN - rising), (RISING, rising)):
         sums, payload_sums = state.sums[k], state.payload_sums[k]
@@ -156,7 +156,7 @@ def _add_to_sums(state, q, dq):
 
 @njit(cache=True, error_model="numpy")
 def _close_span(arm, state, out):
-    """Write the residual of the span that ends, and restart the integrals so that they stay small."""
+    """Write the residual at the end of a span, and reset the integrals to zero, so that they stay small."""
     whole = SPAN * SPAN  # sum of the weights of a triangle
     scale = 1.0 / (whole * SPAN * SIM_DT)  # from sums to a change of means per second
     sums, slid, n = state.sums, state.slid, len(out.y)

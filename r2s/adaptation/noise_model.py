@@ -1,4 +1,4 @@
-"""Uncertainty of the identified model: from its posterior, and from recordings without a payload."""
+"""Determine the uncertainty of an identified model, from its posterior and from recordings without a payload."""
 
 import numpy as np
 from scipy.optimize import nnls
@@ -27,7 +27,7 @@ def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
 
 
 def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
-    """Return the noise of an arm without recordings; `prior`: None if no posterior is available."""
+    """Return the default `Noise` of an arm without recordings; prior: None if no posterior is available."""
     n = len(arm.level)
     zero = np.zeros(n)
     friction, offset = prior or (zero + 0.3, 0.3 * arm.level)
@@ -60,9 +60,9 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 
 
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
-    """Return the residuals of all spans of a recording of commanded torque."""
+    """Return the momentum residuals of all spans of a recording with commanded torque."""
     n, out = recording.n_joints, []
-    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # array types as in live signals
+    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # arrays as in live signals
     for stretch in recording.stretches:
         state, r = ResidualState.fresh(n), MomentumResidual.empty(n)
         for k in range(stretch.start, stretch.stop):
@@ -76,11 +76,11 @@ def fit_noise(
 ) -> tuple[ModelCorrection, Noise]:
     """Return the model correction from two motions without a payload, and the noise of the corrected model.
 
-    The noise comes from `other`, which should be another motion, after a correction fitted to `train` alone. Per
-    joint, the model error comes from covariances at lags of 60 to 300 ms; white noise and its growth with the
-    momentum rate come from the remaining variance. Then each joint's noise is scaled until the filter's innovations
-    have their predicted variance, and then the noise of all joints until the odds of a payload change stay below the
-    number of spans. The initial friction and offsets, and the correction itself, come from both motions.
+    The noise is fitted to the residuals that a correction fitted to `train` leaves in `other`, another motion.
+    Residual covariances at lags of 60 to 300 ms yield a joint's model error; the remaining variance determines white
+    noise and its growth with the momentum rate. A factor per joint then scales the noise until innovations have
+    their predicted variance, and a common factor until the odds of a payload change stay below the number of spans.
+    The returned correction, initial friction and initial offsets are fitted to both motions.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)
@@ -99,7 +99,7 @@ def fit_noise(
 
 
 def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
-    """Return the noise that fits residuals without a payload, scaled to the filter's innovations."""
+    """Return the noise fitted to residuals without a payload, then scaled to the Kalman filter's innovations."""
     n = len(noise.level)
     white, momentum, model = noise.white.copy(), noise.momentum_share.copy(), noise.model.copy()
     for j in range(n):
@@ -118,7 +118,7 @@ def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
 
 
 def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: float) -> tuple[float, float, float]:
-    """Return white noise Nm, share of the momentum rate, and model error Nm of joint j; `model`: its default."""
+    """Return joint j's white noise Nm, momentum share, and model error Nm; model: default of the model error."""
     columns = np.array([[r.friction[j], 1.0] for r in residuals])
     y, sliding = np.array([r.y[j] for r in residuals]), np.array([r.sliding[j] > 0 for r in residuals])
     fitted = columns @ np.linalg.lstsq(columns[sliding], y[sliding], rcond=None)[0]
@@ -144,7 +144,7 @@ def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
 
 
 def _with_model(prior: np.ndarray, model: np.ndarray, momentum: np.ndarray) -> np.ndarray:
-    """Return the prior with these standard deviations of model and momentum errors (n,)."""
+    """Return `prior` with `model` and `momentum` (n,) as standard deviations of model and momentum errors."""
     out = prior.copy()
     out[-2 * len(model) :] = np.concatenate([model, momentum])
     return out
@@ -158,7 +158,7 @@ def _without_payload(noise: Noise) -> Noise:
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Run a filter; return the filter, normalised innovations (M, n) (nan at rest), and log odds (M,)."""
+    """Filter M residuals; return the `Filter`, normalized innovations (M, n), nan at rest, and log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)
@@ -169,12 +169,12 @@ def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.nd
 
 
 def _largest_odds(noise: Noise, residuals: list[MomentumResidual]) -> float:
-    """Return the largest log odds of a payload change, in motion without such a change."""
+    """Return the largest log odds of a payload change, for residuals without a payload change."""
     return float(_run(noise, residuals)[2][len(residuals) // 10 :].max())
 
 
 def _innovation_scale(noise: Noise, residuals: list[MomentumResidual]) -> np.ndarray:
-    """Return (n,) root mean squares of the normalised innovations, without a payload in the state."""
+    """Return (n,) root mean squares of the normalized innovations of an arm without a payload."""
     size = np.abs(_run(_without_payload(noise), residuals)[1])[len(residuals) // 10 :]  # offsets settle before this
     scale = np.ones(size.shape[1])
     for j in range(len(scale)):

@@ -1,12 +1,12 @@
 """Disturbance observer: the momentum residual, added to the policy's torque through a first-order low-pass.
 
-With p = M(q) dq and dp/dt = tau + C^T dq - g - friction - d, generalised momentum p yields the disturbance torque
-d without accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006).
-Here d is the mean over three spans (momentum_residual.py), and the estimate d^ follows filter_s dd^/dt = d - d^.
-Commands pass the identified delay and lag first.
+The momentum p = M(q) dq obeys dp/dt = tau + C^T dq - g - friction - d, which yields the disturbance torque d without
+accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006). Here d is
+the mean over three spans (momentum_residual.py), and tau the command after the identified delay and lag. The low-pass
+filter_s dd^/dt = d - d^ yields the estimate d^.
 
-If a joint does not slide throughout the spans, stiction may balance any torque within breakaway. Then d lies between
-two bounds, and d^ changes only as much as these require: stiction supports the arm, as in the policy's training.
+If a joint does not slide throughout the three spans, stiction may hold it, and the residual only bounds d. The
+estimate then changes no more than these bounds require, because stiction supports the arm, as in the training.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ from r2s.physics.robot import SIM_DT
 
 
 class Observer:
-    """The `Adapter` that adds the whole disturbance torque, whatever its cause.
+    """An `Adapter` that adds the estimated disturbance torque, whatever causes the disturbance.
 
     Attributes:
         held: whether the estimated disturbance is frozen.
@@ -38,7 +38,7 @@ class Observer:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest with a disturbance of zero."""
+        """Start a motion from rest; set the estimated disturbance to zero."""
         n = len(self._arm.level)
         self._state, self._residual = ResidualState.fresh(n), MomentumResidual.empty(n)
         self._disturbance = np.zeros((2, n))  # disturbance of the last span, and its low-pass
@@ -52,7 +52,7 @@ class Observer:
 
 @njit(cache=True, error_model="numpy")
 def _observe(arm, state, residual, q, dq, tau, share, disturbance):
-    """Process one cycle; write `disturbance` (2, n) Nm: in the last span, and low-passed with the gain `share`."""
+    """Process one cycle; write `disturbance` (2, n) Nm: mean over three spans, and its low-pass (gain `share`)."""
     measured, filtered = disturbance[0], disturbance[1]
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):

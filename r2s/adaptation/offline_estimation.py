@@ -1,4 +1,4 @@
-"""The recursive estimate from a recording: causal, cycle by cycle, as on a working arm."""
+"""Apply the recursive estimator to a recording: causally, cycle by cycle, as on a working arm."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,13 +27,13 @@ def fit_correction(
     posterior: tuple[ParameterSpace, np.ndarray] | None = None,
     unloaded: tuple[Recording, Recording] | None = None,
 ) -> tuple[ModelCorrection, Noise]:
-    """Return the model correction from recordings without a payload, and the remaining uncertainty.
+    """Return the model correction from recordings without a payload, and the uncertainty of the corrected model.
 
     Args:
         robot, dynamics: the identified arm.
         posterior: parameter space and posterior draws, for the uncertainty of friction and offsets.
-        unloaded: two recordings of commanded torque without a payload, such as those of the identification. Without
-            recordings the correction is zero, and the model error a tenth of the friction.
+        unloaded: two recordings with commanded torque and without a payload, for example those of the identification.
+            None: the correction is zero, and the model error is a tenth of the friction level.
     """
     arm = make_arm_model(robot, replace(dynamics, declared_payload=np.zeros(4)))  # as during the identification
     prior = prior_of(*posterior) if posterior is not None else None
@@ -44,10 +44,10 @@ def fit_correction(
 
 
 def at_rate(robot: Robot, recording: Recording) -> Recording:
-    """Return the recording with one row per millisecond.
+    """Return the recording, resampled to one row per millisecond.
 
     Raises:
-        UserError: the number of joints differs, the torque is not the commanded one, or the rate is below 200 Hz.
+        UserError: the recording has a wrong number of joints, no commanded torque, or a rate below 200 Hz.
     """
     if recording.n_joints != robot.n:
         raise UserError(f"data: expected {robot.n} joints of {robot.name}, got {recording.n_joints}")
@@ -62,7 +62,7 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
 def estimate_recording(
     robot: Robot, estimator: Estimator, recording: Recording, report: Callable[[Estimate], None] | None = None
 ) -> list[Estimate]:
-    """Return the estimate at the end of each span of the recording; `report` receives each one at once."""
+    """Return the estimates at the ends of all spans of the recording; call `report` with each new estimate."""
     recording, out = at_rate(robot, recording), []
     for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         estimator.begin(pause_s)

@@ -1,10 +1,10 @@
-"""Test for sudden payload changes (jumps), and their correction in the Kalman filter; compiled.
+"""Detect sudden payload changes (jumps), and correct the Kalman filter's estimate after a jump; compiled.
 
-A generalised likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). For each of the last ONSETS spans, the
-test stores the filter's response (signature) to a jump that began there, and computes the jump's odds under a prior.
-Without a jump the mean odds have expectation 1, so odds above x have probability 1 / x at most (Markov's inequality):
-a threshold equal to the number of tests in ten hours allows one false alarm in that time. Model errors have heavier
-tails than the filter's noise, so a threshold for ten hours aims at one alarm per hour.
+This is a generalized likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). A jump may begin in any of the
+last ONSETS spans. For each onset, the test stores the Kalman filter's response to a jump (signature) and computes
+the odds of a jump under a prior. Without a jump, the mean of these odds exceeds x with probability 1 / x at most
+(Markov's inequality, expectation 1). So a threshold equal to the number of tests in ten hours allows one false alarm
+in ten hours. In practice this aims at one per hour, because model errors have heavier tails than the filter's noise.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ MEAN, ONSET = range(2)  # indices of `Filter.log_odds`
 
 @njit(cache=True)
 def begin_onset(filter):
-    """Replace the oldest onset by an onset at this span."""
+    """Replace the oldest onset by the present span."""
     at = filter.counts[NEXT]
     filter.signature[at] = 0.0
     filter.information[at] = 0.0
@@ -56,7 +56,7 @@ def update_onsets(filter, residual, j, v, S):
 
 @njit(cache=True, error_model="numpy")
 def detect(filter, noise):
-    """Write the log odds of a jump; per onset (C, d): d (C + P0^-1)^-1 d / 2 - log(det(1 + P0 C)) / 2, P0: prior."""
+    """Write `Filter.log_odds`: log of the mean odds of a jump over all onsets, and index of the likeliest onset."""
     best, at, mean, total = -np.inf, -1, -np.inf, 0.0
     A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
     logs = np.empty(ONSETS)
@@ -74,8 +74,8 @@ def detect(filter, noise):
 
 @njit(cache=True, error_model="numpy")
 def _solve(C, d, prior, A, b):
-    """Return one onset's log odds; write the Cholesky factor of C + P0^-1 (diagonal inverted) to A, the jump to b."""
-    log = 0.0
+    """Return an onset's log odds d (C + P0^-1)^-1 d / 2 - log(det(1 + P0 C)) / 2, with the prior covariance P0."""
+    log = 0.0  # A: Cholesky factor of C + P0^-1, its diagonal inverted; b: the jump
     for i in range(JUMP):
         for k in range(i + 1):
             s = C[i, k] + (1.0 / prior[i] ** 2 if i == k else 0.0)
@@ -135,6 +135,6 @@ def apply_jump(filter, noise):
 
 @njit(cache=True)
 def widen_payload(P, noise):
-    """Raise the variances of mass and first moments by those of a new payload."""
+    """Add the variances of a new payload to those of the payload's mass and first moments."""
     for c in range(JUMP):
         P[c, c] += (NEW_PAYLOAD * noise.prior[c]) ** 2

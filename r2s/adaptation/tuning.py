@@ -1,7 +1,7 @@
 """Tuning constants of the package adaptation, each with unit and source.
 
-A constant without a named source is an order of magnitude. benchmarks/payload.py tested all of them together on
-development twins (seeds 0 to 9); NAME=VALUE on its command line tests another value.
+A constant without a named source is chosen by its order of magnitude. benchmarks/payload.py tested all constants
+together on development twins (seeds 0 to 9); its argument NAME=VALUE tests another value of a constant.
 """
 
 import numpy as np
@@ -33,7 +33,7 @@ LEAST_SPANS = 50  # sliding spans that a fit needs
 CORRELATED_SPANS = 15  # spans that share one error: 0.3 s, see CORRELATION_S
 
 # noise model (noise_model.py)
-# shares of an arm's largest payload and distance: RMS of a mass uniform up to half the largest, RMS of centres
+# shares of an arm's largest payload and distance: RMS of a mass uniform up to half the largest, RMS of centers
 # uniform in a ball of half the distance; tensor of 0.87 kg of 5 cm size, 5 cm from the frame, for 3 kg and 0.15 m
 PAYLOAD_MASS, PAYLOAD_CENTRE, PAYLOAD_TENSOR = 0.5 / np.sqrt(3), 0.5 / np.sqrt(5), 4e-3 / (3.0 * 0.15**2)
 WARMED = 0.07  # share of friction that may have changed by temperature since the identification
@@ -65,12 +65,12 @@ MOST_SURPRISE = 9.0  # squared standard deviations: a larger innovation is a jum
 ONSETS = 10  # spans at which a jump may have begun: 0.2 s
 THRESHOLD = np.log(36000.0 / T)  # log odds: one false alarm in ten hours (Markov's inequality)
 NEW_PAYLOAD = 0.2  # share of the prior: standard deviation of a payload directly after a jump
-SETTLING_SPANS = round(0.5 / T)  # spans of motion after a rest, in which its payload is compared with that before
+SETTLING_SPANS = round(0.5 / T)  # spans of motion after a rest in which its payload is compared with that before
 # squared distance of two estimates: one false alarm in an hour of tests, doubled because model errors persist
 REPLACED = 2.0 * chi2.isf(T / 3600.0, 4)
 
 # reported estimate (estimator.py)
-LEAST_MASS = 0.02 / 3.0  # share of the largest payload, 0.02 kg of a Panda's 3 kg: a smaller mass gets no centre
+LEAST_MASS = 0.02 / 3.0  # share of the largest payload, 0.02 kg of a Panda's 3 kg: a smaller mass gets no center
 FRICTION_CURVE = 0.02  # share of friction: error of its speed dependence, which one factor cannot follow
 
 # feedforward (feedforward.py)

@@ -1,16 +1,16 @@
-"""External wrench on a working arm without a force sensor, with 95 % intervals, and detection of contacts.
+"""Estimate the external wrench on an arm without a force sensor, with 95 % intervals, and detect contacts.
 
     observer = WrenchObserver(robot, dynamics)
     for each millisecond: observer(state.q, state.dq, command)
     observer.force, observer.force_half, observer.in_contact
 
-The force acts at the tip of `robot.tool`; without a tool, force and moment act at the end effector. wrench_filter.py
-describes the estimate. A contact is a force whose square, in units of its covariance, exceeds a threshold for 15 ms
-while a joint moves: a chi-square test of the hypothesis that no force acts. The threshold aims at one false alarm per
-hour. It is at least the threshold for independent normal errors in each cycle. If errors in motion without contact
-are larger, their tail sets the threshold: maxima over half seconds have an exponential tail (extreme values of a
-chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3), which is
-extrapolated to an hour.
+The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
+tool (wrench_filter.py). A contact begins when the squared force, in units of its covariance, exceeds a threshold for
+15 ms while a joint moves, in a chi-square test of the hypothesis that no force acts. The threshold aims at one false
+alarm per hour. It is at least GAUSSIAN, the value for independent normal errors in each cycle. For larger errors,
+`contact_threshold` determines the threshold from recordings without contact: the largest squares of half seconds
+have an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling
+Extremal Events, 1997, section 3.3), which the function extrapolates to an hour.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ class WrenchObserver:
         tool: the robot's tool, or None.
 
     Args:
-        robot, dynamics: the identified arm. threshold: see above; None: twice GAUSSIAN.
+        robot, dynamics: the identified arm. threshold: see the attribute; None: twice GAUSSIAN.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, threshold: float | None = None):
@@ -61,16 +61,16 @@ class WrenchObserver:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest, without contact, and without a payload beyond the model."""
+        """Start a motion from rest, without contact, and with the model's payload only."""
         self._state = WrenchState.fresh(len(self._arm.level), self._components)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
-        """Process a cycle's q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return `in_contact`.
+        """Process q, dq (n,) rad, rad/s and command (n,) Nm without gravity of one cycle; return `in_contact`.
 
-        A cycle with values that are not finite begins a motion anew.
+        Values that are not finite restart the motion, as `begin` does.
 
         Raises:
-            UserError: the arrays have another number of joints.
+            UserError: an array does not have one value per joint.
         """
         n = len(self._arm.level)
         if q.shape != (n,) or dq.shape != (n,) or tau.shape != (n,):
@@ -78,24 +78,24 @@ class WrenchObserver:
         if not np.isfinite(q.sum() + dq.sum() + tau.sum()):
             self.begin()
             return False
-        self._q[:], self._dq[:], self._tau[:] = q, dq, tau  # one type of arrays, so that numba compiles once
+        self._q[:], self._dq[:], self._tau[:] = q, dq, tau  # arrays of one type, so that numba compiles once
         update_wrench(self._arm, self._tip, self._noise, self.threshold, self._state, self._q, self._dq, self._tau)
         return self.in_contact
 
     def carry(self, payload: np.ndarray) -> None:
-        """Set the payload beyond the model: ten inertial parameters in the payload frame (momentum.py)."""
+        """Set the payload that the model lacks: ten inertial parameters in the payload frame (momentum.py)."""
         n, state = len(self._arm.level), self._state
         state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # the payload's current momentum
         state.payload[:] = payload
 
     @property
     def in_contact(self) -> bool:
-        """Whether the arm touches its surroundings; False once the force proves to be a payload's weight."""
+        """Whether the arm touches its surroundings; False if the force is a payload's weight (`hangs`)."""
         return bool(self._state.contact[TOUCHES] > 0.0) and not self.hangs
 
     @property
     def hangs(self) -> bool:
-        """Whether the force is a payload's weight, because the force has pointed down over 5 cm of motion."""
+        """Whether the force is a payload's weight: it has pointed down over 5 cm of the tip's path."""
         return bool(self._state.contact[HANGING] > tuning.WEIGHT_PATH)
 
     @property
@@ -161,8 +161,8 @@ def observe_recording(
     """Return a row per millisecond: wrench with half widths of 95 % intervals, contact, and position of the tip.
 
     Args:
-        estimator: estimates the payload, whose effect is subtracted. With a tool, contact freezes this estimate.
-        report: called with each estimate at once.
+        estimator: estimates a payload, whose effect is removed from the wrench; frozen while a tool is in contact.
+        report: called with each new estimate of the payload.
     """
     recording = at_rate(robot, recording)
     touch = 1 + 2 * len(observer.wrench)  # column of `in_contact`
@@ -205,7 +205,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why `contact_threshold` refuses recordings without contact (rate, length); None if it accepts them."""
+    """Return why the recordings are unfit for `contact_threshold` (rate or length), or None if they are fit."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]
@@ -215,7 +215,7 @@ def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
 
 
 def contact_threshold(robot: Robot, observer: WrenchObserver, free: Sequence[Recording]) -> float:
-    """Return the threshold for one false alarm per hour, from recordings without contact.
+    """Return the contact threshold for one false alarm per hour, determined from recordings without contact.
 
     Raises:
         UserError: the recordings are shorter than 5 s, or their rate is below 200 Hz.

@@ -1,18 +1,18 @@
-"""Kalman filter of the external wrench, of momentum, and of the error of modelled friction; compiled.
+"""Kalman filter of the external wrench, the momentum, and the friction model's error; compiled.
 
-State of n joints, N = w + 2 n: the wrench at the tip in base axes, w = 3 (force) or 6 (force and moment); per joint
-the error b of its friction f = f_model + b, Nm; the generalised momentum p, Nm s, which every cycle measures
-(momentum.py). dp/dt = u - f + J^T wrench, with u all known torques (De Luca and Mattone, ICRA 2003; as a disturbance
-in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
+The state has N = w + 2 n components: the wrench at the tip in base axes, with w = 3 (force) or 6 (force and moment);
+for each of n joints, the error b of the friction f = f_model + b, Nm; and the generalized momentum p, Nm s, which
+every cycle measures (momentum.py). Momentum obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
+and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 
-The uncertainty of f depends on whether the joint slides (wrench_friction.py):
-- It slides: b is the error of the identified friction, small with short correlation. Near a reversal b is larger,
-  because the noisy speed leaves the direction of friction uncertain. Such a joint measures the wrench.
-- It rests: friction balances the other torques and stays within the breakaway edges. Such a joint only limits how far
-  the wrench can have changed.
-The wrench changes with the motion of the tip, as in a stiff environment. With all joints at rest the tip is fixed:
-only a hand may change the force, and friction hides changes within the breakaway edges. Once the variance
-of a resting joint's friction exceeds that of a uniform distribution between the edges, it is reset to the latter.
+The uncertainty of a joint's friction depends on whether the joint slides (wrench_friction.py):
+- A sliding joint measures the wrench: its friction error b is small, with a short correlation time. Near a reversal,
+  b is larger, because the noisy speed leaves the direction of friction uncertain.
+- A resting joint only bounds the change of the wrench: its friction balances the other torques, between the negative
+  and the positive breakaway torque (edges).
+The wrench is assumed to change with the motion of the tip, as in a stiff environment. With all joints at rest, only a
+person's hand can change the force, and friction hides changes between the edges. The variance of a resting joint's
+friction is at most that of a uniform distribution between the edges.
 """
 
 import numpy as np
@@ -47,12 +47,12 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
-    """Process one cycle; the wrench and its covariance are the first rows of `state.x` and `state.P`.
+    """Process one cycle; the first rows of `state.x` and `state.P` are the wrench and its covariance.
 
     Args:
         arm: `ArmModel`. tip: (3,) m in the last link's frame. noise: `WrenchNoise`.
-        threshold: squared force, in variances, above which there is contact. q, dq: (n,) rad, rad/s, of this cycle.
-        tau: (n,) Nm without gravity, the command sent in this cycle.
+        threshold: squared force, in units of its covariance, above which the arm is in contact.
+        q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm, command sent in this cycle, without gravity.
     """
     joints, counts, n = state.joints, state.counts, len(q)
     if counts[CYCLE] == 0:
@@ -98,7 +98,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
 
 @njit(cache=True, error_model="numpy")
 def _shake(state):
-    """Update the mean square of each momentum's fast part, which comes from gears and vibration."""
+    """Update the mean square of the high-frequency part of each joint's momentum, which vibrating gears cause."""
     joints, rate = state.joints, SIM_DT * tuning.SHAKE_BAND
     for j in range(joints.shape[1]):
         if state.counts[CYCLE] == 0:
@@ -112,7 +112,7 @@ def _shake(state):
 
 @njit(cache=True, error_model="numpy")
 def _begin(noise, state):
-    """Set the state of the first cycle: measured momentum, and zero force with a small variance."""
+    """Set the state of the first cycle: the measured momentum, and a wrench of zero with a small variance."""
     x, P, joints = state.x, state.P, state.joints
     n = joints.shape[1]
     w = len(x) - 2 * n
@@ -220,7 +220,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Limit the friction of each resting joint to the breakaway edges, and its variance to `_hidden`."""
+    """Limit each resting joint's friction to its breakaway torques (edges), and its variance to `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)

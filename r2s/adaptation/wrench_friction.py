@@ -1,8 +1,8 @@
-"""Friction in the wrench filter: which joints rest, and in which direction (side) the others slide; compiled.
+"""Friction in the wrench filter: determine which joints rest, and the direction (side) of sliding; compiled.
 
-The speed of a joint at rest stays 0, so its friction balances all other torques. With A = M_rs M_ss^-1 of joints at
-rest (r) and sliding joints (s), the momentum at rest follows from the momentum of the sliding joints: dp_r/dt = A
-(dp_s/dt - M'_ss dq_s) + M'_rs dq_s, and f_r = u_r + J_r^T wrench - dp_r/dt.
+The friction of a resting joint balances all other torques. The mass matrix M couples resting joints (r) to sliding
+joints (s). With A = M_rs M_ss^-1, the momentum of the resting joints changes by dp_r/dt = A (dp_s/dt - M'_ss dq_s) +
+M'_rs dq_s, and their friction is f_r = u_r + J_r^T wrench - dp_r/dt.
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ def masses(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def couple(state):
-    """Write M_rs M_ss^-1 of the joints at rest (r) and the sliding ones (s)."""
+    """Write the coupling M_rs M_ss^-1 of resting joints (r) and sliding joints (s), from the mass matrix M."""
     rest, mass = state.joints[REST], state.mass
     state.coupling[:] = 0.0
     sliding, resting = np.flatnonzero(rest == 0.0), np.flatnonzero(rest == 1.0)
@@ -72,7 +72,7 @@ def couple(state):
 
 @njit(cache=True, error_model="numpy")
 def known_torque(arm, noise, state, q):
-    """Decide which joints rest; write the modelled friction and the known torques."""
+    """Decide which joints rest; write each joint's modeled friction and the sum of its known torques."""
     joints, terms, x, P = state.joints, state.terms, state.x, state.P
     n = len(q)
     b = len(x) - 2 * n
@@ -111,7 +111,7 @@ def known_torque(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
-    """Decide whether joint j rests; a resting joint that has crept slides in this cycle only."""
+    """Decide whether joint j rests; a resting joint that has crept is treated as sliding for this cycle."""
     joints[CREEP, j] = 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])
@@ -131,13 +131,13 @@ def _rest_or_motion(noise, joints, j, q):
 
 @njit(cache=True, error_model="numpy")
 def _unlagged(joints, j):
-    """Return the speed of joint j, rad/s, without the lag of its low-passes at a constant acceleration."""
+    """Return the speed of joint j, rad/s, corrected for the lag of its low-passes at constant acceleration."""
     return joints[FAST, j] + tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
 
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, of friction whose side is wrong with probability p: 4 f^2 p (1 - p)."""
+    """Return the variance, Nm^2, of friction whose direction is wrong with probability p: 4 f^2 p (1 - p)."""
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # logistic for the normal distribution
@@ -147,7 +147,7 @@ def side_variance(noise, joints, j):
 
 @njit(cache=True, error_model="numpy")
 def holding_friction(state, j, gain):
-    """Return the friction, Nm, that holds joint j at rest; write its derivative by the state in `gain` (N,)."""
+    """Return the friction, Nm, that keeps joint j at rest; write its derivative by the state x to `gain` (N,)."""
     x, joints, J = state.x, state.joints, state.jacobian
     n = joints.shape[1]
     w = len(x) - 2 * n

@@ -1,14 +1,14 @@
-"""External force from momentum and from an identified surface together.
+"""Combine two estimates of the external force: from the momentum and from an identified surface.
 
-Encoders measure the penetration depth of the tip, from which the law of the surface (r2s/physics/surface.py) yields
-the normal force F_s. Its variance s^2 comes from the surface's posterior, encoder noise and law errors. The force
-F from momentum, of covariance P, has other errors, so one Kalman update combines both: F' = F + P n (F_s - n . F) /
-(n . P n + s^2). The difference F_s - n . F passes a low-pass first, because angles have noise.
+The joint angles yield the tip's penetration depth, and the law of the surface (r2s/physics/surface.py) yields the
+normal force F_s. The variance s^2 of F_s comes from the surface's posterior, encoder noise, and errors of the law. A
+Kalman update along the normal n combines F_s with the force F from momentum, which has the covariance P, as F' =
+F + P n (F_s - n . F) / (n . P n + s^2). The difference F_s - n . F is low-passed first, because angles are noisy.
 
-If the tip touches another surface, or the surface has moved, F_s is wrong. So the difference is tested: its
-low-passed mean, in standard deviations, may not exceed REFUSED (innovation test: Bar-Shalom, Li and Kirubarajan,
-Estimation with Applications to Tracking, 2001, 5.4). A refused surface is ignored for the rest of the motion, because
-a small force would agree with any surface.
+F_s is wrong if the tip touches another surface or the surface has moved. An innovation test (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore refuses a surface if the low-passed
+difference exceeds REFUSED standard deviations. For the rest of the motion, the estimate ignores a refused surface: a
+small force would pass the test with any surface.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ LAW_K, LAW_EXPONENT, LAW_DAMPING, LAW_POINT, LAW_NORMAL, LAW = 0, 1, 2, 3, 6, 9 
 
 
 class SurfaceLaw(NamedTuple):
-    """The law of a surface as numbers for compiled code."""
+    """A surface's parameters as arrays for compiled code."""
 
     law: np.ndarray  # (1 + S, LAW): the estimate, then S draws of its posterior
     radius: float  # m, radius of the tip
@@ -37,14 +37,14 @@ class SurfaceLaw(NamedTuple):
 
 
 def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle: float) -> SurfaceLaw:
-    """Return a surface and up to `tuning.SURFACE_DRAWS` draws of its posterior as numbers."""
+    """Return the `SurfaceLaw` of a surface and of at most `tuning.SURFACE_DRAWS` posterior draws."""
     each = [surface, *draws[: tuning.SURFACE_DRAWS]]
     law = [np.concatenate([[s.coefficient, s.exponent, s.damping], s.point, s.normal]) for s in each]
     return SurfaceLaw(np.array(law, dtype=float), float(radius), float(angle))
 
 
 class FusedWrench(WrenchObserver):
-    """A `WrenchObserver` that also uses the law of a surface; momentum alone decides whether there is contact.
+    """A `WrenchObserver` that also uses the law of a surface, but detects contacts by momentum alone.
 
     Args:
         surface, draws: identified surface, and draws from its posterior (r2s/identification/contact/contact_file.py).
@@ -68,13 +68,13 @@ class FusedWrench(WrenchObserver):
         super().__init__(robot, dynamics, threshold)
 
     def begin(self) -> None:
-        """Begin a motion from rest; the surface is trusted until the test refuses it."""
+        """Start a motion from rest; use the surface until the innovation test refuses it."""
         super().begin()
         self._memory = np.zeros(6)
         self._memory[TRUSTED] = 1.0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
-        """Process a cycle; see `WrenchObserver`."""
+        """Process one cycle; see `WrenchObserver`."""
         touches, state = super().__call__(q, dq, tau), self._state
         fuse(
             self._law,
@@ -100,13 +100,13 @@ class FusedWrench(WrenchObserver):
 
     @property
     def trusted(self) -> bool:
-        """Whether the surface has agreed with the momentum in this motion."""
+        """Whether the innovation test has accepted the surface throughout this motion."""
         return bool(self._memory[TRUSTED] > 0.0)
 
 
 @njit(cache=True, error_model="numpy")
 def surface_force(law, k, tip, rate):
-    """Return normal force, N, and penetration depth, m, in surface k for a tip (3,) m and a depth rate, m/s."""
+    """Return normal force, N, and penetration depth, m, of a tip (3,) m with depth rate, m/s; k: row of `law.law`."""
     row = law.law[k]
     depth = law.radius
     for c in range(3):
@@ -116,7 +116,7 @@ def surface_force(law, k, tip, rate):
 
 @njit(cache=True, error_model="numpy")
 def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the variance, N^2, of the surface's force, from posterior, encoder noise, and errors of the law."""
+    """Return the variance, N^2, of the surface's normal force, from posterior, encoder noise, and law errors."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count

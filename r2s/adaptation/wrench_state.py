@@ -1,4 +1,4 @@
-"""State of the wrench filter from cycle to cycle, and the uncertainties that the filter uses."""
+"""Define the wrench filter's state, and the uncertainties that the filter assumes."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = ran
 
 
 class WrenchNoise(NamedTuple):
-    """Uncertainty of n joints' friction, noise of the sensors, and remaining error of the force."""
+    """Uncertainties that the wrench filter assumes: friction of n joints, inertia, sensor noise, and force."""
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a sliding joint
     edges: np.ndarray  # (n, 2) Nm, sum of the other torques at which a joint breaks away: negative, positive

@@ -1,9 +1,9 @@
-"""An arm behind its driver: the only module of r2s that commands an arm.
+"""Command an arm through its driver; no other module of r2s commands an arm.
 
-Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives the
-driver's torques and nothing else; tests/test_command_loop.py checks that no other code commands an arm. Every cycle
-checks for a stop request (r2s/arm/stop_request.py). After the driver has brought the arm to rest, the loop stops the
-arm and raises ArmStopped with the reason.
+Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives
+only the driver's torques; tests/test_command_loop.py checks that no other code commands an arm. Every cycle checks
+for a stop request (r2s/arm/stop_request.py). After the driver has brought the arm to rest, the loop stops the arm
+and raises ArmStopped with the reason.
 """
 
 import time
@@ -40,8 +40,8 @@ class CommandLoop:
     Args:
         arm: the arm. driver: limits the torques of all motions of this loop.
         log: receives (state, torque) of every cycle before the torque is sent.
-        adapter: called once per cycle; its torque is added in the next cycle. If the adapter raises, the driver
-            stops the arm as if commands were missing, and then the exception propagates.
+        adapter: called once per cycle; its torque is added in the next cycle. After an exception of the adapter, the
+            driver first stops the arm, as it does without new commands, and then the exception propagates.
     """
 
     def __init__(
@@ -125,10 +125,10 @@ class CommandLoop:
         self.state = self.arm.read()
 
     def rest(self, hold: np.ndarray | None = None) -> None:
-        """Damp the motion until the arm rests under a command of `hold` (n,) Nm, for at most 0.5 s.
+        """Damp the motion for at most 0.5 s, until the arm rests under the command `hold` (n,) Nm.
 
-        If joints slide on without a contact, `resist` changes this torque, as in a stop by the driver.
-        Without `hold`, the command goes to zero; callers omit it after a contact.
+        Without a contact, `resist` changes `hold` to brake joints that slide on, as in a stop by the driver.
+        Without `hold`, as after a contact, the command goes to zero.
         """
         inertia, robot = 1 / np.diag(self._inverse(self.state.q[None])[0]), self.arm.robot
         limit, step, most = REST_SHARE * robot.tau_max, robot.step_max, ADDED * robot.tau_max
@@ -142,7 +142,7 @@ class CommandLoop:
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:
-        """If the driver is stopping the arm when a motion ends, complete this stop and raise its reason.
+        """If the driver has begun a stop before the end of a motion, complete this stop and raise its reason.
 
         Raises:
             StopRequested, ArmStopped: as `__call__`.
@@ -151,9 +151,9 @@ class CommandLoop:
             self._cycle(None)
 
     def halt(self, reason: str) -> None:
-        """Damp the arm, bring its command to zero as after a contact, and raise ArmStopped with `reason`.
+        """Damp the arm to rest under zero command, and raise ArmStopped with `reason`.
 
-        Do nothing if the driver is already stopping the arm: the arm then leaves its path because of this stop.
+        Do nothing if the driver is already stopping the arm, because this stop makes the arm leave its path.
         """
         if self.driver.stopping is not None:
             return
@@ -161,9 +161,9 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return the reason if the driver was stopping it or it stopped itself meanwhile, else None.
+        """Stop the arm; return the reason of a stop that the driver or the arm itself had begun, else None.
 
-        With a push limit the driver first handles a contact force, as in any stop (r2s/physics/contact_stop.py).
+        A driver with a push limit first holds or releases a contact, as in any stop (r2s/physics/contact_stop.py).
         """
         reason = None if self._ended else self.driver.stopping
         if reason is not None:
@@ -175,7 +175,7 @@ class CommandLoop:
         return reason
 
     def _leave(self) -> str | None:
-        """Let the driver stop the arm after a motion; return the reason if the arm stopped itself, else None."""
+        """Bring the arm to rest after a motion; return the reason if the arm stops itself meanwhile, else None."""
         self.driver.stop("the motion is over")
         try:
             while not self.driver.done:
@@ -215,7 +215,7 @@ class CommandLoop:
             raise
 
     def _raise(self, reason: str, hold: np.ndarray) -> None:
-        """Stop the arm and raise `reason`, even if the arm reports another reason when it is stopped."""
+        """Stop the arm; raise ArmStopped or StopRequested with `reason`, whatever reason the arm itself reports."""
         kind = StopRequested if self._requested else ArmStopped
         self._block(reason)
         self._stop_arm(hold)

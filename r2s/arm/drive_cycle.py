@@ -40,19 +40,19 @@ TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` wou
 
 
 class Memory(NamedTuple):
-    """The state of the driver of m arms, which `drive_cycle` updates.
+    """State of the driver for m arms, which `drive_cycle` updates.
 
     Attributes:
         command: (m, c), the last finite command. law: (m, k), memory of the control law.
         target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `Actuation`.
         sent: (m, n) Nm, the last torque command.
-        held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop continues to apply it, except in contact.
-        share: (m,), factor on the allowed speeds: 1; during a stop it falls to the speed that the stop still needs.
-        cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, and the stop's start.
+        held: (m, n) Nm, last sum of adapter torque and `Given.hold`, which a stop still applies, except in contact.
+        share: (m,), factor on the allowed speeds: 1 in a motion, decreasing in a stop (`_brake`).
+        cycle: (m,), cycles of the motion. silent: cycles since the last finite command. damped: cycles of the stop.
         why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the filter changed the torque.
         rests: (m,), whether the arm is at rest. commanded: (m,), whether a command has arrived.
-        least: (m, K) m, least allowed distance of each pair of the fence.
-        push: (m, COLUMNS of push_limit.py), parameters and state of the push limit; (m, 0): no push limit.
+        least: (m, K) m, least allowed distance between the two bodies of each pair of the fence.
+        push: (m, COLUMNS), parameters and state of the push limit (push_limit.py); (m, 0): no push limit.
     """
 
     command: np.ndarray
@@ -75,7 +75,7 @@ class Memory(NamedTuple):
 
     @staticmethod
     def fresh(m: int, n: int, command: int, law: int, pairs: int, push: np.ndarray) -> "Memory":
-        """Return the state of m arms with n joints each before their first cycle, with zero torque."""
+        """Return the state of m arms with n joints each before the first cycle: all torques are zero."""
         own = np.zeros((m, command)), np.zeros((m, law))
         count, flags = np.zeros((5, m), dtype=np.int64), np.zeros((2, m), dtype=bool)
         least = np.full((m, pairs), -np.inf)
@@ -86,8 +86,8 @@ class Memory(NamedTuple):
 class Given(NamedTuple):
     """Inputs of the driver in one cycle, for m arms.
 
-    command: (m, c), valid if `new`. added: (m, n) Nm, torque of the adapters, valid if `adds`. hold: (m, n) Nm, part
-    of the target that a stop continues to apply. contact: (m,), whether each arm reports a contact.
+    command: (m, c), ignored unless `new`. added: (m, n) Nm, torque of the adapters, ignored unless `adds`.
+    hold: (m, n) Nm, part of the target torque that a stop still applies. contact: (m,), whether an arm is in contact.
     """
 
     command: np.ndarray
@@ -99,9 +99,9 @@ class Given(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Settings of the driver; `torque` and `added`, (n,) Nm, limit the target torque and the adapter torque.
+    """Settings of the driver: `torque` and `added`, (n,) Nm, bound the target torque and the adapter's torque.
 
-    An arm is stopped beyond q_low, q_high, dq_max (n,) rad, rad/s, or `deadline` s after the last finite command.
+    The driver stops arms beyond q_low, q_high, dq_max (n,) rad, rad/s, or `deadline` s after the last finite command.
     spring: (n,) Nm/rad, see `resist`. factor: gain of the low-pass. fade: cycles of the soft start.
     """
 
@@ -128,7 +128,7 @@ class Model(NamedTuple):
 
 @njit(cache=True)
 def _watch(i, q, dq, given, bounds, memory):
-    """Store arm i's command if finite; set `why` if the arm must stop; return whether the arm's state is finite."""
+    """Store arm i's command if it is finite; set `why` if the arm must stop; return whether q and dq are finite."""
     seen = np.isfinite(q).all() and np.isfinite(dq).all()
     helped = given.adds and np.isfinite(given.added[i]).all()
     if given.new and np.isfinite(given.command[i]).all() and helped == given.adds:
@@ -149,12 +149,12 @@ def _watch(i, q, dq, given, bounds, memory):
 
 @njit(cache=True)
 def resist(dq, spring, most, held):
-    """Change the compensation `held` (n,) Nm so that it opposes joints that still slide, at dq (n,) rad/s.
+    """Change the torque `held` (n,) Nm of a stop to oppose the joints that still slide, at dq (n,) rad/s.
 
-    Joints slide on under an undeclared load, or if the compensation still contains the motion's friction torque.
+    A joint slides on if it carries an undeclared load, or if `held` still compensates the friction of the motion.
 
     Args:
-        spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound on the compensation.
+        spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound on `held`.
     """
     for j in range(len(held)):
         if abs(dq[j]) > STILL:
@@ -165,7 +165,7 @@ def resist(dq, spring, most, held):
 
 @njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
-    """Add the adapter's torque to the target (n,) Nm of arm i; during a stop, add the held torque instead."""
+    """Add the adapter's torque to arm i's target torque (n,) Nm; during a stop, add `Memory.held` instead."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:
@@ -196,7 +196,7 @@ def _kinematics(model, q):
 def _brake(i, seen, arm, bounds, model, memory):
     """Set arm i's target torque during a stop, and lower its allowed speeds, beginning at the present speed.
 
-    Only a stop with code SILENT, LAW_NOT_FINITE or REQUESTED handles a contact force (`stop_torque`).
+    A stop with code SILENT, LAW_NOT_FINITE or REQUESTED first holds or releases a contact (`stop_torque`).
     """
     needs, why = 0.0, memory.why[i]
     memory.target[i] = 0.0
@@ -216,7 +216,7 @@ def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
-        q, dq: (m, n) rad, rad/s. applied: (m, n) Nm, torque of the last cycle. given, bounds, model: see the classes.
+        q, dq: (m, n) rad, rad/s. applied: (m, n) Nm, torque of the last cycle. given, bounds, model: `Given` etc.
         control: number and parameters of the control law. memory: `Memory`, updated.
     """
     out, (m, n) = np.empty_like(memory.sent), q.shape
@@ -278,7 +278,7 @@ drive_cycle = njit(cache=True)(_drive_cycle)
 
 @cache
 def compiled_cycle(laws: tuple[Callable, ...]) -> Callable:
-    """Return `drive_cycle` with these control laws; if one is not built in, each process compiles the cycle anew."""
+    """Return `drive_cycle` for these control laws; unless all are built in, each process compiles the cycle anew."""
     if laws == BUILT_IN:
         return drive_cycle
     return njit(FunctionType(_drive_cycle.__code__, {**globals(), "control_law": chain(laws)}))

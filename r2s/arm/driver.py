@@ -1,12 +1,12 @@
 """The driver: once per millisecond it computes, from a policy's command, a torque that respects the arm's limits.
 
-Each cycle has these steps: check that the command is finite and fresh (watchdog) -> control law
-(r2s/physics/control_laws.py) -> soft start and low-pass -> add an adapter's torque (r2s/adaptation/adapter.py) ->
-safety filter (r2s/physics/safety_filter.py), the same as in training -> rate limit relative to the torque that the
-arm applied in the last cycle. The driver reads no clock and calls no arm: its only inputs are states and commands, so
-tests can run it on a million hostile inputs.
+Each cycle checks that the command is finite and recent (watchdog). The target torque then passes the control law
+(r2s/physics/control_laws.py), soft start and low-pass, the adapter, which adds a torque (r2s/adaptation/adapter.py),
+the safety filter of the training (r2s/physics/safety_filter.py), and a limit on the change from the torque that
+the arm applied in the last cycle. The driver has no clock and no connection to an arm: states and commands are its
+only inputs, so tests can run the driver on a million adversarial inputs.
 
-`DriverBatch` drives many arms in lock-step, `Driver` one.
+`DriverBatch` drives many arms in lock-step; `Driver` drives one arm.
 """
 
 from typing import Any
@@ -52,7 +52,7 @@ def spring(robot: Robot) -> np.ndarray:
 
 
 class DriverBatch:
-    """The driver of m arms: the last stage that every torque command passes.
+    """The driver of m arms, the last stage of every torque command before the arm.
 
     Attributes:
         stopping: for each of the m arms, the reason why the driver is bringing it to rest, or None.
@@ -129,7 +129,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, compensation that continues in a stop, plus the contact force's torque in a 'hold' stop."""
+        """(m, n) Nm, torque that a stop still applies: compensation, plus the contact's torque if a stop holds it."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -137,7 +137,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop handles a contact force (hold, release or retreat); this needs a `push_limit`."""
+        """Whether a stop holds, releases or retreats from a contact, which needs a `push_limit`."""
         return bool(len(self._push))
 
     @property
@@ -164,14 +164,14 @@ class DriverBatch:
         """Return the torque commands (m, n) Nm of this cycle.
 
         Args:
-            q, dq: (m, n) rad, rad/s, in this cycle. If an arm's values are not finite, its torque falls to zero.
+            q, dq: (m, n) rad, rad/s, in this cycle. An arm with values that are not finite is brought to zero torque.
             tau_J_d: (m, n) Nm, the torque that the arms applied in the last cycle.
             command: (m, c), new commands for the control law; None: no new commands in this cycle.
             added: (m, n) Nm, torque of the adapters in this cycle, clipped to ADDED * tau_max; None: no adapter. If
-                an arm's values are not finite, they are not added, and the arm's command of this cycle is ignored.
+                an arm's values are not finite, the driver ignores these values and the arm's new command.
             hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. A stop
-                continues to apply the last sum of `hold` and `added`, clipped to ADDED * tau_max.
-            contact: (m,), whether each arm reports a contact; a stop then applies no compensation. None: no contact.
+                still applies the last sum of `hold` and `added`, clipped to ADDED * tau_max.
+            contact: (m,), whether each arm reports a contact; a stop in contact has no compensation. None: none.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)
@@ -187,7 +187,7 @@ class DriverBatch:
         return out
 
     def stop(self, reason: str) -> None:
-        """Begin to bring all arms to rest in the next cycle; the reason of an already stopping arm stays."""
+        """Bring all arms to rest from the next cycle on; an arm that is already stopping retains its reason."""
         self._memory.why[self._memory.why == RUNS] = REQUESTED
         self.stopping = [reason if own is None else own for own in self.stopping]
 
@@ -233,12 +233,12 @@ class Driver:
 
     @property
     def held(self) -> np.ndarray:
-        """(n,) Nm, see `DriverBatch.held`; in contact only the contact force's torque of a 'hold' stop."""
+        """(n,) Nm, see `DriverBatch.held`; in contact the compensation is zero."""
         return self._drivers.held[0]
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop handles a contact force; see `DriverBatch.decides_contact`."""
+        """Whether a stop holds, releases or retreats from a contact; see `DriverBatch.decides_contact`."""
         return self._drivers.decides_contact
 
     @property
@@ -252,7 +252,7 @@ class Driver:
         return self.stopping is not None and bool(self._drivers.done[0])
 
     def stop(self, reason: str) -> None:
-        """Begin to bring the arm to rest in the next cycle; if it is already stopping, the first reason stays."""
+        """Bring the arm to rest from the next cycle on; an arm that is already stopping retains its first reason."""
         self._drivers.stop(reason)
 
     def __call__(

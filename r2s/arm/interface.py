@@ -1,8 +1,8 @@
 """The interface of an arm, real or simulated: move to a posture, read, send one torque per 1 kHz cycle, stop.
 
 The convention is libfranka's: commands exclude gravity, and the arm adds its own gravity compensation. `read`
-returns the state of the current cycle; `command` ends the cycle and waits for the next. This fits both panda_py's
-`control(callback)` loop and pylibfranka's readOnce/writeOnce.
+returns the state of the current cycle; `command` ends this cycle and waits for the next cycle. Both panda_py's
+`control(callback)` loop and pylibfranka's readOnce/writeOnce can implement `read` and `command`.
 """
 
 from collections.abc import Callable
@@ -17,21 +17,21 @@ from r2s.recordings.recording import SIGNALS, Recording
 
 
 class ArmStopped(RuntimeError):  # noqa: N818 (a stop is not a bug)
-    """The motion ended for the reason in the message; the next `move_to` begins a new one.
+    """The motion ended for the reason in the message; the next `move_to` begins a new motion.
 
     Attributes:
-        recording: what was recorded before the stop; None if nothing, or too little, was recorded.
+        recording: the motion recorded before the stop; None if it is too short.
     """
 
     recording: Recording | None = None
 
 
 class NotCleared(ArmStopped):
-    """After an earlier stop, no operator allowed the arm to move again; the run ends here."""
+    """No operator allowed the arm to move again after an earlier stop; the run ends."""
 
 
 class StopRequested(ArmStopped):
-    """The motion ended on a signal, or because the process that sends the commands ended; the run ends here."""
+    """A signal, or the end of the process that sends the commands, ended the motion; the run ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +44,14 @@ class ArmState:
         tau_J: (n,) Nm, measured link-side torque; it includes gravity, but little of the motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
         tau_ext_hat_filtered: (n,) Nm, torque that the joints exert on the surroundings: tau_J minus the torque
-            of the arm's own model (gravity, load, dynamics). None here or below: the arm does not report this value.
+            of the arm's own model (gravity, load, dynamics). None if not reported, as all later values.
         O_F_ext_hat_K: (6,) N, Nm, wrench that the end effector exerts on the surroundings, in the base frame.
         joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,) for joints, (6,) for the end
             effector; above 0 where the external torque or force exceeds the contact or collision threshold.
         control_command_success_rate: share of the last 100 commands that reached the arm; 0 while no motion runs.
         O_T_EE: (16,), pose matrix of the end effector in the base frame, column by column.
         m_ee, m_load: kg, masses of end effector and load that the arm's gravity compensation assumes.
-        box: (6,), a box in the base frame, as a camera measures it: centre, m, and direction of its first axis.
+        box: (6,), a box in the base frame, as a camera measures it: center, m, and direction of its first axis.
     """
 
     t: float
@@ -132,9 +132,9 @@ class Operated(Protocol):
 
     Attributes:
         operator: function that asks the operator, given the reason of the stop, and returns whether the arm may move.
-            None: there is no operator, so the arm may not.
-        blocked: reason of a stop about which `move_to` must first ask the operator; None: there is none. Code that
-            stops the arm's motion writes its reason here.
+            None: no operator, so the arm may not move again after a stop.
+        blocked: reason of a stop that the operator has not yet cleared; None: no such stop. Code that stops the arm
+            must write the reason to this attribute.
     """
 
     operator: Callable[[str], bool] | None
@@ -158,7 +158,7 @@ def speed_share(arm: Arm) -> float:
 
 
 class Reflexes:
-    """Checks commands and states, as a real arm does in order to stop itself; error messages name the joint."""
+    """Checks commands and states against the limits at which a real arm stops itself; errors name the joint."""
 
     def __init__(self, robot: Robot, dt: float = SIM_DT):
         self.robot = robot

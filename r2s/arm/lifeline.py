@@ -1,7 +1,7 @@
-"""Detect at once that another process has died.
+"""Detect the death of another process without delay.
 
 When the owner of a robust mutex dies, the kernel marks the mutex (robust_list of futex(2)) before it unmaps the
-owner's memory. The owner's child processes get a new parent only after that, tens of ms later if it imported PyTorch.
+owner's memory. The parent id of child processes changes only after unmapping, tens of ms later if PyTorch is loaded.
 """
 
 import ctypes
@@ -15,9 +15,9 @@ _kept: list[RawArray] = []  # type: ignore[valid-type]  # once locked: the C lib
 
 
 class Lifeline:
-    """A mutex in shared memory: one process locks it, and the other can see whether that process has died.
+    """A mutex in shared memory; a process can detect the death of another process that has locked this mutex.
 
-    Where the C library has no robust mutex with this layout, `lost` always returns None.
+    If the C library has no robust mutex of the expected layout, `lost` always returns None.
     """
 
     def __init__(self):
@@ -43,5 +43,5 @@ class Lifeline:
             ctypes.CDLL(None).pthread_mutex_unlock(self._raw)
 
     def lost(self) -> str | None:
-        """Return a message if the thread that locked the mutex has died, else None; a source for `watched`."""
+        """Return a message if the thread that locked the mutex has died, else None; for use with `watched`."""
         return "the process of the policy has ended" if self._raw[0] & OWNER_DIED else None

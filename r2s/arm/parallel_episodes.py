@@ -1,7 +1,7 @@
 """Run episodes on a twin in parallel: each chunk of goals runs on a new twin with the same seed.
 
 The chunks, and therefore the results, do not depend on the number of cores. Each chunk has its own stream of sensor
-noise. A twin whose friction warms up begins each chunk cold.
+noise. A twin with temperature-dependent friction is cold at the start of each chunk.
 """
 
 import multiprocessing
@@ -31,9 +31,9 @@ def run_parallel_episodes(
     workers: int,
     progress: Callable[[int, int], None],
 ) -> tuple[Episodes, list[Stop], Timing]:
-    """Return the episodes, their early stops, and measured durations.
+    """Return the episodes, their early stops, and the measured durations.
 
-    On Linux the processes are forked, so call this before any thread starts; elsewhere this process runs all chunks.
+    On Linux this function forks, so call it before any thread starts; elsewhere the calling process runs all chunks.
 
     Args:
         open_twin: function that opens a twin for a chunk, given the chunk's number.

@@ -1,7 +1,7 @@
 """Run a policy on an arm that waits for commands: observe, query the policy at its rate, command the arm at 1 kHz.
 
-The arm's time stands still while the policy computes. This suits twins and the emulator in lock-step, and makes runs
-repeatable bit for bit. r2s/arm/realtime_process.py runs an arm whose clock does not wait, in a process of its own.
+Twins and the emulator in lock-step are such arms. Their clock stands still while the policy computes, which makes
+runs repeatable bit for bit. For arms whose clock does not wait, see r2s/arm/realtime_process.py.
 """
 
 import time
@@ -78,7 +78,7 @@ class PolicyRunner:
         arm: an arm that waits for its commands.
         task: rates, torque limits and controller.
         friction: (n,) Nm, friction level of each joint: `Dynamics.level` of the dynamics the policy was trained on.
-        soft_start_s: s, fade-in of an episode's torque; recommended on hardware, 0 for twins.
+        soft_start_s: s over which an episode's torque fades in; recommended on hardware, 0 for twins.
         rotors: (n,) kg m^2, `Dynamics.armature` of the same dynamics; None: as in `arm.robot`.
         adapter: adds torque to the policy's; None: no adaptation.
     """
@@ -111,8 +111,8 @@ class PolicyRunner:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move to starts (1, n) rad and begin episode `first` there.
 
-        A stop during this move ends the episode. An `Operated` arm tries again if its operator agrees, up to
-        ATTEMPTS times in all. If the operator refuses or all attempts fail, this and later episodes do not run.
+        If the arm stops on the way, the episode ends; an `Operated` arm tries again, up to ATTEMPTS times in total,
+        if its operator agrees. If the operator refuses or all attempts fail, this and later episodes do not run.
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []
@@ -208,9 +208,9 @@ class PolicyRunner:
 
 
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
-    """Return smoothed joint speeds (k, n) rad/s at every `every`-th of the measured angles (n,) rad.
+    """Return smoothed joint speeds (k, n) rad/s of every `every`-th cycle, from the measured angles (n,) rad.
 
-    A speed is a parabola's slope over SMOOTHING_CYCLES on each side (Savitzky and Golay, Anal. Chem. 36(8), 1964).
+    Each speed is the slope of a parabola fitted over 2 SMOOTHING_CYCLES + 1 cycles (Savitzky and Golay, 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:
@@ -220,7 +220,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Return the `State` of one arm, as a batch of one; effort (n,) Nm, stopped and limited become its entries."""
+    """Return the `State` of one arm, a batch of one, from its `ArmState`, effort (n,) Nm, stop flag, filter rate."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],

@@ -1,7 +1,7 @@
 """Record presses and slides on a surface with any arm, from which the surface can be identified.
 
-The arm follows paths of `task=wipe` by hybrid control with its identified model, through the driver. The force rises
-along one path and falls along the next. Joints must move: friction at rest hides the force (docs/how_to/surfaces.md).
+The arm follows paths of `task=wipe` by hybrid control with its identified model. The force rises along one path and
+falls along the next. The joints must move, because friction at rest hides the force (docs/how_to/surfaces.md).
 """
 
 from collections import deque
@@ -34,7 +34,7 @@ class PressPlan(WipeTask):
     force: tuple[float, float] = (1.0, 2.0)  # see `press_plan`
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return goals as `WipeTask` does, with the plan's forces; every other goal begins with the larger force."""
+        """Return the goals of `WipeTask` with the plan's forces; every second goal begins with the larger force."""
         goals = super().goals(robot, rng, count)
         goals[:, 6:8] = self.force
         goals[1::2, 6:8] = self.force[::-1]
@@ -69,10 +69,10 @@ def record_presses(
 ) -> Recording:
     """Follow `count` random paths on the surface; return a recording with commanded torque, one trajectory per path.
 
-    Rows are as in `r2s.arm.recorder.record`; between two paths the recorded time advances by PAUSE_S.
+    The recording has the rows of `r2s.arm.recorder.record`. The recorded time advances by PAUSE_S between paths.
 
     Args:
-        arm: it moves above the first point of each path, and is always stopped at the end. dynamics: its model.
+        arm: moves above the first point of each path, and is always stopped at the end. dynamics: the arm's.
         seed: random seed of the paths. progress: called after every path with (paths done, total).
         timing: receives the durations of the cycles.
 

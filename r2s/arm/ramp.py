@@ -1,6 +1,6 @@
 """The paper's breakaway protocol: ramp the torque of one joint after the other, in both directions, until it moves.
 
-It runs on any `Arm`; r2s/identification/friction/breakaway.py estimates breakaway torques from the recording.
+The ramps run on any `Arm`; r2s/identification/friction/breakaway.py estimates breakaway torques from them.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,14 +41,14 @@ SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return (count, n) rad: home, then postures, each 0.3 rad from the previous one in every joint, if in limits."""
+    """Return `count` postures (count, n) rad: home, then steps of 0.3 rad in every joint, clipped to the limits."""
     change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
     poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
 
 
 def check_paths(robot: Robot, poses: np.ndarray, *, what: str = "ramp.poses") -> None:
-    """Raise UserError if no path leads from home to the first pose of (P, n) rad, or from a pose to the next."""
+    """Raise UserError unless collision-free paths lead from home through all poses (P, n) rad, in this order."""
     space = Space(robot)
     for k, (a, b) in enumerate(pairwise([robot.q_home, *poses]), 1):
         approach(robot, a, b, what=f"{what}: the path to pose {k}", space=space)
@@ -65,20 +65,20 @@ def ramp(
 ) -> Ramps:
     """Ramp every joint in both directions at every pose and return one trajectory per ramp.
 
-    A ramp begins with a short rest at zero command. Then the command of one joint rises from 0 at `rate`, with the
-    others at 0, until the joint has moved by MOVED (or the command reaches `largest`, or any joint moves by STRAY).
-    The stop after each ramp is not recorded. Each row has the state and the command of one cycle, as in
-    `r2s.arm.recorder`. If the error of gravity compensation exceeds a joint's friction, the joint slides at zero
-    command. It is then braked until it rests under a constant command, from which its ramp starts.
+    A ramp begins with a short rest at zero command. Then one joint's command rises from 0 at `rate`, while the other
+    commands stay 0. The ramp ends when the joint has moved by MOVED, its command reaches `largest`, or any joint has
+    moved by STRAY. The recording omits the stop after each ramp. Rows are those of `r2s.arm.recorder`. If the
+    error of gravity compensation exceeds a joint's friction, the joint slides at zero command. The ramp then brakes
+    this joint until it rests under a constant command, from which the joint's ramp starts.
 
     Args:
-        arm: it moves to each pose, and is always stopped at the end.
-        poses: (P, n) rad, at least 0.15 rad inside the position limits; poses and the paths between them
-            (r2s/excitation/paths.py) must be clear of table and arm, otherwise nothing moves.
+        arm: moves to each pose, and is always stopped at the end.
+        poses: (P, n) rad, at least 0.15 rad inside the position limits. Nothing moves if the arm would come too close
+            to the table or to itself, at a pose or on a path (r2s/excitation/paths.py).
         rate: (n,) or one number, Nm/s; default: 2.2 for joints with tau_max of at least 40 Nm, 4 for weaker ones, and
             proportionally less below 12 Nm.
-        largest: (n,) or one number, Nm, at which a ramp gives up; default 20 % of tau_max.
-        progress: called after every ramp with (ramps done, total), between two 1 kHz cycles: it must return at once.
+        largest: (n,) or one number, Nm, command at which a ramp ends in any case; default 20 % of tau_max.
+        progress: called after every ramp with (ramps done, total); it must return within the 1 kHz cycle.
         timing: receives the durations of the cycles.
 
     Raises:
@@ -135,7 +135,7 @@ class _Drive:
 
     Attributes:
         rows: t, q, dq and command of every cycle since the list was last emptied.
-        base: (n,) Nm, command of the resting arm. held: (n,) Nm, mean command at the end of the last braking.
+        base: (n,) Nm, command under which the arm rests. held: (n,) Nm, mean command at the end of the last braking.
     """
 
     def __init__(self, loop: CommandLoop, timing: Timing):
@@ -160,7 +160,7 @@ class _Drive:
         self._loop.end()
 
     def place(self, q: np.ndarray) -> None:
-        """Bring the arm to q (n,) rad and release it there."""
+        """Move the arm to q (n,) rad and bring all joints to rest there."""
         data = mujoco.MjData(self._model)
         data.qpos[:] = q
         mujoco.mj_forward(self._model, data)
@@ -189,7 +189,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints and release their torque, again if one slides on; `next_joint` must be slowest (STILL)."""
+        """Brake all joints, then release their torque; repeat if a joint slides on. next_joint: to be below STILL."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -202,7 +202,7 @@ class _Drive:
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:
-        """Empty `rows`, send `base` for RELEASE_CYCLES, and return which joints rest, (n,)."""
+        """Clear `rows`, send the command `base` for RELEASE_CYCLES, and return whether each joint rests, (n,)."""
         self.rows = []
         for _ in range(RELEASE_CYCLES):
             self.send(self.base)
@@ -251,7 +251,7 @@ def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.nd
 
 
 def _positive(name: str, value, default: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Return `value` or the default as (n,); raise UserError unless all are above 0 and at most `most` (n,)."""
+    """Return `value`, by default `default`, as (n,); raise UserError unless all elements are in (0, `most`]."""
     n = len(default)
     array = per_joint(f"ramp.{name}", default if value is None else value, n, f"{n} joints")
     good = (array > 0) & (array <= most)

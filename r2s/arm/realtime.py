@@ -85,10 +85,10 @@ class Timing:
     """Measured durations, s. In lock-step only the durations of r2s's own computations are meaningful.
 
     Attributes:
-        policy: time from a state to the policy's command, once per control step. driver: time to compute one command.
+        policy: time from a state to the policy's command, once per control step. driver: time of one driver cycle.
         adapter: time of one update of the adapter, if there is one. period: time from one command to the next.
         robot: time from one state to the next by the arm's clock; above 1 ms if cycles were lost.
-        success: the rate that the arm reports for its last 100 commands, in each cycle after a motion's first 100.
+        success: control_command_success_rate of each cycle, without the first 100 cycles of a motion.
     """
 
     policy: list[float] = field(default_factory=list)

@@ -1,8 +1,8 @@
 """Run a policy on an arm whose clock does not wait: a separate process runs the 1 kHz cycle.
 
 The arm's process continues whatever happens to the policy's process: if no new command arrives within the driver's
-deadline, it damps and stops the arm. A thread would not suffice, because a policy that holds Python's global lock
-blocks every thread. The processes share memory without a lock, because a killed process would never release a lock.
+deadline, it damps and stops the arm. A thread instead of a process would not suffice: a policy that holds Python's
+global lock blocks every thread. The processes share memory without a lock: a killed process would not release it.
 
 The arm's process runs in its own session, so signals from the terminal do not reach it. Every motion, including the
 approach, is damped and ended if the policy's process receives a signal or ends, or if the arm's process receives a
@@ -54,7 +54,7 @@ class Slot:
         a[0] += 1
 
     def read(self) -> tuple[int, np.ndarray] | None:
-        """Return the number of writes and the values (width,); None while a write runs or was interrupted."""
+        """Return the number of writes and the values (width,), or None if a write is running or was interrupted."""
         a = np.frombuffer(self._raw)
         for _ in range(READ_ATTEMPTS):
             before = a[0]
@@ -65,12 +65,12 @@ class Slot:
 
 
 class Channel(NamedTuple):
-    """Memory that the two processes share.
+    """Memory that the policy's process and the arm's process share.
 
     Attributes:
         command: (c,), written by the policy's process. state: written by the arm's process, see `_publish`.
-        end: above 0 when the policy's process has ended the episode.
-        signal: number of a signal that the policy's process received. lifeline: locked by the policy's process.
+        end: above 0 if the policy's process has ended the episode.
+        signal: number of a signal that the policy's process received. lifeline: mutex that this process locks.
     """
 
     command: Slot
@@ -174,7 +174,7 @@ class RealtimeRunner:
     def step(self, command: np.ndarray) -> State:
         """Pass the command (1, c) to the arm's process, and return the state when the next control period begins.
 
-        If the command arrives after its period, it takes effect at once; the state is of the next period to begin.
+        A command that arrives after its period takes effect at once; the state is then that of the next period.
         """
         self.timing.policy.append(time.perf_counter() - self._observed_at)
         self._channel.command.write(command[0])
@@ -222,7 +222,7 @@ class RealtimeRunner:
         return state
 
     def _receive(self, kind: str, timeout_s: float | None = None) -> Any:
-        """Wait for a message of this kind from the arm's process; return its content; forward operator questions."""
+        """Return the content of the next message of this kind from the arm's process; meanwhile, ask the operator."""
         try:
             while True:
                 if timeout_s is not None and not self._line.poll(timeout_s):
@@ -297,7 +297,7 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
-    """Yield each cycle's command (None: no new one), from the first new command until the episode ends.
+    """Yield a new command, or None, for each cycle from the first new command until the episode ends.
 
     Args:
         last: number of commands written in earlier episodes.

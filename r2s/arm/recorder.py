@@ -1,4 +1,4 @@
-"""Record an excitation on any arm; simulated arms get the same calls and the same precautions as hardware."""
+"""Record an excitation on an arm, simulated or real, with the same code and the same safety checks."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -40,23 +40,23 @@ def record(
 ) -> Recording:
     """Follow the excitation at 1 kHz and return the recorded motion.
 
-    Row k contains the state of cycle k. With 'commanded', tau[k] is the command sent in cycle k, which is tau_J_d of
-    cycle k + 1: a replay of tau[k : k + m] from state k predicts q[k + 1 : k + m + 1]. With 'measured', tau[k] is
-    the tau_J read together with q[k] and dq[k], as in robot logs. t is the arm's clock; signals are of cycle k.
+    Row k contains the arm's state in cycle k, with the time t of the arm's clock. With torque='commanded', tau[k] is
+    the command of cycle k, which the arm reports as tau_J_d in cycle k + 1. So a replay of tau[k : k + m] from state
+    k predicts q[k + 1 : k + m + 1]. With torque='measured', tau[k] is tau_J of cycle k, as in robot logs.
 
     Args:
-        arm: it moves to the excitation's first posture, and is always stopped at the end.
-        excitation: in steps of 1 ms; it must be within limits and clear of table and arm, else the arm does not move.
+        arm: the arm, which moves to the excitation's first posture; after the recording it always stops.
+        excitation: motion with a time step of 1 ms, checked for limits and clearance before the arm moves.
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, includes gravity).
-        progress: called every 0.5 s of motion with (cycles done, total), between two cycles: it must return at once.
-        loaded: whether the arm may carry an undeclared payload; `LoadedTrackingController` then tracks the motion.
-        timing: receives the durations of the cycles.
+        progress: called every 0.5 s with (cycles done, total cycles); it must return at once, as the arm is moving.
+        loaded: whether the arm may carry an undeclared payload; if so, `LoadedTrackingController` tracks the motion.
+        timing: stores the duration of each cycle.
 
     Raises:
-        ArmStopped: the arm or the driver ended the motion; the arm deviated from the plan by more than its
-            `DeviationLimits`; or, in real time, more than 1 % of the commands did not reach the arm in time. The
-            exception's `recording` contains the rows so far, if they are at least MIN_ROWS.
-        UserError: the excitation is not allowed.
+        ArmStopped: the arm or the driver stopped the motion, or the arm deviated from the plan by more than its
+            `DeviationLimits`. On a real-time arm also if more than 1 % of the commands did not arrive in time. The
+            exception's `recording` contains the rows recorded before the stop, if there are at least MIN_ROWS.
+        UserError: the excitation does not fit the arm, exceeds its limits or leaves too little clearance.
 
     """
     declared_torque(torque)
@@ -96,7 +96,7 @@ def record(
 
 
 class _Rows:
-    """The rows of a recording, allocated before the motion; `filled` of them have been written."""
+    """The rows of a recording, allocated before the motion; `filled` is the number of rows written so far."""
 
     def __init__(self, rows: int, robot: Robot, torque: str):
         self._robot, self._torque = robot, torque
@@ -106,14 +106,14 @@ class _Rows:
         self.filled = 0
 
     def add(self, state: ArmState, sent: np.ndarray) -> None:
-        """Append a row: the state of a cycle and the command (n,) Nm sent in it."""
+        """Append a row with the state of a cycle and the command `sent`, (n,) Nm, of this cycle."""
         k = self.filled
         self._t[k], self._q[k], self._dq[k], self._signals[k] = state.t, state.q, state.dq, state.signals
         self._tau[k] = sent if self._torque == "commanded" else state.tau_J
         self.filled += 1
 
     def recording(self) -> Recording:
-        """Return the rows so far."""
+        """Return the rows recorded so far."""
         rows = self.filled
         t, q, dq, tau = (x[:rows] for x in (self._t, self._q, self._dq, self._tau))
         known = named_signals(self._signals[:rows], self._robot.n)

@@ -1,4 +1,4 @@
-"""Simulate an arm behind the arm interface: MuJoCo with known dynamics, and sensor noise."""
+"""Simulate an arm with known dynamics and sensor noise in MuJoCo, behind the interface of a real arm."""
 
 import numpy as np
 
@@ -14,14 +14,14 @@ class SimulatedArm:
     """An `Arm` in MuJoCo with the friction model of r2s/physics/friction.py, to test identification on known values.
 
     Attributes:
-        external: (n,) Nm, external joint torque from the next cycle on; zero by default.
+        external: (n,) Nm, external joint torque that acts from the next cycle on; zero by default.
         declared_payload: see the arguments.
 
     Args:
         robot, dynamics: the arm and its true dynamics.
         position_noise, velocity_noise: standard deviations of white noise on q, rad, and dq, rad/s.
         seed: random seed of the noise.
-        payload: carried body, and when it is attached. declared_payload: payload that gravity compensation assumes.
+        payload: carried body and its attachment times. declared_payload: payload in the arm's gravity compensation.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class SimulatedArm:
         self._state = self.move_to(robot.q_home)
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad; the clock restarts."""
+        """Place the arm at rest at q (n,) rad, and set its clock to 0."""
         self._sim.reset(np.asarray(q, dtype=float)[None], np.zeros((1, self.robot.n)))
         self._motors.reset()
         self._cycle, self._last = 0, np.zeros(self.robot.n)
@@ -58,11 +58,11 @@ class SimulatedArm:
         return self._sense()
 
     def read(self) -> ArmState:
-        """Return the state of this cycle."""
+        """Return the arm's state in the current cycle."""
         return self._state
 
     def command(self, tau: np.ndarray) -> None:
-        """Apply tau (n,) Nm, without gravity, for 1 ms; raises ArmStopped as a real arm's reflexes would."""
+        """Apply the command tau (n,) Nm, without gravity, for 1 ms; raise ArmStopped after a reflex."""
         self._reflexes.command(tau, self._last)
         self._update_payload()
         self._last = np.array(tau, dtype=float)
@@ -72,14 +72,14 @@ class SimulatedArm:
         self._sense()
 
     def stop(self) -> None:
-        """End the motion: the arm rests at its posture, without command."""
+        """End the motion: set velocity and command to zero at the present posture."""
         self._sim.reset(self._sim.q.copy(), np.zeros((1, self.robot.n)))
         self._motors.reset()
         self._last = np.zeros(self.robot.n)
         self._sense()
 
     def _update_payload(self) -> None:
-        """Attach or detach the payload at its time."""
+        """Attach or detach the payload at the time that its `on_s` and `off_s` set."""
         now = self._payload is not None and bool(self._payload.attached(self._cycle * SIM_DT))
         if now != self._carries:
             self._sim.set_dynamics(self._dynamics[now])

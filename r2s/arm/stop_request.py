@@ -1,7 +1,7 @@
-"""Handle requests to end every motion of this process: signals, or the end of the process that sends commands.
+"""Stop every motion of this process on a signal, or when the process that sends the commands ends.
 
-`CommandLoop` calls `requested` in every cycle. On a request the driver brings the arm to rest, and the motion ends
-with `StopRequested`. No new motion begins after a request. A process has one request, as it has one set of signals.
+`CommandLoop` calls `requested` in every cycle. After a stop request the driver brings the arm to rest, the motion
+ends with `StopRequested`, and no new motion begins. All motions of a process share one stop request.
 """
 
 import os
@@ -14,15 +14,15 @@ from types import FrameType
 
 from r2s.errors import Stopped
 
-# a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; SIGKILL and SIGSTOP cannot be handled
+# signals of a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; no process can handle SIGKILL and SIGSTOP
 SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP)
-PARENT = "R2S_PARENT"  # environment variable: pid of the parent, at whose end every motion of this process ends
+PARENT = "R2S_PARENT"  # environment variable: pid of the process whose end stops every motion here
 FOLLOW_S = 0.1  # s between two checks that the parent still runs
 GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s each) before a KeyboardInterrupt
 
 
 class _Request:
-    """The first stop request of this process: reason, whether a motion is ending for it, whether none runs now."""
+    """The stop request of this process. `ending`: a motion is stopping on request; `served`: the motion has ended."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -34,7 +34,7 @@ _request = _Request()
 
 
 def requested() -> str | None:
-    """Return the reason why every motion must end, or None; later reasons do not replace the first one."""
+    """Return the first reason for a stop request in this process, or None without a request."""
     if _request.reason is None:
         for source in _request.sources:
             if (reason := source()) is not None:
@@ -44,18 +44,18 @@ def requested() -> str | None:
 
 
 def begin_ending() -> None:
-    """Note that a motion is now ending because of the request."""
+    """Record that a motion is stopping because of the stop request."""
     _request.ending = True
 
 
 def serve() -> None:
-    """Note that no motion runs any more after the request; a further signal then raises KeyboardInterrupt at once."""
+    """Record that the stop request has ended the motion, so that the next signal raises KeyboardInterrupt at once."""
     _request.ending, _request.served = False, True
 
 
 @contextmanager
 def watched(source: Callable[[], str | None]) -> Iterator[None]:
-    """Let `requested` also call `source` in this context; `source` returns a reason or None, within microseconds."""
+    """Let `requested` call `source` in this context; `source` must return a stop reason or None in microseconds."""
     _request.sources.append(source)
     try:
         yield
@@ -64,12 +64,12 @@ def watched(source: Callable[[], str | None]) -> Iterator[None]:
 
 
 def parent_ended(parent: int) -> Callable[[], str | None]:
-    """Return a source for `watched` that reports the end of the process `parent`, which sends the commands."""
+    """Return a `source` for `watched` that requests a stop when the policy's process, `parent`, has ended."""
     return lambda: None if os.getppid() == parent else "the process of the policy has ended"
 
 
 def pipeline() -> int | None:
-    """Return the pid in PARENT, or None. In a grandchild, which inherits PARENT, it is not the pid of its parent."""
+    """Return the pid in the variable PARENT, or None; in a grandchild this pid differs from the parent's pid."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 
@@ -82,7 +82,7 @@ def _follow(parent: int, over: threading.Event) -> None:
 
 
 def _leave_terminal() -> None:
-    """Discard output to the terminal, which SIGHUP has closed: writing to it would end the run with an error."""
+    """Discard output to a terminal that has closed, because writing to it would end the run with an error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         if stat.S_ISCHR(os.fstat(stream).st_mode):
@@ -94,18 +94,18 @@ def _leave_terminal() -> None:
 def handled_signals(
     forward: Callable[[int], None] = lambda number: None, parent: int | None = None
 ) -> Iterator[None]:
-    """Convert SIGNALS to a stop request while an arm is open in this process.
+    """Convert each signal of SIGNALS to a stop request while an arm is open in this process.
 
-    If no motion has responded to the request after GRACE_S, the main thread gets a KeyboardInterrupt; this context
-    then raises `Stopped` with the name of the signal. It also raises `Stopped` if no motion has responded when the
-    block ends: later code may move the arm. Outside the main thread it does nothing, as Python allows no handlers.
+    If no motion is stopping GRACE_S after the request, the main thread gets a KeyboardInterrupt, and this context
+    raises `Stopped` with the signal's name. The context also raises `Stopped` if its block ends before a motion has
+    stopped, because later code may move the arm. The context has no effect outside the main thread.
 
     Args:
-        forward: called by the signal handler with the number of each signal.
-        parent: pid of the parent process, whose end acts as a SIGTERM; None: no process is watched.
+        forward: function that the signal handler calls with each signal's number.
+        parent: pid of the parent process, whose end acts like SIGTERM; None: no process is watched.
 
     Raises:
-        Stopped: a signal came while no motion ran.
+        Stopped: a signal arrived while no motion ran.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

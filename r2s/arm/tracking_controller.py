@@ -1,4 +1,4 @@
-"""Track a planned motion: PD control with nominal feedforward and an adaptive estimate of friction and offset."""
+"""Track a planned motion with PD control, nominal feedforward, and adaptive friction and offset compensation."""
 
 import numpy as np
 
@@ -16,28 +16,28 @@ CUTOFF_HZ = 100.0  # low-pass of the driver during tracking, libfranka's default
 BANDWIDTH = 20.0  # rad/s, of the critically damped tracking loop
 ADAPTATION_RATE = 0.8  # 1/s, adaptation gain over proportional gain; leaves half of the loop's stability margin
 FRICTION_DQ = 0.03  # rad/s, width of the sign change of the friction estimate
-MASS_EVERY = 10  # cycles between two mass matrices
+MASS_EVERY = 10  # cycles between two updates of the mass matrix
 # Limits
-OFFSET_SHARE = 0.1  # share of tau_max, limit of the estimated offset: enough for 1 undeclared kg at a Panda's reach
-CORRECTION_SHARE = 0.3  # share of tau_max, limit of all torque that is added to the feedforward
-MAX_DEVIATION = 0.2  # rad; an arm that deviates more is blocked by an obstacle, or is not the planned arm
+OFFSET_SHARE = 0.1  # largest estimated offset over tau_max: balances 1 kg of undeclared payload at a Panda's reach
+CORRECTION_SHARE = 0.3  # largest torque added to the feedforward, over tau_max
+MAX_DEVIATION = 0.2  # rad; an arm that deviates more meets an obstacle, or is not the arm of the plan
 # For an arm with an undeclared payload
 LOADED_FACTOR = 2.0  # factor on OFFSET_SHARE and CORRECTION_SHARE
 LOADED_DEVIATION = 0.5  # rad
 
 
 class TrackingController:
-    """PD control with the nominal model's feedforward torque and an adaptive estimate of the missing torque.
+    """PD control with the nominal model's feedforward torque and an adaptive estimate of friction and offset.
 
-    The estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max) per joint: offset, Coulomb and viscous friction,
-    adapted during the motion as in Slotine and Li (IJRR 6(3), 1987), within plausible limits. A light wrist needs
-    this estimate: its gains must be small, so friction can be as large as its whole PD torque and stop it.
-    The gains are the nominal mass matrix times BANDWIDTH^2 and 2 BANDWIDTH. They suit any arm; with nearly
-    parallel joint axes, separate gains per joint would be unstable.
+    Each joint's estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max): offset, Coulomb and viscous friction.
+    theta adapts during the motion as in Slotine and Li (IJRR 6(3), 1987), within limits. Light wrist joints need
+    the estimate: their PD gains must be small, so friction can cancel the PD torque and stop the joint. The PD gains
+    are the nominal mass matrix times BANDWIDTH^2 and times 2 BANDWIDTH. They suit any arm, while separate gains per
+    joint would be unstable on an arm with nearly parallel joint axes.
 
     Args:
-        robot: the nominal model. excitation: the plan.
-        allowed: limits of the deviation from the plan; None: MAX_DEVIATION for each joint.
+        robot: the nominal model. excitation: the motion to track.
+        allowed: limits of the deviation from this motion; None: MAX_DEVIATION for each joint.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):
@@ -50,13 +50,13 @@ class TrackingController:
         self._theta = np.zeros((3, robot.n))
         friction = friction_margin(robot)
         self._theta_max = np.array([OFFSET_SHARE * robot.tau_max, friction, friction])
-        # inertia of each joint with the others free; where it is small, adaptation has to be slow
+        # inertia of each joint with the other joints free; a joint of small inertia must adapt slowly
         inertia = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
         self._gain = ADAPTATION_RATE * SIM_DT * BANDWIDTH**2 * inertia  # Nm per rad/s, see `__call__`
         self._correction = CORRECTION_SHARE * robot.tau_max
 
     def __call__(self, k: int, state: ArmState) -> np.ndarray:
-        """Return the target torque (n,) Nm of cycle k, from the state read in cycle k, and adapt the estimate."""
+        """Return the target torque (n,) Nm for the state of cycle k, and adapt the friction and offset estimate."""
         e = self._plan
         error, rate = e.q[k] - state.q, e.dq[k] - state.dq
         self._theta += self._gain[k // MASS_EVERY] * (rate + 0.5 * BANDWIDTH * error) * self._regressor[k]
@@ -89,8 +89,8 @@ class TrackingController:
 class LoadedTrackingController(TrackingController):
     """Tracking controller for an arm that may carry an undeclared payload of up to half the arm's largest payload.
 
-    Its gains are for half of that payload, because otherwise the sag of a strong joint would swing the wrist. It
-    allows a larger deviation and a larger correction.
+    The PD gains include half of this payload; otherwise the sag of a strong joint would swing the wrist. The limits
+    of deviation and correction are larger than in `TrackingController`.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):

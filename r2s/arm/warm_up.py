@@ -1,4 +1,4 @@
-"""Compile the code of the 1 kHz cycles before a motion: compilation takes up to a second, but a cycle has 1 ms."""
+"""Compile the code of the 1 kHz loop before a motion, because compilation takes up to 1 s and a cycle only 1 ms."""
 
 import copy
 from contextlib import suppress
@@ -19,11 +19,11 @@ from r2s.tasks.task import Task
 
 CYCLES = 200  # cycles at rest, and again in motion: each ten spans of an estimator
 SWING_RAD, SWING_HZ = 0.05, 1.0  # up to 0.3 rad/s: every joint slides
-RAMP_NM = 0.02  # Nm, so that the ramps give up at once
+RAMP_NM = 0.02  # Nm, largest torque of the ramps, so low that they end at once
 
 
 class _Puppet:
-    """An `Arm` that ignores its commands: it rests, then swings all joints by `swing` rad."""
+    """A mock `Arm` that ignores commands: it rests, then swings all joints by `swing` rad."""
 
     def __init__(self, robot: Robot, swing: float):
         self.robot, self._swing, self._cycle = robot, swing, 0
@@ -49,13 +49,13 @@ class _Puppet:
 
 
 def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = None) -> None:
-    """Run the code of an arm's 1 kHz cycles once, so that it is compiled; discard its results.
+    """Run the code of the 1 kHz loop on a mock arm, so that numba compiles the code.
 
-    Call it in the process that will drive the arm, before the arm is opened. It uses a mock arm for recordings
-    and ramps and, if there is a task, for an episode with a copy of the adapter.
+    Call this function in the process that will drive the arm, before the arm is opened. The mock arm runs recordings
+    and a ramp and, if there is a task, an episode with a copy of the adapter.
 
     Raises:
-        Exception: any exception of the adapter.
+        Exception: any exception that the adapter raises.
     """
     rest = np.zeros((CYCLES, robot.n))
     still = Excitation(SIM_DT * np.arange(CYCLES), robot.q_home + rest, rest, rest)

@@ -1,1 +1,1 @@
-"""Controllers: they map a policy's action to torque every millisecond, before the safety filter."""
+"""Controllers, which map a policy's action to joint torque at 1 kHz, before the safety filter."""

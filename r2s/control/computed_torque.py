@@ -1,10 +1,10 @@
-"""`control=computed_torque`: follow a task's trajectory with the model's inverse dynamics; an action adds torque.
+"""`control=computed_torque`: follow a task's trajectory by inverse dynamics; the policy's action adds torque.
 
     tau = action + ID(q_r, dq_r, ddq_r) + M(q_r) (w^2 (q_d - q) + 2 w (dq_d - dq))
 
-ID is the inverse dynamics of the identified arm without gravity, friction included. q_d is the present reference, and
-q_r the reference at the time when the torque acts, so that latency does not delay the feedforward (Spong, Hutchinson
-and Vidyasagar, Robot Modeling and Control, ch. 8).
+ID is the inverse dynamics of the identified arm, with friction and without gravity. q_d is the reference now, and q_r
+is the reference at the later time when the torque acts, so that latency does not delay the feedforward (Spong,
+Hutchinson and Vidyasagar, Robot Modeling and Control, ch. 8).
 """
 
 from dataclasses import dataclass, field
@@ -26,11 +26,11 @@ BANDWIDTH_LATENCY = 0.6
 
 @dataclass(frozen=True)
 class ComputedTorque(Controller):
-    """Computed torque about a task's trajectory; see `Controller`.
+    """Computed-torque control along a task's trajectory; for the other attributes see `Controller`.
 
     Attributes:
-        model: the identified arm. ahead_s: s, look-ahead of the feedforward: half a control period plus time constant
-            of the low-pass plus identified delay and lag.
+        model: the identified arm. ahead_s: s, look-ahead of the feedforward, the sum of half a control period, the
+            low-pass time constant, the identified delay and the identified lag.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -44,11 +44,11 @@ class ComputedTorque(Controller):
 
     @property
     def observes_torque(self) -> bool:
-        """Whether the policy observes the torque to which its action is added."""
+        """Whether the policy observes the computed torque, to which its action is added."""
         return True
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the model's torque (n,) Nm at rest at q (n,) rad."""
+        """Return the torque (n,) Nm that holds the model at rest at q (n,) rad."""
         still = np.zeros((1, len(q)))
         return self.model(q[None], still, still, still)[0]
 
@@ -69,14 +69,14 @@ def computed_torque(
     bandwidth: float | None = None,
     feedback_hz: float | None = None,
 ) -> ComputedTorque:
-    """Return the controller of a task that has a trajectory.
+    """Return the computed-torque controller of a task with a trajectory.
 
     Args:
         robot, task: the arm and its task. dynamics: the identified arm.
         residual: share of the task's torque limit that an action of 1 adds.
-        bandwidth: w, rad/s, of the critically damped feedback; None: 2 w times the latency is BANDWIDTH_LATENCY, as
-            the damping 2 w sets the loop's bandwidth. The latency is the sum of control period, low-pass, LATENCY.
-        feedback_hz: rate at which the feedback is updated, at most 1000; None: the policy's.
+        bandwidth: w, rad/s, of the critically damped feedback, whose loop bandwidth is 2 w. None: BANDWIDTH_LATENCY
+            over twice the latency, which is the sum of control period, low-pass time constant and LATENCY.
+        feedback_hz: Hz, update rate of the feedback, at most 1000; None: the policy's rate.
 
     Raises:
         UserError: the task has no trajectory, or a setting is out of its range.

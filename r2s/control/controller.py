@@ -11,7 +11,7 @@ from r2s.physics.robot import Robot
 
 
 class ControlledTask(Protocol):
-    """The part of a task that a controller uses.
+    """The interface of a task to its controller.
 
     Attributes:
         ctrl_hz: policy rate, Hz. cutoff_hz: cutoff of the low-pass on the torque, Hz.
@@ -23,24 +23,24 @@ class ControlledTask(Protocol):
     def cutoff_hz(self) -> float: ...  # noqa: D102
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the largest target torque."""
+        """Return the largest target torque (n,) Nm."""
         ...
 
 
 @dataclass(frozen=True)
 class Controller:
-    """An action space and a control law, for all arms of one robot; `control=` selects the function that creates it.
+    """An action space and a control law for all arms of one robot; `control=` selects the kind of controller.
 
-    A policy's action lies in [-1, 1]. In SI units it is action_offset + action_scale action. A command is the action
-    in SI units, then the setpoint that the controller derives from the task.
+    A policy's action lies in [-1, 1]. The controller scales the action to SI units: action_offset + action_scale *
+    action. A command consists of this scaled action and of the setpoint that the controller derives from the task.
 
     Attributes:
         name: the controller's name.
         law: the compiled law; see r2s/physics/control_laws.py.
-        action_scale, action_offset: (a,) in `unit`. action: name of the commanded quantity, for tables and contracts.
+        action_scale, action_offset: (a,) in `unit`. action: name of the quantity that an action sets.
         parameters: (p,), the law's parameters. memory_size: number of values that the law stores between cycles.
-        torque_limit: (n,) Nm, the largest target torque; None: the task's.
-        cpp: body of the same law in C++17, for contract.hpp; "": the bundle gets no header.
+        torque_limit: (n,) Nm, the largest target torque; None: the task's limit.
+        cpp: C++17 body of the law for contract.hpp; "": a bundle with this controller has no contract.hpp.
     """
 
     name: str
@@ -71,17 +71,17 @@ class Controller:
 
     @property
     def observes_torque(self) -> bool:
-        """Whether the policy observes the torque that the law computes for an action of zero."""
+        """Whether the policy observes the control law's torque for an action of zero."""
         return False
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s) at t (m,) s of episodes with these goals."""
+        """Return the setpoints (m, s) of m episodes with these goals at the times t (m,) s."""
         return np.empty((len(t), 0))
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that the law's model needs at rest at q (n,) rad, such as for a payload.
+        """Return the torque (n,) Nm that holds the law's model at rest at q (n,) rad, for example with a payload.
 
-        The driver keeps applying this torque while it brings the arm to rest.
+        The driver continues to apply this torque while it brings the arm to rest.
         """
         return np.zeros(len(q))
 
@@ -99,5 +99,5 @@ class Controller:
         return np.concatenate([scaled, self.setpoint(task, t, goals)], axis=1)
 
     def torque(self, q: np.ndarray, dq: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n) Nm in the first cycle of a command (m, c), at q, dq (m, n) rad, rad/s."""
+        """Return the torque (m, n) Nm that a new command (m, c) causes at q, dq (m, n) rad, rad/s."""
         return run_law(self.law, q, dq, command, self.parameters, self.memory_size)

@@ -1,8 +1,8 @@
-"""`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs about a target, which actions move or stiffen.
+"""`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs to a target; actions set target or stiffness.
 
-The laws are in r2s/physics/impedance_laws.py; this module computes their parameters from arm, task and model.
-Defaults scale with the arm: forces are torques over the lever at home, stiffnesses are forces over a distance, and no
-spring is faster than the latency of the loop allows.
+The control laws are in r2s/physics/impedance_laws.py; this module computes their parameters from arm, task and model.
+The defaults scale with the arm: a force is the torque limit over the lever arm at home, a stiffness is a force over a
+distance, and the latency of the loop limits the natural frequency of each spring.
 """
 
 from collections.abc import Sequence
@@ -32,11 +32,11 @@ CLIP_M = 0.05  # m, error at which the default spring saturates
 
 @dataclass(frozen=True)
 class Impedance(Controller):
-    """An impedance law; see `Controller`.
+    """Impedance control of joints or end effector; for the other attributes see `Controller`.
 
     Attributes:
-        model: the identified arm. target_size: number of values in the task's target.
-        contact: (4,) normal, and force N against it, for hybrid control; None: the task's. hybrid: whether hybrid.
+        model: the identified arm. target_size: number of values in the task's target. hybrid: whether hybrid control.
+        contact: (4,), surface normal and contact force, N, for hybrid control; None: the task's contact.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -46,21 +46,21 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Number of values: target; hybrid: normal (3), force, measured force, whether measured; slides: pull (3)."""
+        """Size of a setpoint: target; hybrid: normal (3), force, measured force and its flag; sliding: pull (3)."""
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
     def slides(self) -> bool:
-        """Whether the target slides on a surface; the setpoint then contains the task's pull."""
+        """Whether the target slides on a surface; if so, the setpoint contains the feedforward force `task.pull`."""
         return bool(self.hybrid and self.parameters[law.APPROACH] == law.SLIDES)
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the model's torque (n,) Nm at rest at q (n,) rad."""
+        """Return the torque (n,) Nm that holds the model at rest at q (n,) rad."""
         still = np.zeros((1, len(q)))
         return self.model(q[None], still, still, still)[0]
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, s): the task's target, and for hybrid control its contact, without a measured force."""
+        """Return the setpoints (m, s): the task's target; for hybrid control also contact, with measured force 0."""
         if not self.target_size:
             return np.empty((len(t), 0))
         if self.law is joint_impedance_law:
@@ -73,7 +73,7 @@ class Impedance(Controller):
         return np.concatenate([target, contact, np.zeros((len(t), 2)), *pull], axis=1)
 
     def with_force(self, command: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Return the commands (m, c) of hybrid control with the measured force (m,) N against the normal."""
+        """Return hybrid commands (m, c) that contain the measured force (m,) N against the normal."""
         out, at = command.copy(), self.command_size - 3 * self.slides - 2
         out[:, at], out[:, at + 1] = force, 1.0
         return out
@@ -92,15 +92,15 @@ def joint_impedance(
     damping: float = 1.0,
     tank: Sequence[float] = (1.0, 2.0),
 ) -> Impedance:
-    """Return the joint impedance about a task's trajectory, or about home if the task has none.
+    """Return the joint impedance controller about a task's trajectory, or about home without a trajectory.
 
     Args:
         robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
-        action: what an action sets: target, stiffness, or both.
-        torque_fraction: largest torque over tau_max. displacement: rad, shift of the target by an action of 1.
-        stiffness: Nm/rad, the highest; None: CLIP times torque limit over displacement, at most what latency allows.
-        softest: lowest stiffness of an action over the highest. damping: damping ratio of all modes.
-        tank: J, first level and size of the energy tank.
+        action: quantity that an action sets: target, stiffness or both.
+        torque_fraction: largest torque over tau_max. displacement: rad, by which an action of 1 shifts the target.
+        stiffness: Nm/rad, largest one; None: CLIP * torque limit / displacement, at most that of `fastest_spring`.
+        softest: smallest over largest stiffness that an action sets. damping: damping ratio of all modes.
+        tank: J, initial level and capacity of the energy tank.
 
     Raises:
         UserError: a setting is out of its range.
@@ -160,22 +160,22 @@ def cartesian_impedance(
     integral_rate: float = 2.0,
     integral_max: float = 0.3,
 ) -> Impedance:
-    """Return the impedance of the end effector, or of the tool's tip, about the task's target.
+    """Return the impedance controller of the end effector, or of the tool's tip, about the task's target.
 
     Args:
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
         displacement, rotation: m and rad, shift and rotation of the target by an action of 1.
-        stiffness: N/m, the highest; None: force_clip over CLIP_M, at most what latency allows.
-        rotational_stiffness: Nm/rad, the highest; 0: the orientation is free and follows the null space.
-        force_clip: N, largest force of the spring at the highest stiffness, at most what the torque limit allows in
-            every direction at home; None: CLIP times that. moment_clip: Nm, likewise.
-        null_stiffness: 1/rad, stiffness towards home in the null space, over the torque limit of each joint.
-        hybrid: whether a force acts along a normal, and the impedance only across it. A displacement against the
-            normal adds a force, stiffness times displacement. If the task `approaches` a surface, its target moves
-            into the surface, and the spring to the target bounds the force. So the tip approaches no faster than the
-            target.
-        normal: (3,) in the base frame, out of the surface. force: N, against the normal. None: the task's contact.
-        integral_rate: 1/s, integral gain on a measured force error. integral_max: largest integral over force_clip.
+        stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, at most that of `fastest_spring`.
+        rotational_stiffness: Nm/rad, largest rotational stiffness; 0: the orientation is free.
+        force_clip: N, largest spring force at the largest stiffness. It must not exceed the force that the torque
+            limit allows in every direction at home. None: CLIP times this force. moment_clip: Nm, same for moments.
+        null_stiffness: 1/rad, null-space stiffness towards home, divided by each joint's torque limit.
+        hybrid: whether a force acts along the normal of a surface, and the impedance only across the normal. An
+            action that displaces the target against the normal adds the force stiffness * displacement. If the task
+            `approaches` a surface, its target moves into the surface, and the spring to the target bounds the force,
+            so that the tip approaches no faster than the target.
+        normal: (3,), surface normal in the base frame. force: N, against the normal. None: the task's contact.
+        integral_rate: 1/s, integral gain of the force error. integral_max: bound of the integral over force_clip.
 
     Raises:
         UserError: the task has no target or contact, or a setting is out of its range.
@@ -232,7 +232,7 @@ def cartesian_impedance(
 
 
 def _check(action: str, softest: float, displacement: float) -> None:
-    """Raise UserError if a setting that both impedances share is out of range."""
+    """Raise UserError if a setting of joint and Cartesian impedance is out of range."""
     if action not in ACTIONS:
         raise UserError(f"action: '{action}'; {instead_of(action, ACTIONS)}")
     check_number("softest", softest, "(0, 1]")
@@ -240,7 +240,7 @@ def _check(action: str, softest: float, displacement: float) -> None:
 
 
 def _torque(robot: Robot, fraction: Sequence[float] | float) -> np.ndarray:
-    """Return the torque limit (n,) Nm: `fraction` of tau_max, checked."""
+    """Return the torque limit `fraction` * tau_max (n,) Nm; raise UserError unless 0 < `fraction` <= 1."""
     share = per_joint("torque_fraction", fraction, robot.n, f"the {robot.n} joints of {robot.name}")
     if not ((share > 0) & (share <= 1)).all():
         raise UserError(f"torque_fraction: expected numbers in (0, 1], got {share.tolist()}")
@@ -248,7 +248,7 @@ def _torque(robot: Robot, fraction: Sequence[float] | float) -> np.ndarray:
 
 
 def _contact(task: Any, normal: Sequence[float] | None, force: float | None, most: float) -> np.ndarray | None:
-    """Return normal and force (4,) from the settings; None if the task's contact is used."""
+    """Return normal and force (4,) of the settings, or None to use the task's contact."""
     if normal is None and force is None and hasattr(task, "contact"):
         return None
     if normal is None or force is None:
@@ -263,7 +263,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Return the largest force or moment, by default CLIP of what the torque limit (n,) Nm allows at home."""
+    """Check and return a force or moment limit; None: CLIP times the largest that `limit` (n,) Nm allows at home."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most
@@ -274,7 +274,7 @@ def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian
 
 
 def fastest_spring(task: ControlledTask) -> float:
-    """Return the highest frequency w of a spring, rad/s; with critical damping, the loop has the rate 2 w."""
+    """Return the highest natural frequency w, rad/s, of a spring, whose loop bandwidth is 2 w at critical damping."""
     return 0.5 * BANDWIDTH_LATENCY / (1 / (2 * np.pi * task.cutoff_hz) + LATENCY)
 
 
@@ -290,7 +290,7 @@ def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _action(
     action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an action's scale and offset, and write its indices in the command into the parameters."""
+    """Return scale and offset of an action, and store in `parameters` where a command contains the action."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
     parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]
@@ -302,7 +302,7 @@ def _action(
 def _parameters(
     robot: Robot, task: ControlledTask, dynamics: Dynamics, damping: float, tank: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters (p,) without springs and action, and a view (n, ROW) of the joints' rows."""
+    """Return the law's parameters (p,), before springs and action are set, and a view (n, ROW) of the joint rows."""
     check_number("damping", damping, "(0, 10]")
     if np.shape(tank) != (2,) or not 0 <= tank[0] <= tank[1] < np.inf:
         raise UserError(f"tank: expected first level and size in J, 0 <= level <= size, got {tank}")

@@ -1,1 +1,1 @@
-"""Physics engines other than the training engine, behind one small interface."""
+"""Physics engines other than MuJoCo, the training engine, with a common interface."""

@@ -1,7 +1,7 @@
-"""The DART engine with the settings of Gazebo's physics plugin, for Sim2Sim transfer and for the rigid twin.
+"""Simulate an arm in DART with the settings of Gazebo's physics plugin, for Sim2Sim transfer and the rigid twin.
 
-It has semi-implicit Euler steps, implicit joint damping, hard position limits and exact Coulomb friction. With these
-settings DART and Gazebo's plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
+DART has semi-implicit Euler steps, implicit joint damping, hard position limits and exact Coulomb friction. With
+these settings DART agrees with Gazebo's plugin to round-off, and with MuJoCo to 1e-15 rad over 0.1 s.
 """
 
 from collections.abc import Callable
@@ -18,18 +18,17 @@ from r2s.physics.welds import Bodies, about, make_pose
 
 
 class DartEngine:
-    """One arm without contacts. A command acts for one step and is clipped to the torque limits.
+    """An arm without contacts. A command acts for one step and is clipped to the torque limits.
 
     Args:
         robot: the arm; its MJCF defines kinematics, inertia and limits.
-        gravity: False is libfranka's convention (the arm compensates gravity).
-        masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in link
-            axes; each replaces the MJCF's values of the n moving links.
-        armature: (n,) kg m^2, replaces the MJCF's values of the joints.
+        gravity: whether gravity acts; False: libfranka's convention, in which the arm compensates gravity.
+        masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the center of mass in link
+            axes, of the n moving links; None: the MJCF's values.
+        armature: (n,) kg m^2, armature of the joints; None: the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
-    The engine does not enforce velocity limits: MuJoCo has none either, and enforcing them would hide that a policy
-    violates them.
+    The engine, like MuJoCo, has no velocity limits, because they would hide that a policy violates them.
     """
 
     def __init__(
@@ -106,13 +105,13 @@ class DartEngine:
         return joint, link
 
     def relink(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
-        """Replace the last link's mass kg, centre (3,) m and tensor about it (3, 3) kg m^2; the motion continues."""
+        """Replace the last link's mass, kg, center (3,) m and tensor (3, 3) kg m^2 about the center in a motion."""
         at = self._last
         self._links.mass[at], self._links.com[at], self._links.inertia[at] = mass, com, inertia
         self._tip.setInertia(_dartpy().dynamics.Inertia(*self._links.lumped(at)))
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Set q, dq (n,) rad, rad/s."""
+        """Set the joint positions q (n,) rad and velocities dq (n,) rad/s."""
         self._skeleton.resetCommands()
         self._skeleton.clearInternalForces()
         self._skeleton.setPositions(q)
@@ -125,8 +124,8 @@ class DartEngine:
 
         Args:
             tau: (n,) Nm, the command; clipped to the torque limits.
-            passive: (n,) Nm, joint torque that is not clipped: friction, offsets.
-            damping: (n,) Nm s/rad, implicit damping of this step.
+            passive: (n,) Nm, additional joint torque that is not clipped, such as friction and offsets.
+            damping: (n,) Nm s/rad, joint damping that DART integrates implicitly in this step.
         """
         drive = np.minimum(np.maximum(tau, self._low), self._high)
         if passive is not None:
@@ -169,7 +168,7 @@ class DartEngine:
 
 
 def dart(robot: Robot) -> Callable[[Dynamics], DartEngine]:
-    """Return the function that creates the engine of simulator=dart from dynamics, without gravity."""
+    """Return the function that creates a DART engine without gravity from the dynamics of an arm."""
     _dartpy()
     return lambda d: DartEngine(
         robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia, armature=d.armature

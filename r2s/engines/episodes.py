@@ -1,4 +1,4 @@
-"""Episodes in an engine other than the training engine, one by one, with the same goals, starts and random arms."""
+"""Run episodes one by one in an engine other than MuJoCo, with the same goals, starts and random arms."""
 
 from collections.abc import Callable
 
@@ -19,13 +19,13 @@ NONE = np.zeros(1, dtype=bool)  # no arm has stopped
 
 
 class EngineArms:
-    """The arms of `count` episodes, one after the other, as `Arms` for `r2s.tasks.rollout.rollout`.
+    """The arms of `count` successive episodes, with the interface `Arms` of `r2s.tasks.rollout.rollout`.
 
     Arm e has the e-th random draw, as in `r2s.learning.evaluate.make_evaluation`, and its own stream of sensor noise.
 
     Args:
-        make: returns the engine of an arm with given dynamics.
-        robot, task, draw: as in training.
+        make: function that returns the engine of an arm with given dynamics.
+        robot, task, draw: robot, task and domain randomization of the training.
         count: number of episodes.
     """
 
@@ -48,7 +48,7 @@ class EngineArms:
         self._actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Make the arm of episode `first` and put it at rest at starts (1, n) rad."""
+        """Create the arm of episode `first`, at rest at the joint angles `starts` (1, n) rad."""
         dynamics = self._drawn.one(first)
         self._engine, self._law = self._make(dynamics), FrictionTorque(self.robot, dynamics)
         self._guard = SafetyFilter(single_arm(self.robot, dynamics), self.robot, self._torque, dynamics.level)
@@ -62,7 +62,7 @@ class EngineArms:
         return self._read()
 
     def step(self, command: np.ndarray) -> State:
-        """Run one control period with the command (1, c) of the controller."""
+        """Run one control period with the controller's command (1, c)."""
         self._limited = self._guard.changed
         control, target = self._control, np.empty(self.robot.n)
         for _ in range(self._substeps):
@@ -76,7 +76,7 @@ class EngineArms:
         return self._read()
 
     def end(self) -> np.ndarray:
-        """Return (1,) False: nothing stops an arm in an engine."""
+        """Return (1,) False, because an arm in an engine has no reflexes that could stop it."""
         return NONE
 
     def _read(self) -> State:

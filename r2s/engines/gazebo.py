@@ -1,7 +1,7 @@
-"""Gazebo (gz-sim) in this process and in lock-step, through its Python bindings: Harmonic, Ionic and Jetty.
+"""Simulate an arm in Gazebo (gz-sim Harmonic, Ionic or Jetty), in this process, through the Python bindings.
 
-Each millisecond is one blocking `server.run`. The world contains physics only; all engines share its description
-(r2s/physics/description.py). Gazebo is not on PyPI; OSRF's packages and conda-forge contain the bindings.
+Each step of 1 ms is one blocking call of `server.run`. The world contains only an arm, without sensors or graphics;
+r2s/physics/description.py describes the arm. OSRF's packages and conda-forge contain the bindings; PyPI does not.
 """
 
 import importlib
@@ -25,14 +25,14 @@ PHYSICS = {"filename": "gz-sim-physics-system", "name": "gz::sim::systems::Physi
 
 
 class GazeboEngine:
-    """One arm in a Gazebo server.
+    """An arm in a Gazebo server.
 
-    A command acts for one step. The bindings can set positions and velocities only within an update, which then
-    integrates them. So `reset` stores q, dq; the next `step` applies them with its torque and starts exactly there.
+    Each command acts for one step of 1 ms. The bindings can set a joint state only within an update, and the same
+    update integrates this state. So `reset` only stores q and dq, and the next `step` starts exactly from them.
 
     Args:
-        robot, dynamics: the arm, its masses, centres, tensors and rotors; `FrictionTorque` adds friction.
-        sim: the bindings; None imports the installed ones.
+        robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.
+        sim: the bindings; None: import the installed bindings.
 
     Raises:
         UserError: the bindings are not installed, or cannot load the world.
@@ -80,7 +80,7 @@ class GazeboEngine:
             raise self._error
 
     def _guarded(self, update):
-        """Return `update` as a callback; `_run` raises its exception, because the bindings cannot pass it on."""
+        """Return a callback that stores an exception of `update` for `_run`, as the bindings would lose it."""
 
         def call(info, ecm):
             try:
@@ -117,7 +117,7 @@ class GazeboEngine:
 
 
 def gazebo(robot: Robot) -> Callable[[Dynamics], GazeboEngine]:
-    """Return the function that creates the engine of simulator=gazebo from dynamics.
+    """Return the function that creates a Gazebo engine from the dynamics of an arm.
 
     Raises:
         UserError: Gazebo is not installed.

@@ -1,8 +1,8 @@
-"""Gazebo Classic 11 in a process of its own, in lock-step, with ODE (its default) or DART as physics engine.
+"""Simulate an arm in Gazebo Classic 11, in a separate process, with ODE (the default) or DART.
 
-`gzserver` loads the world plugin gazebo_classic.cc, which waits for a command over a pipe before each step. Gazebo
-Classic is a package of Debian 11 and Ubuntu up to 22.04. Elsewhere it runs from a root directory that
-gazebo_classic_root.sh creates; the environment variable R2S_GAZEBO_ROOT is its path. No display is needed.
+`gzserver` loads the world plugin gazebo_classic.cc, which waits for a command over a pipe before each step. Debian 11
+and Ubuntu up to 22.04 have a package of Gazebo Classic. Elsewhere `gzserver` runs from the root directory that
+gazebo_classic_root.sh creates and that the environment variable R2S_GAZEBO_ROOT names. No display is needed.
 """
 
 import os
@@ -31,7 +31,7 @@ from r2s.physics.simulator import single_arm
 PHYSICS = ("ode", "dart")
 PLUGIN = Path(__file__).with_name("libr2s_gazebo_classic.so")
 ROOT = "R2S_GAZEBO_ROOT"  # environment variable: a root directory with Gazebo
-FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # library folders, relative to Debian's one of the processor
+FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # library folders, relative to that of the processor in Debian
 NAME = "simulator=gazebo_classic"
 HELP = "docs/how_to/gazebo.md installs it; simulator=dart needs nothing more"
 START_S = 60.0  # s, longest wait for the server; a start takes 0.5 s
@@ -39,13 +39,13 @@ SDF = "1.7"  # newest SDF version that Gazebo 11 reads
 
 
 class GazeboClassicEngine:
-    """One arm in a `gzserver` process, which ends with this object.
+    """An arm in a `gzserver` process, which ends with this object.
 
-    A command acts for one step. ODE solves the joints as constraints, iteratively: expect differences of 1e-4 m from
-    MuJoCo after 1 s; with DART there are none.
+    Each command acts for one step. ODE solves the joint constraints iteratively, so its motion differs from MuJoCo's
+    by 1e-4 m after 1 s. DART's motion does not differ from MuJoCo's.
 
     Args:
-        robot, dynamics: the arm, its masses, centres, tensors and rotors; `FrictionTorque` adds friction.
+        robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.
         physics: "ode" or "dart".
 
     Raises:
@@ -125,7 +125,7 @@ class GazeboClassicEngine:
 
 
 def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], GazeboClassicEngine]:
-    """Return the function that creates the engine of simulator=gazebo_classic from dynamics.
+    """Return the function that creates a Gazebo Classic engine from the dynamics of an arm.
 
     Raises:
         UserError: an unknown physics engine, or Gazebo or the plugin is missing.
@@ -139,7 +139,7 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 def gzserver() -> list[str]:
     """Return the command that starts the server.
 
-    The server in a root directory is started by that directory's loader, which, unlike chroot, needs no root rights.
+    The dynamic loader of a root directory starts the server there; unlike chroot, the loader needs no root rights.
 
     Raises:
         UserError: the server or the plugin is missing.
@@ -162,7 +162,7 @@ def gzserver() -> list[str]:
 
 
 def version() -> str:
-    """Return the server's version, "11.1.0"."""
+    """Return the server's version, such as "11.1.0"."""
     done = subprocess.run([*gzserver(), "--version"], capture_output=True, text=True)
     words = re.findall(r"version (\S+)", done.stdout)
     if not words:
@@ -171,7 +171,7 @@ def version() -> str:
 
 
 def _environment(folder: str) -> dict[str, str]:
-    """Return the server's environment: settings within `folder`, a free port, no model database."""
+    """Return the server's environment variables: settings in `folder`, a free port, no model database."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         master = f"http://127.0.0.1:{free.getsockname()[1]}"

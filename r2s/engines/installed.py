@@ -1,4 +1,4 @@
-"""List of the physics engines: versions of the installed ones, and what the missing ones need."""
+"""List the physics engines: the versions of installed engines, and how to install missing engines."""
 
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -8,7 +8,7 @@ from r2s.errors import UserError
 
 
 def installed() -> Iterator[tuple[str, str, str]]:
-    """Yield the value of `simulator=`, the engine with its version, and what a missing engine needs ("" if none)."""
+    """Yield for each engine: value of `simulator=`, version or "missing", and how to install it ("" if installed)."""
     engines: dict[str, Callable[[], str]] = {
         "mujoco": lambda: f"MuJoCo {_package('mujoco')}",
         "dart": lambda: f"DART {_package('dartpy')}",

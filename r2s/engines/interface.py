@@ -1,7 +1,7 @@
-"""The interface of a physics engine: set joint positions and velocities, apply one torque per millisecond, read them.
+"""The interface of a physics engine: set the joint state, apply a torque for 1 ms, return the new joint state.
 
 An engine simulates rigid bodies only. `FrictionTorque` computes friction, breakaway, offsets and the contact with a
-surface as an additional joint torque in each step, so that the arm moves and touches alike in every engine.
+surface as an additional joint torque in each step, so that friction and contact are the same in every engine.
 """
 
 from typing import Protocol
@@ -17,10 +17,10 @@ from r2s.physics.simulator import single_arm
 
 
 class Engine(Protocol):
-    """One arm without gravity, which the arm compensates, as a Franka does."""
+    """An arm without gravity, because a real arm, such as a Franka, compensates gravity itself."""
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Set q, dq (n,) rad, rad/s."""
+        """Set the joint positions q (n,) rad and velocities dq (n,) rad/s."""
         ...
 
     def step(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -29,17 +29,17 @@ class Engine(Protocol):
 
 
 class FrictionTorque:
-    """The joint torque of r2s/physics/friction.py and contact.py, for engines whose only input is torque.
+    """Joint torque of friction and contact (r2s/physics/friction.py, contact.py), for engines with torque input.
 
-    This friction is implicit: with its torque P and its slope D at the present velocity, MuJoCo solves (M + h D) a =
-    tau + P - bias. An engine that solves M a = tau + F - bias computes the same a with F = P - h D a, where a is
-    the result of the implicit step. Without the term h D a, real wrist joints chatter at 1 ms.
+    MuJoCo integrates friction implicitly: with the friction torque P and its slope D at the present velocity, MuJoCo
+    solves (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias computes the same acceleration a
+    with F = P - h D a. Without the term h D a, wrist joints chatter at a time step of 1 ms.
 
     Args:
-        robot, dynamics: the arm.
+        robot, dynamics: the arm and its dynamics.
 
     Attributes:
-        contact: (COLUMNS,), state of r2s/physics/contact.py, with the last step's force; None without a surface.
+        contact: (COLUMNS,), contact state with the last step's force, see contact.py; None without a surface.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics):
@@ -54,7 +54,7 @@ class FrictionTorque:
             self.contact[:] = contact_columns(robot, dynamics.surface)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return F (n,) Nm to add to the torque tau (n,) Nm in the step that begins at q, dq (n,)."""
+        """Return the torque F (n,) Nm to add to tau (n,) Nm in the step that begins at q, dq (n,) rad, rad/s."""
         m, d = self._model, self._data
         d.qpos[:], d.qvel[:], d.qfrc_applied[:] = q, dq, tau
         mujoco.mj_forward(m, d)

@@ -1,7 +1,7 @@
-"""Design a motion of up to ten minutes that determines chosen parameters well, one segment after the other.
+"""Design a motion of up to ten minutes, segment by segment, from which chosen parameters can be identified well.
 
 Each segment is the Fourier series (fourier.py) with the best score, given the earlier segments (sequential design:
-Chernoff, Ann. Math. Stat. 30(3), 1959). Between two segments the arm follows a checked path at minimum jerk.
+Chernoff, Ann. Math. Stat. 30(3), 1959). Between two segments the arm follows a checked path with minimum jerk.
 """
 
 from collections.abc import Callable
@@ -21,20 +21,20 @@ from r2s.physics.robot import SIM_DT, Robot
 
 SEGMENT_S = 60.0  # s, longest segment: two minutes of a series need 1 GB
 LONGEST_S = 600.0
-PEAKS = 1.875, 5.7735  # of velocity and acceleration at minimum jerk, for 1 rad in 1 s
+PEAKS = 1.875, 5.7735  # peak velocity and acceleration of a minimum-jerk motion of 1 rad in 1 s
 SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor on the duration while torque is too high; its most uses
-EVERY = round(1 / (COARSE_HZ * SIM_DT))  # step between the rows of a motion that a design evaluates
+EVERY = round(1 / (COARSE_HZ * SIM_DT))  # ms between the samples of a motion that a design evaluates
 
 
 class Design(Protocol):
     """The criterion for choosing the next motion, given the motions chosen so far."""
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the scores (B,) of motions (B, T, n) at times t (T,) s, given the motions so far."""
+        """Return the scores (B,) of motions (B, T, n) at times t (T,) s, given the motions chosen so far."""
         ...
 
     def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
-        """Add a chosen motion (T, n) to the motions so far."""
+        """Add a motion (T, n) to the motions chosen so far."""
         ...
 
 
@@ -49,17 +49,17 @@ def designed(
     effort: int,
     report: Callable[[float], None] = lambda share: None,
 ) -> Excitation:
-    """Return a motion that passes `check_motion`: segments of `seconds` in total, and the paths between them.
+    """Return a motion that passes `check_motion` and consists of segments and of paths between the segments.
 
     Args:
-        robot, space: limits, links and obstacles.
+        robot: limits and links. space: computes the distances between links and obstacles.
         design: criterion that scores motions.
-        seconds: total duration of the segments. center: (n,) rad, centre posture, see `fourier.checked_center`.
+        seconds: total duration of the segments. center: (n,) rad, center posture, see `fourier.checked_center`.
         seed: random seed. effort: number of motions tried per segment.
-        report: called with the share of the work that is done.
+        report: function that is called with the completed share of the work.
 
     Raises:
-        UserError: an argument is out of range, no draw is safe, or no path between two segments is free.
+        UserError: an argument is out of range, no random series is safe, or no path between two segments is safe.
     """
     check_number("seconds", seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
     check_number("effort", effort, "[0, inf)", whole=True)
@@ -77,10 +77,10 @@ def designed(
 
 
 def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Excitation:
-    """Return a motion between two postures (n,) rad on a path from `approach`, with rest at each corner.
+    """Return a motion from q_from to q_to (n,) rad along the path of `approach`; the arm stops at each corner.
 
     Raises:
-        UserError: no path is free.
+        UserError: no candidate path is safe.
     """
     path = approach(robot, q_from, q_to, what="excitation: the way between two segments", space=space)
     legs = []
@@ -100,7 +100,7 @@ def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Exc
 
 
 def joined(parts: list[Excitation]) -> Excitation:
-    """Return one motion from several, each of which begins where the previous one ends."""
+    """Return the sequence of several motions, each of which begins at the end of the previous motion."""
 
     def all_of(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
@@ -112,7 +112,7 @@ def joined(parts: list[Excitation]) -> Excitation:
 def trajectory_yaml(motion: Excitation, joints: list[str], rate_hz: float) -> str:
     """Return a motion as trajectory_msgs/msg/JointTrajectory (ROS 2), sampled at `rate_hz`, plus the last sample.
 
-    Controllers interpolate between points with positions, velocities and accelerations by quintic polynomials.
+    ROS 2 controllers interpolate by quintic polynomials between points with position, velocity and acceleration.
     """
     rows = np.union1d(np.arange(0, len(motion.t), max(1, round(1 / (rate_hz * SIM_DT)))), [len(motion.t) - 1])
     lines = ["header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}", f"joint_names: [{', '.join(joints)}]", "points:"]

@@ -1,4 +1,4 @@
-"""Compute how far an arm may deviate from a planned motion: less where a joint moves a link towards an obstacle."""
+"""Compute how far an arm may deviate from a planned motion without a collision."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from r2s.physics.fence import FENCE_M
 
 @dataclass(frozen=True)
 class DeviationLimits:
-    """Limits of the deviation from a motion: e (n,) rad is allowed in cycle k if weights[k // every] @ |e| <= 1.
+    """Limits of the deviation e (n,) rad from a motion: in cycle k, weights[k // every] @ |e| must be at most 1.
 
     Attributes:
-        weights: (R, K, n) 1/rad, K limits for each of R intervals. every: cycles per interval.
+        weights: (R, K, n) 1/rad: K linear limits in each of R time intervals. every: cycles per interval.
 
     """
 
@@ -27,22 +27,22 @@ class DeviationLimits:
 
     @classmethod
     def along(cls, space: Space, motion: Motion, most: float) -> "DeviationLimits":
-        """Return limits for a motion: an interval allows what `deviation_weights` allows at both of its ends."""
+        """Return limits along a motion: in an interval, the smaller limits of `deviation_weights` at its two ends."""
         rows = geometry_rows(motion)
         weights = deviation_weights(space, motion.q[rows], most)
         return cls(np.maximum(weights[:-1], weights[1:]), int(rows[1] - rows[0]))
 
     def share(self, k: int, deviation: np.ndarray) -> np.ndarray:
-        """Return shares (K, n) of the K limits that the joints use in cycle k; allowed if each row's sum is <= 1."""
+        """Return the share (K, n) of each limit that each joint uses in cycle k; a row's sum must be at most 1."""
         return self.weights[min(k // self.every, len(self.weights) - 1)] * np.abs(deviation)
 
 
 def deviation_weights(space: Space, q: np.ndarray, most: float) -> np.ndarray:
-    """Return weights (T, K + n, n) 1/rad that limit deviations from q (T, n) rad, so that no link meets the fence.
+    """Return weights (T, K + n, n) 1/rad that limit deviations from q (T, n) rad, so that links avoid obstacles.
 
-    The K limits keep each distance above FENCE_M, to first order: a joint uses up distance in proportion to its
-    lever. The n limits keep each joint within `most`. A deviation of all joints by DEVIATION is allowed everywhere,
-    so that an arm that starts too near to an obstacle can move away.
+    K limits keep each distance above FENCE_M to first order: a joint's deviation reduces a distance in proportion to
+    the joint's lever. n limits keep the deviation of each joint below `most`. All joints may always deviate by
+    DEVIATION, so that an arm that starts too near to an obstacle can move away.
     """
     distances, levers = space.measured(q)
     levers = levers[:, 1:]

@@ -1,9 +1,9 @@
-"""Design an excitation: a finite Fourier series that the arm runs at a ladder of speeds.
+"""Design an excitation: a finite Fourier series that the arm follows at several speeds.
 
-The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
-T-RA 13(5), 1997; a prior prevents unidentifiable quantities from dominating the determinant.
-Friction curves and delay need several speeds. So the motion proceeds through the series in rungs, from 10 % to 100 %
-of full speed, with rests between them. Slow rungs also run backwards, so that every joint reverses at low speed.
+The choice of a series by the determinant of its information matrix (D-optimality) follows Swevers et al., IEEE T-RA
+13(5), 1997. A prior prevents unidentifiable quantities from dominating the determinant. Friction curves and delay
+need several speeds. So the motion consists of rungs, sections of the series at 10 % to 100 % of full speed, with
+rests between rungs. Slow rungs also run backwards, so that every joint reverses at low speed.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 # Speed ladder: paces relative to full speed.
 SLOWEST = 0.1
-REVERSES_BELOW = 0.4  # a slower rung also runs back part of its way
+REVERSES_BELOW = 0.4  # a rung at a lower pace also runs backwards for a part of its way
 RUNG_S = 4.0  # s, approximate duration of a rung with its rest
 SHORT = 0.3, 0.8  # paces if the duration allows one rung only
 LADDER = 6  # maximum number of rungs per ladder
@@ -38,9 +38,9 @@ LONGEST_S = 120.0
 LEAST_S = 5 * BLEND_S
 # Series.
 TOP_HZ = 1.0  # highest harmonic, in the series' own time
-DECAY = 1.5  # exponent of amplitude over harmonic: low harmonics need position range, high ones acceleration
+DECAY = 1.5  # amplitude decreases with this power of the harmonic: low harmonics need range, high ones acceleration
 SHORTEST_S = 4.0  # s, minimum fundamental period
-RANGE = 0.8  # share of the distance from the centre to the nearer position limit, or of pi rad if that is less
+RANGE = 0.8  # share of the distance from the center to the nearer position limit, or of pi rad if that is less
 SPEED = 0.65  # share of dq_max
 ACCELERATION = 0.7  # share of ddq_max
 STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then it catches up at a higher speed
@@ -53,7 +53,7 @@ MARGIN = 0.3  # share of each clearance, and 0.03 of tau_max: reserve for motion
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
 FINE = 10  # number of samples for limits per sample for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
-Samples = tuple[np.ndarray, ...]  # offset from the centre, velocity, acceleration
+Samples = tuple[np.ndarray, ...]  # offset from the center, velocity, acceleration
 # Scores (B,) of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)
 Score = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -71,9 +71,9 @@ def fourier(
 ) -> Excitation:
     """Return an informative motion that passes `motion_checks.check_motion`.
 
-    The amplitudes of a random series use 80 % of the position range, 65 % of the velocity limit and 70 % of the
-    acceleration limit, less where obstacles require it; a local search then increases the `information`. The series
-    ends before its period, so the motion does not repeat itself. The result depends on the arguments only.
+    A random series uses up to 80 % of the position range, 65 % of the velocity limit and 70 % of the acceleration
+    limit, and less near obstacles. A local search then increases the `information`. The motion does not repeat,
+    because it is shorter than the period of the series. The same arguments produce the same motion.
 
     Args:
         robot: limits, links and nominal model.
@@ -81,12 +81,12 @@ def fourier(
         seed: random seed.
         gravity: see `information`.
         effort: number of motions that the local search tries; 0: return the first safe draw.
-        q_center: (n,) rad, centre posture; default: the middle of the position range.
+        q_center: (n,) rad, center posture; default: the middle of the position range.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
 
     Raises:
-        UserError: an argument is out of range, or no draw is safe.
+        UserError: an argument is out of range, or no random series is safe.
     """
     if not LEAST_S <= duration <= LONGEST_S:
         raise UserError(f"excitation.duration: expected {LEAST_S:g} to {LONGEST_S:g} s, got {duration:g}")
@@ -101,10 +101,10 @@ def fourier(
 
 
 def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> np.ndarray:
-    """Return the centre posture (n,) rad of a motion, by default the middle of the position range.
+    """Return the center posture (n,) rad of a motion, by default the middle of the position range.
 
     Raises:
-        UserError: the centre is outside the limits, or the centre or q_home is too near to an obstacle.
+        UserError: the center is outside the limits, or the center or q_home is too near to an obstacle.
     """
     center = 0.5 * np.add(*robot.q_range) if q_center is None else np.asarray(q_center, dtype=float)
     _check_center(robot, center)
@@ -113,13 +113,13 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions: coefficients x (2 H, n) of a series, and shares a (n,) of the largest joint amplitudes.
+    """Candidate motions (x, a): series coefficients x (2 H, n), and amplitudes a (n,) as shares of the largest ones.
 
-    A joint's limits determine its largest amplitude, so x determines only the shape.
+    The limits of a joint determine its largest amplitude; x determines only the shape of the motion.
 
     Args:
-        robot: limits and links. center: (n,) rad, centre posture. duration: s. space: computes distances.
-        score: function that scores motions, the larger the better; see `Score`.
+        robot: limits and links. center: (n,) rad, center posture. duration: s. space: computes link distances.
+        score: function that scores motions, larger scores for better motions; see `Score`.
     """
 
     def __init__(self, robot: Robot, center: np.ndarray, duration: float, score: Score, space: Space):
@@ -134,10 +134,10 @@ class Candidates:
     def found(
         self, rng: np.random.Generator, effort: int, report: Callable[[float], None] = lambda share: None
     ) -> Excitation:
-        """Return the best motion of `effort` tries; `report` is called with the share of tries that are done.
+        """Return the best motion of `effort` tries; call `report` with the completed share of the tries.
 
         Raises:
-            UserError: no draw is safe.
+            UserError: no random series is safe.
         """
         best = self.draw(rng, KEPT if effort else 1)
         motion = self.finish(*self.search(rng, best, effort, report)) if best else None
@@ -151,7 +151,7 @@ class Candidates:
         return motion
 
     def draw(self, rng: np.random.Generator, count: int) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """Return (score, x, a) of the best of up to `count` safe draws, or None if no draw is safe."""
+        """Return (score, x, a) of the best of up to `count` safe random series, or None if no series is safe."""
         shapes = [rng.standard_normal((2 * self.harmonics, self.robot.n)) for _ in range(DRAWS)]
         full = np.ones(self.robot.n)
         if count > 1:
@@ -171,7 +171,7 @@ class Candidates:
         effort: int,
         report: Callable[[float], None],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (x, a) after a local search with random changes of one joint at a time."""
+        """Return (x, a) of a local search that begins at `best` and changes one joint at random at a time."""
         most, x, a = best
         steps = -(-effort // TRIES)
         for step in range(steps):
@@ -194,7 +194,7 @@ class Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the motion at 1 kHz, scaled down until it is safe at GEOMETRY_HZ; None if it becomes too small."""
+        """Return the motion at 1 kHz, with amplitudes that are safe at GEOMETRY_HZ; None: these are too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))
@@ -206,12 +206,12 @@ class Candidates:
         return Excitation(self.clock[0], self.center + offset, dq, ddq)
 
     def scores(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return the scores (B,) of B pairs (x, a); to compute them together is faster."""
+        """Return the scores (B,) of B pairs (x, a), computed together for speed."""
         offset, dq, ddq = (np.stack(m) for m in zip(*(self._coarse(x, a) for x, a in motions), strict=True))
         return self.score(self.t, self.center + offset, dq, ddq)
 
     def _basis(self, rows: slice) -> Samples:
-        """Return matrices (T, 2 H) that map x to position, velocity, acceleration of the series at the ms `rows`."""
+        """Return matrices (T, 2 H) that map x to position, velocity and acceleration at the milliseconds `rows`."""
         _, s, pace, slope = (c[rows, None] for c in self.clock)
         order = np.arange(1, self.harmonics + 1)
         omega = 2 * np.pi / self.period * order
@@ -221,7 +221,7 @@ class Candidates:
         return np.hstack([sine, cosine]), first * pace, second * pace**2 + first * slope
 
     def _scaled(self, series: Samples, a: np.ndarray) -> Samples:
-        """Return offset from the centre, velocity, acceleration (T, n), with shares a of the largest amplitudes."""
+        """Return offset from the center, velocity and acceleration (T, n) of a series with amplitude shares a."""
         r = self.robot
         q, dq, ddq = series
         room = RANGE * np.minimum([r.q_max - self.center, self.center - r.q_min], np.pi)
@@ -236,7 +236,7 @@ class Candidates:
         return q[::FINE], dq[::FINE], ddq[::FINE]
 
     def _safety(self, offset: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the smaller of two margins (T,), negative if unsafe: gap / clearance, unused torque share / 0.1."""
+        """Return safety (T,), the smaller of gap / clearance and unused torque share / 0.1; negative: unsafe."""
         q = self.center + offset
         torque = (TORQUE_SHARE - torque_share(self.robot, q, dq, ddq)).min(1)
         return np.minimum((self.space.gaps(q) / self.space.clearance).min(1), 10 * torque)
@@ -255,9 +255,9 @@ class Candidates:
     def _shrink(
         self, a: np.ndarray, moved: Callable[[np.ndarray], Samples], by: float, margin: float, least: float
     ) -> np.ndarray | None:
-        """Return shares a, reduced until `_safety` reaches `margin`; None if one falls below `least`.
+        """Return amplitude shares a, reduced until `_safety` reaches `margin`; None if a share falls below `least`.
 
-        Each round reduces the amplitude of the joint that most improves the least safe sample.
+        Each round reduces the joint whose smaller amplitude most improves the least safe sample.
         """
         a = a.copy()
         for every in (5, 1):  # first every fifth sample, so that most rounds are fast
@@ -277,7 +277,7 @@ class Candidates:
 
 
 def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return t, the series' own time s, ds/dt and d2s/dt2, each (T,); raised cosines blend the paces ds/dt."""
+    """Return time t, time s within the series, ds/dt and d2s/dt2, each (T,); raised cosines blend the paces ds/dt."""
     t = SIM_DT * np.arange(round(duration / SIM_DT) + 1)
     levels, shares, fixed = [0.0], [0.0], [ENDS_S]  # a level lasts `fixed` s plus its share of the remaining time
     rungs = _rungs(duration)
@@ -299,7 +299,7 @@ def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def _rungs(duration: float) -> list[list[float]]:
-    """Return the paces of each rung: each ladder goes from slow to fast; slow rungs run forwards and backwards."""
+    """Return the paces of each rung: the rungs of a ladder go from slow to fast; slow rungs also run backwards."""
     count = int(duration / RUNG_S + 0.5)
     if count < 2:
         return [list(SHORT)]

@@ -1,4 +1,4 @@
-"""Compute the expected information of a recording of a planned motion, from assumed noise and priors."""
+"""Compute the information that a recording of a planned motion will contain, for assumed noise and priors."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ COARSE_HZ = 10  # rate of the samples for information and safety
 NOISE = 0.002  # share of tau_max, per sample
 FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
 DRAG_PRIOR = 0.01  # share of tau_max, torque proportional to the sine of the angle, such as a cable's
-MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, for each coordinate of its centre of mass
+MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, for each coordinate of its center of mass
 SCALE_PRIOR = 0.3  # share of a link's tensor, or of its trace
 DELAY_PRIOR = 3e-3  # s
 SLOPE = 0.05  # share of dq_max, width of the sign change of friction
@@ -23,11 +23,11 @@ def information(
 ) -> np.ndarray:
     """Return the information (B,) nats in motions (B, T, n) at times (T,) s.
 
-    It is half of log(det posterior / det prior precision); priors are independent and normal. Unknowns per joint:
-    offset, Coulomb friction as a tanh, its width and shift, viscous friction, angle-dependent drag. Per link: mass,
-    centre of mass (gravity depends on their errors even if the arm compensates it). Commanded torque (no `gravity`)
-    adds each tensor's scale and one delay; link-side torque (`gravity`) adds the whole tensors. The noise is 0.2 % of
-    tau_max at 10 samples per second. Samples of a joint at rest are ignored: its friction is then undetermined.
+    Information is half of log(det posterior precision / det prior precision), with independent normal priors. Each
+    joint has the unknowns offset, Coulomb friction as a tanh, its width and shift, viscous friction and drag. Each
+    link has the unknowns mass and center of mass, whose errors remain in the torque despite gravity compensation. For
+    commanded torque (`gravity` false) each tensor's scale and one delay are unknown, for link-side torque the whole
+    tensors. The noise is 0.2 % of tau_max at 10 Hz. A resting joint's samples are ignored, as friction may hold it.
     """
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)

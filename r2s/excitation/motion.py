@@ -37,7 +37,7 @@ def load(path: str | os.PathLike, robot: Robot, *, table: float = TABLE_M, z_min
     """Read an excitation in the format of `Excitation.save` and check it for this robot.
 
     Raises:
-        UserError: no such file, another format, or a motion that fails `motion_checks.check_motion`.
+        UserError: the file is missing or has another format, or the motion fails `motion_checks.check_motion`.
     """
     path = Path(path)
     if not path.is_file():
@@ -47,7 +47,7 @@ def load(path: str | os.PathLike, robot: Robot, *, table: float = TABLE_M, z_min
             header = [name.strip() for name in file.readline().split(",")]
             with warnings.catch_warnings(action="ignore"):  # NumPy warns about a file without rows
                 rows = np.loadtxt(file, delimiter=",", ndmin=2)
-    except ValueError as error:  # UnicodeDecodeError is one too
+    except ValueError as error:  # UnicodeDecodeError is a ValueError too
         raise UserError(f"data.excitation: {path} is not a table of numbers: {str(error).splitlines()[0]}") from None
     expected, n = _columns(robot.n), robot.n
     for name in expected:

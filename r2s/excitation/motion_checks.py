@@ -1,6 +1,6 @@
 """Check a motion before an arm runs it: consistency, limits, torque, and clearance to table and links.
 
-Joint limits are checked at every sample, torque and geometry at `GEOMETRY_HZ`. The links are the MJCF's geoms.
+The checks test joint limits at every sample, torque and distances at GEOMETRY_HZ. MJCF geoms define the links' shape.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,14 +42,14 @@ class Motion(Protocol):
 def check_motion(
     robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M, space: "Space | None" = None
 ) -> None:
-    """Raise UserError with joint or link, value and time of the first violation, in the order of the checks below.
+    """Raise UserError at the first violation, with joint or link, value and time of the violation.
 
     Args:
         robot: limits and links.
-        motion: sampled at 1 kHz.
+        motion: the motion, sampled at 1 kHz.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
-        space: a `Space` to use instead of one from robot, table and z_min; it may have obstacles.
+        space: a `Space`, for example with obstacles, used instead of table and z_min; None: a `Space` of both.
     """
     check_shape(robot, motion)
     check_limits(robot, motion)
@@ -59,7 +59,7 @@ def check_motion(
 
 
 def check_shape(robot: Robot, motion: Motion) -> None:
-    """Raise UserError unless the motion is finite, has the robot's joints and a step of 1 ms."""
+    """Raise UserError unless the motion is finite, has a column per joint of the robot, and a time step of 1 ms."""
     t = motion.t
     for name in ("q", "dq", "ddq"):
         x = getattr(motion, name)
@@ -98,7 +98,7 @@ def check_limits(robot: Robot, motion: Motion) -> None:
 def check_derivatives(robot: Robot, motion: Motion) -> None:
     """Raise UserError unless dq and ddq are the derivatives of q, and the motion starts and ends at rest.
 
-    The tracking controller uses all three, so a step in q would jerk the arm although all limits are respected.
+    The tracking controller uses q, dq and ddq, so a jump of q alone would jerk the arm without exceeding a limit.
     """
     e = motion
     for name, x, slope, most, unit in (
@@ -123,7 +123,7 @@ def check_derivatives(robot: Robot, motion: Motion) -> None:
 
 
 def check_torque(robot: Robot, motion: Motion) -> None:
-    """Raise UserError if the nominal model and friction need more than 80 % of a torque limit."""
+    """Raise UserError if the motion needs more than 80 % of a torque limit with the nominal model and friction."""
     rows = geometry_rows(motion)
     share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
     bad = np.argwhere(~(share <= TORQUE_SHARE))
@@ -140,17 +140,17 @@ def check_torque(robot: Robot, motion: Motion) -> None:
 def check_space(
     robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M, space: "Space | None" = None
 ) -> None:
-    """Raise UserError if a link comes too near to table, obstacles or another link; for the approach see paths.py."""
+    """Raise UserError if the motion brings a link too near to the table, an obstacle or another link."""
     space = space or Space(robot, table=table, z_min=z_min)
     rows = geometry_rows(motion)
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
 
 
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return (T, n): |gravity| + |dynamics| of the nominal model + `friction_margin`, divided by tau_max.
+    """Return (|gravity| + |dynamics| + `friction_margin`) / tau_max (T, n) of the nominal model.
 
-    The sum of magnitudes is conservative: the arm differs from the nominal model, and the torque limit applies to
-    the torque without gravity compensation on some arms, and to the torque with it on others.
+    The sum of magnitudes is conservative, because the arm differs from the nominal model. The torque limit includes
+    gravity compensation on some arms and not on others; the sum is sufficient for both.
     """
     gravity = gravity_torque(robot, q)
     dynamics = nominal_torque(robot, q, dq, ddq) - gravity
@@ -163,27 +163,27 @@ def gravity_torque(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 def friction_margin(robot: Robot) -> np.ndarray:
-    """Return the torque (n,) Nm reserved for friction before identification."""
+    """Return the torque (n,) Nm that is reserved for friction as long as friction is not identified."""
     return np.minimum(FRICTION_SHARE * robot.tau_max, FRICTION_ROOT * np.sqrt(robot.tau_max))
 
 
 class Space:
-    """Computes distances of an arm's links from table, obstacles and each other; `collision` selects the geoms.
+    """Computes the distances of an arm's links from table, obstacles and each other; `collision` selects the geoms.
 
-    An arm does not follow its plan exactly. If each joint j deviates by e_j rad, a distance shrinks by at
-    most sum_j lever_j |e_j|, to first order. The lever is the link's motion per rad of joint j, from the Jacobian at
-    the posture. A planned posture must leave room for a deviation of all joints by DEVIATION. In motion, an arm that
-    exceeds its `DeviationLimits` is stopped before it comes too near; these limits are larger where there is more
-    room. So no plan is refused because of a deviation that the arm never has.
+    An arm does not follow its plan exactly. If each joint j deviates by e_j rad, a distance decreases by at most
+    sum_j lever_j |e_j|, to first order. lever_j is the displacement of the link per rad of joint j, from the Jacobian
+    at the posture. A planned posture needs enough distance for a deviation of all joints by DEVIATION. Larger
+    deviations need no distance in the plan, because the arm stops when it exceeds its `DeviationLimits`, which depend
+    on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, required distances: end effector above z_min (a scale for the search; `gaps` requires 0 m),
-            links above the table, and between pairs of links.
+        clearance: (K,) m, least distances: end effector above z_min (a scale for fourier.py; `gaps` requires 0 m),
+            links above the table, and links of a pair from each other.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
-        robot: links. table, z_min: m, see `check_motion`. deviation: rad, of all joints, to leave room for.
-        obstacles: boxes.
+        robot: links of the arm. table, z_min: m, see `check_motion`. deviation: rad, assumed deviation of all joints.
+        obstacles: boxes that the links must avoid.
     """
 
     def __init__(
@@ -227,13 +227,13 @@ class Space:
         return distances - self._needed(levers)
 
     def _needed(self, levers: np.ndarray) -> np.ndarray:
-        """Return the required distances (T, K) m for levers (T, K, n) m/rad; 0 for the end effector."""
+        """Return the required distances (T, K) m for levers (T, K, n) m/rad; the end effector needs 0 m."""
         need = np.clip(FENCE_M + self._deviation * levers.sum(2), self.clearance, self._most)
         need[:, 0] = 0.0
         return need
 
     def measured(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distances (T, K) m, and levers (T, K, n) m/rad of joints on distances; 0 for the end effector."""
+        """Return distances (T, K) m and levers (T, K, n) m/rad, see `Space`; the end effector has levers 0."""
         tip, apart = np.empty((len(q), 1)), np.empty((len(q), len(self.pairs)))
         places, frames = (np.empty((len(q), self.model.ngeom, k)) for k in (3, 9))
         levers = np.zeros((len(q), 1 + len(self.above) + len(self.pairs), q.shape[1]))
@@ -246,10 +246,10 @@ class Space:
         return np.hstack([tip - self.floor, self._heights(places, frames) - self.table, apart]), levers
 
     def _levers(self) -> np.ndarray:
-        """Return upper bounds (K - 1, n) m/rad on the change of each distance per rad of each joint, at this q."""
+        """Return upper bounds (K - 1, n) m/rad on the change of each distance per joint angle, at this posture."""
         d, radius, link = self.data, self.model.geom_rbound, self._link
         arm = d.geom_xpos[:, None] - d.xanchor
-        moved = np.cross(d.xaxis, arm)  # (ngeom, n, 3) of each geom's centre
+        moved = np.cross(d.xaxis, arm)  # (ngeom, n, 3), displacement of each geom's center
         joint = np.arange(len(d.xaxis))
         up = np.abs(moved[:, :, 2]) + radius[:, None] * np.hypot(*d.xaxis.T[:2])
         lifted = np.where(joint < link[:, None], up, 0.0)[self.above]
@@ -260,7 +260,7 @@ class Space:
         return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
-        """Raise UserError at the first row of q (T, n) with a gap below 0; `when(k)` describes row k."""
+        """Raise UserError for the first row of q (T, n) with a gap below 0; `when(k)` is the text for row k."""
         gaps = self.gaps(q)
         bad = np.argwhere(~(gaps >= 0))
         if len(bad):
@@ -268,7 +268,7 @@ class Space:
             raise UserError(f"excitation: {self.explain(int(which), q[row], when(row))}")
 
     def explain(self, which: int, q: np.ndarray, when: str) -> str:
-        """Return the error message for column `which` of `gaps` at q (n,) rad."""
+        """Return the message about a violation in column `which` of `gaps` at the posture q (n,) rad."""
         distances, levers = self.measured(q[None])
         seen, allowed = distances[0, which], self._needed(levers)[0, which]
         if which == 0:
@@ -289,7 +289,7 @@ class Space:
         return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
 
     def _apart(self) -> np.ndarray:
-        """Return the distances of the `pairs`, m; beyond FAR_M, the distances of their bounding spheres."""
+        """Return the distance, m, of each geom pair in `pairs`; beyond FAR_M, that of the bounding spheres."""
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         radius, place = self.model.geom_rbound, self.data.geom_xpos
         out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]
@@ -298,14 +298,14 @@ class Space:
         return out
 
     def _heights(self, places: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Return the heights (T, G) m of the lowest points of `above`, from geom_xpos and geom_xmat (T, ngeom, .)."""
+        """Return the heights (T, G) m of the lowest points of the geoms `above`, from geom_xpos and geom_xmat."""
         lowest = [places[:, g, 2] - self._reach(g, frames[:, g, 6:]) for g in self.above]
         return np.array(lowest).T.reshape(len(places), len(self.above))
 
     def _reach(self, g: int, up: np.ndarray) -> np.ndarray:
-        """Return (T,) m from a geom's centre to its lowest point; `up` (T, 3) is the vertical in the geom's frame.
+        """Return a geom's height (T,) m from lowest point to center; `up` (T, 3): the vertical in the geom's frame.
 
-        Other shapes, such as a signed distance field, are replaced by their bounding sphere.
+        Other shapes than those below, such as a signed distance field, have the height of their bounding sphere.
         """
         m, kind, size = self.model, mujoco.mjtGeom, self.model.geom_size[g]
         across, along = np.hypot(up[:, 0], up[:, 1]), np.abs(up[:, 2])
@@ -327,6 +327,6 @@ class Space:
 
 
 def geometry_rows(motion: Motion) -> np.ndarray:
-    """Return the indices of the rows at GEOMETRY_HZ, and of the last row."""
+    """Return the indices of a motion's rows at the rate GEOMETRY_HZ, and of the last row."""
     rows = np.arange(0, len(motion.t), max(1, round(1 / (GEOMETRY_HZ * SIM_DT))))
     return np.union1d(rows, [len(motion.t) - 1])

@@ -1,7 +1,7 @@
-"""Joint-space paths to a posture, checked for limits and clearance before an arm moves along them.
+"""Find a joint-space path to a posture, and check its limits and clearance before an arm moves along the path.
 
-A path is a list of postures (k, n) rad, connected by straight lines in joint space; speed is not part of it.
-Distances and clearances are those of `motion_checks`.
+A path is an array of postures (k, n) rad, connected by straight lines in joint space, without speeds. Distances and
+clearances are computed as in `motion_checks`.
 """
 
 from collections.abc import Iterator
@@ -12,23 +12,23 @@ from r2s.errors import UserError
 from r2s.excitation.motion_checks import CLEARANCE_M, Space
 from r2s.physics.robot import Robot
 
-CLOSER_M = 1e-3  # m, an arm that starts too near to an obstacle may come closer by this on its way out
+CLOSER_M = 1e-3  # m by which an arm that starts too near to an obstacle may come closer before it moves away
 SAME = 1e-3  # rad, a joint this close to its target need not move
 
 
 def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, space: Space) -> np.ndarray:
-    """Return the first candidate path (k, n) rad from q_from to q_to that has no `path_violation`.
+    """Return the first candidate path (k, n) rad from q_from to q_to without `path_violation`.
 
-    The candidates are the straight line, a path through q_home, joint by joint (last or first joint first), and
-    joint by joint through q_home.
+    The candidates are the straight line, two straight lines through q_home, a path that moves one joint after the
+    other (from the last or from the first), and such a path through q_home.
 
     Args:
         robot: limits and links.
         q_from, q_to: (n,) rad.
-        what: name of the path for the message. space: `Space` of the robot.
+        what: name of the path in the error message. space: `Space` of the robot.
 
     Raises:
-        UserError: no candidate is free; the message describes the violation on the straight line.
+        UserError: every candidate has a violation; the message describes the violation on the straight line.
     """
     first = ""
     for path in _candidates(robot, np.asarray(q_from, dtype=float), np.asarray(q_to, dtype=float)):
@@ -40,18 +40,18 @@ def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, s
 
 
 def _candidates(robot: Robot, a: np.ndarray, b: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield paths (k, n) from a to b (n,), the simplest first."""
+    """Yield the candidate paths (k, n) rad from a to b (n,) in the order that `approach` lists."""
     home, last_first = robot.q_home, np.arange(robot.n)[::-1]
     yield np.array([a, b])
     yield np.array([a, home, b])
     for order in (last_first, last_first[::-1]):
         yield _one_by_one(a, b, order)
-    for order in (last_first, last_first[::-1]):  # to q_home in this order, from q_home in the opposite one
+    for order in (last_first, last_first[::-1]):  # to q_home in this order, from q_home in the opposite order
         yield np.concatenate([_one_by_one(a, home, order), _one_by_one(home, b, order[::-1])[1:]])
 
 
 def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Return the path (k, n) from a to b (n,) that moves one joint after the other, in this order."""
+    """Return the path (k, n) rad from a to b (n,) that moves one joint after the other in the order `order`."""
     path = [a]
     for joint in order:
         if abs(b[joint] - path[-1][joint]) > SAME:
@@ -60,9 +60,9 @@ def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
-    """Return a description of the first place where a path (k, n) leaves limits or comes too near, else "".
+    """Return a description of the first violation of limits or clearances on a path (k, n) rad, or "".
 
-    The first posture, where the arm is, may violate clearances, but these distances must not decrease further.
+    The first posture, where the arm is, may violate clearances; its distances may decrease by CLOSER_M at most.
     """
     if path.ndim != 2 or len(path) < 2 or path.shape[1] != robot.n:
         return f"expected postures of shape (2 or more, {robot.n}), got {path.shape}"
@@ -92,6 +92,6 @@ def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
 
 
 def _where(leg: int, count: int, share: float) -> str:
-    """Return a description of the point at `share` of a leg, on a path of `count` postures."""
+    """Return a description of the point at a share of leg number `leg` of a path with `count` postures."""
     which = "" if count == 2 else f", from posture {leg + 1} to {leg + 2} of {count}"
     return f" {100 * share:.0f} % of the way{which}"

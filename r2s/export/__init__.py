@@ -1,1 +1,1 @@
-"""Export a trained policy as a bundle: files that another program can run, with a runtime in a single file."""
+"""Export a trained policy as a bundle, with which another program can run the policy without r2s."""

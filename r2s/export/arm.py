@@ -1,4 +1,4 @@
-"""Check that a bundle was made for the arm on which it will run. `r2s export` copies this module into the bundle."""
+"""Check that a bundle was made for the arm that will run it. `r2s export` copies this module into the bundle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ class Arm:
 
     Attributes:
         joints: joint names in order from the base. cycle_hz: rate at which the arm takes torque commands, Hz.
-        torque: "without gravity" if the arm adds its own gravity compensation, as libfranka's arms do.
+        torque: "without gravity" if the arm itself compensates gravity, as a Franka arm does.
         q_min, q_max, dq_max, tau_max, dtau_max: the arm's limits, one per joint: rad, rad, rad/s, Nm, Nm/s.
-        slows: (decelerations rad/s^2, offsets rad/s), one value per joint, for an arm such as the FR3: at a distance
-            d from a position limit this arm allows the speed sqrt(2 deceleration d) - offset. None: no such limit.
+        slows: each joint's (decelerations rad/s^2, offsets rad/s) in the speed limits of an arm such as the FR3 near
+            its position limits: sqrt(2 deceleration d) - offset at the distance d. None: no such speed limits.
     """
 
     joints: Sequence[str]
@@ -33,7 +33,7 @@ class Arm:
 
 
 def fits(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle was made for another arm, or needs more than the limits of this arm allow."""
+    """Raise BundleError if a bundle was made for another arm, or exceeds a limit of this arm."""
     own, n = contract["joints"], len(contract["joints"])
     if len(arm.joints) != n:
         raise BundleError(f"expected {n} joints, got {len(arm.joints)} of the arm")
@@ -64,7 +64,7 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
 
 
 def _slows(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle allows higher speeds near position limits than the arm, see `Arm.slows`."""
+    """Raise BundleError if a bundle allows higher speeds near position limits than the arm does in `Arm.slows`."""
     law = Driver(contract["law"], Model(contract["model"]))
     deceleration, offset = np.array(arm.slows, dtype=float)
     for way in np.linspace(0.0, 1.0, 101):  # rad before the limit

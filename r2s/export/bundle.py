@@ -56,15 +56,15 @@ def write_bundle(
     config: Mapping[str, Any],
     places: Sequence[str],
 ) -> None:
-    """Write the bundle of a finished training into the new folder `to`, atomically.
+    """Write the bundle of a finished training atomically into the new folder `to`.
 
     Args:
-        to: the new folder. source: run folder of the training. robot, task, policy, config: those of the training.
-        dynamics: dynamics of one arm, the center of the training's randomization.
-        places: names of all simulators and arms; the model card lists those that were not tried.
+        to: the new folder. source: run folder of the training. robot, task, policy, config: parts of the training.
+        dynamics: dynamics of one arm, at the center of the training's domain randomization.
+        places: names of all simulators and arms; the model card lists those without a transfer of the policy.
 
     Raises:
-        UserError: `to` exists, or policy.onnx of the run is missing or does not compute the actions of policy.pt.
+        UserError: `to` exists, or the run's policy.onnx is missing or computes other actions than policy.pt.
     """
     if to.exists():
         raise UserError(f"export: {to} exists; remove it, or choose another to=FOLDER")
@@ -109,7 +109,7 @@ def write_bundle(
 
 
 def surface_of(source: Path, robot: Robot, task: Task, dynamics: Dynamics) -> Surface | None:
-    """Return the surface that a task touches: as identified in the run folder, else nominal; None without contact."""
+    """Return the identified surface of a run with contact, or else the nominal surface; None without contact."""
     if not task.touches:
         return None
     if (source / "contact.yaml").is_file():
@@ -126,7 +126,7 @@ def check_with_own_runtime(folder: Path) -> None:
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
-    """Copy policy.onnx, and check that its actions equal those of policy.pt and its metadata equal the contract."""
+    """Copy policy.onnx, and check its actions against policy.pt and its metadata against the contract."""
     import onnx
     from onnx.reference import ReferenceEvaluator
 
@@ -174,7 +174,7 @@ def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
 
 
 def one_file(control: Controller) -> str:
-    """Return the text of r2s_runtime.py: runtime.py, whose imports from r2s are replaced by the imported source.
+    """Return the text of r2s_runtime.py: the code of runtime.py and of the r2s modules that runtime.py imports.
 
     Raises:
         UserError: the control law uses names that a bundle does not contain.
@@ -208,7 +208,7 @@ def one_file(control: Controller) -> str:
 def law_source(law: Any) -> tuple[str, str]:
     """Return the name and the source of a control law as plain Python, without decorators.
 
-    If the law uses other functions or numbers, the source is a function that defines them and returns the law.
+    If the law uses other functions or numbers, the source is a function that defines these and returns the law.
 
     Raises:
         UserError: the law uses a name that is neither a function, a number, a builtin nor NumPy's `np`.
@@ -225,7 +225,7 @@ def law_source(law: Any) -> tuple[str, str]:
 
 
 def _collect(function: Any, law: str, sources: dict[str, str]) -> None:
-    """Add the source of a function to `sources` {name: source}, after the sources of everything that it uses."""
+    """Add the functions and numbers that a function uses, then the function, to `sources` {name: source}."""
     node = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
     assert isinstance(node, ast.FunctionDef)
     node.decorator_list = []

@@ -75,12 +75,12 @@ def card(
 
 
 def contacts(contract: Mapping[str, Any]) -> str:
-    """Return words that name the contacts that were absent from the training."""
+    """Return the words for the contacts that did not occur in the training."""
     return "no contact but of the tip" if contract["goal"]["kind"] == "surface" else "no contact"
 
 
 def pushing(contract: Mapping[str, Any]) -> list[str]:
-    """Return sentences on the limits of pushing force and closing speed."""
+    """Return sentences on the limits of contact force and closing speed."""
     push, on_surface = contract["law"]["push"], contract["goal"]["kind"] == "surface"
     if push is None:
         return ["Nothing but the torque limit bounds a force: safety.force_max was null."] if on_surface else []
@@ -133,14 +133,14 @@ def plans(contract: Mapping[str, Any]) -> list[Item]:
 
 
 def settings(group: Mapping[str, Any]) -> str:
-    """Return a config group as "name, key value, ..."."""
+    """Return a config group as a text "name, key value, ..."."""
     name = group.get("name") or group.get("_target_", "").rsplit(".", 1)[-1]
     own = (f"{k} {v}" for k, v in group.items() if k not in NOT_SHOWN and v is not None)
     return ", ".join([*([name] if name else []), *own])
 
 
 def model(source: Path, config: Mapping[str, Any]) -> str:
-    """Return a line that says where the model of the training comes from."""
+    """Return a line on the source of the training's model, either nominal or identified."""
     path = source / "parameters.yaml"
     if not path.is_file():
         return f"model: nominal, friction {settings(config['friction'])}; not identified from a recording"
@@ -149,7 +149,7 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"place (run)": measures} of a policy's ended transfers in its root, if they include `measure`."""
+    """Return {"simulator or arm (run)": measures} of all ended transfers of a policy that have `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:

@@ -1,7 +1,7 @@
-"""Make contract.json: everything that a program needs to run a policy on the arm for which it was trained.
+"""Make contract.json, which contains all data that a program needs to run a policy on the arm of its training.
 
-The contract has all numbers of driver and safety filter (r2s/arm/driver.py, r2s/physics/safety_filter.py), the
-controller, and the model for computed torque (r2s/physics/inverse_dynamics.py), so a runtime needs no other numbers.
+The contract contains all parameters of driver and safety filter (r2s/arm/driver.py, r2s/physics/safety_filter.py), of
+the controller, and of the model for computed torque (r2s/physics/inverse_dynamics.py).
 JSON has no infinity, so null stands for a missing limit.
 """
 
@@ -56,19 +56,19 @@ class DescribesObservation(Protocol):
     """A task that describes the terms of its observations."""
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms in the order in which an observation lists them."""
+        """Return the terms of an observation, in their order."""
         ...
 
 
 def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.ndarray | None = None) -> dict[str, Any]:
-    """Return a policy's contract, except its keys files, versions, trained and seal, which `write_bundle` adds.
+    """Return a policy's contract without the keys files, versions, trained and seal, which `write_bundle` adds.
 
     Args:
-        robot, task: the training's. friction: Coulomb level (n,) Nm, see `r2s.physics.safety_filter.filter_torque`.
+        robot, task: of the training. friction: Coulomb level (n,) Nm, see `r2s.physics.safety_filter.filter_torque`.
         rotors: armatures (n,) kg m^2 for the safety filter; None: the armatures of `robot`.
 
     Raises:
-        UserError: the task does not describe its observations, or the runtime of a bundle cannot run the task.
+        UserError: the task has no `observation_terms`, or the runtime of a bundle does not support the task.
     """
     check_exportable(robot, task)
     control = task.control(robot)
@@ -123,14 +123,14 @@ def kind_of(task: Task) -> str:
 
 
 def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
-    """Return the position of the second joint, m, from which tasks measure the distance of goals."""
+    """Return the position of the second joint, m, from which the contract measures the distance of a goal."""
     arm = Model(model)
     arm.place(robot.q_home)
     return listed(arm.origin[min(1, robot.n - 1)])
 
 
 def check_exportable(robot: Robot, task: Task) -> None:
-    """Raise UserError unless a runtime can run the task: its goals are points or plans of known kinds."""
+    """Raise UserError unless the runtime of a bundle supports the task's goals, controller and friction family."""
     control, kind = task.control(robot), kind_of(task)
     model = model_of(control, task)
     if model is not None and model.dynamics.family.name not in FRICTION:
@@ -160,7 +160,7 @@ def check_exportable(robot: Robot, task: Task) -> None:
 
 
 def model_of(control: Controller, task: Task) -> InverseDynamics | None:
-    """Return the arm model that computed torque or the observed contact force needs, or None."""
+    """Return the arm model for computed torque or for the estimate of contact force; None if neither is used."""
     if isinstance(control, ComputedTorque):
         return control.model
     return task.model if isinstance(task, SurfaceTask) else None
@@ -183,7 +183,7 @@ def controller(control: Controller, task: Task) -> dict[str, Any]:
 
 
 def links_of(robot: Robot, dynamics: Dynamics) -> list[dict[str, Any]]:
-    """Return per link its joint, mass, center of mass and inertia tensor, in the link frame at angle zero."""
+    """Return each link's joint pose and axis, mass, center of mass and inertia tensor at the joint angle zero."""
     out = []
     for k in chain(robot, dynamics, friction=False)[0]:
         row: dict[str, Any] = {"place": k.origin[:3, 3], "frame": k.origin[:3, :3], "axis": k.axis}
@@ -222,14 +222,14 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
 
 
 def width(of: str, joints: int, preview: int) -> int:
-    """Return the number of values of an observation term whose source is named `of`."""
+    """Return the number of values in an observation term with the source `of`."""
     own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
     own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
     return {**own, "above_target": 1}.get(of, joints)
 
 
 def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the entry `goal` for goals that are points: their format, and the region of the training's goals."""
+    """Return the entry `goal` for point goals: the format of a goal, and the region of the training's goals."""
     out: dict[str, Any] = {"kind": "point", "shape": [3], "unit": "m", "frame": "the arm's base"}
     if hasattr(task, "region"):
         low, high = task.region(robot)
@@ -240,7 +240,7 @@ def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
 
 
 def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the entry `goal` for goals that are plans: their format, and the ranges of the training's plans."""
+    """Return the entry `goal` for plans as goals: the format of a plan, and the ranges of the training's plans."""
     ends = np.cumsum([0, 3, 3, robot.n, robot.n, robot.n]).tolist()
     low, high = task.region(robot)
     trained = {"kinds": list(task.kinds), "size_m": list(task.size), "fastest_m_per_s": list(task.speed)}
@@ -260,7 +260,7 @@ def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, A
 
 
 def start(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the entry `start`: the start posture, and the allowed distance from it and speed at the start."""
+    """Return the entry `start`: the start posture, the allowed distance from this posture, and the allowed speed."""
     rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
         return {"words": FIRST_ROW} | rest
@@ -286,7 +286,7 @@ WORDS = {
 
 
 def identified(arm: InverseDynamics, ahead_s: float, kind: str) -> dict[str, Any]:
-    """Return the entry `control.model`: the numbers of the arm model, and the formula in which they are used."""
+    """Return the entry `control.model`: the parameters of the arm model, and the formula that uses them."""
     robot, d = arm.robot, arm.dynamics
     names = FRICTION[d.family.name]
     phi = dict(zip(d.family.names, d.phi.T, strict=False))
@@ -310,7 +310,7 @@ def identified(arm: InverseDynamics, ahead_s: float, kind: str) -> dict[str, Any
 
 
 def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[Any]]:
-    """Return the safety filter's and driver's parameters that differ between joints: {name in UNITS: n values}."""
+    """Return {name in UNITS: n values}, the parameters of safety filter and driver that differ between joints."""
     matrix = law.filter_limits(robot, task.torque_limit(robot))
     values = [matrix[:, k] for k in range(law.COLUMNS)]
     values += [friction, task.torque_limit(robot), robot.q_min + driver.Q_INSIDE, robot.q_max - driver.Q_INSIDE]
@@ -320,7 +320,7 @@ def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[
 
 
 def numbers(task: Task) -> dict[str, float]:
-    """Return the safety filter's and driver's parameters that are the same for all joints."""
+    """Return {name: value}, the parameters of safety filter and driver that are the same for all joints."""
     deadline = max(driver.DEADLINE_S, driver.PERIODS / task.ctrl_hz)
     own = {"cycle_s": SIM_DT, "low_pass": low_pass_factor(task.cutoff_hz), "brake_s": law.BRAKE_S, "rate": law.RATE}
     own |= {"approach": law.APPROACH, "allowed": law.ALLOWED, "nothing": law.FADED, "exact": law.TOLERANCE}

@@ -1,7 +1,7 @@
-"""Run the control law of a bundle in plain Python; r2s itself compiles the same function.
+"""Run the control law of a bundle in plain Python; r2s itself runs the same function, compiled by numba.
 
-`r2s export` copies the source of the control law into r2s_runtime.py of the bundle. So the bundle runs the function
-that the training ran, although r2s is not installed.
+`r2s export` copies the source of the control law into r2s_runtime.py of the bundle, so that the bundle runs the same
+function as the training and does not need r2s.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ LAWS: dict[str, Callable] = {"torque": torque_law, "computed_torque": computed_t
 
 
 class Control:
-    """The controller of a contract. It maps the policy's command and the state to target torques, once per cycle.
+    """The controller of a contract: a call maps the policy's command and the arm's state to a target torque.
 
     Args:
         contract: contract of the bundle; the entry `control` describes the controller.
@@ -30,17 +30,17 @@ class Control:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the memory of the control law, before a motion."""
+        """Clear the memory of the control law before a motion."""
         self._memory = np.zeros(self._memory_size)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Return the target torque (n,) Nm of this cycle. `command` is the action followed by the setpoint."""
+        """Return the target torque (n,) Nm of this cycle; `command` contains the action, then the setpoint."""
         out = np.zeros(self._n)
         self._law(q, dq, command, self._parameters, self._memory, out)
         return out
 
     def at_rest(self, q: np.ndarray, dq: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that the control law computes for a zero action and a cleared memory."""
+        """Return the control law's torque (n,) Nm for an action of zero, as in the first cycle of a motion."""
         out = np.zeros(self._n)
         command = np.concatenate([np.zeros(self.action_dim), setpoint])
         self._law(q, dq, command, self._parameters, np.zeros(self._memory_size), out)

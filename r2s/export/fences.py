@@ -1,6 +1,6 @@
 """Check start, goal and plan of a motion, run the policy in a thread, and bring the arm to rest after a signal.
 
-`r2s export` copies this module into the bundle. The thread is for arms whose clock does not wait for the policy.
+`r2s export` copies this module into the bundle. The thread is for physical arms, which do not wait for the policy.
 """
 
 import signal
@@ -17,8 +17,8 @@ from r2s.export.law import BundleError, Model
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")  # Ctrl-C, kill, a closed terminal, Ctrl-\, Ctrl-Z
 POLL_S = 1e-4  # s, time between two reads of the mailbox by the policy's thread: a tenth of a cycle
-ROUNDING_M = 1e-6  # m, tolerance with which a goal is compared with the border of its region
-AGREE_M = 1e-3  # m, allowed distance between the position in a plan's row and the one that its joint angles reach
+ROUNDING_M = 1e-6  # m, tolerance of the border of the region of goals
+AGREE_M = 1e-3  # m, allowed distance between a position in a plan and the position that the plan's joint angles reach
 
 
 def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
@@ -37,7 +37,7 @@ def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
 
 
 def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.ndarray) -> None:
-    """Raise BundleError unless the arm is at rest near the start posture `home` (n,) rad. `start`: the limits."""
+    """Raise BundleError unless the arm rests near the posture `home` (n,) rad, within the limits `start`."""
     if not (np.isfinite(q).all() and np.isfinite(dq).all()):
         raise BundleError("the arm's state is not finite")
     if start["within_rad"] is not None and (far := np.abs(q - home)).max() > start["within_rad"]:
@@ -51,7 +51,7 @@ def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.n
 
 
 def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError if a plan exceeds the arm's limits or the training's region, or is for another arm."""
+    """Raise BundleError if a plan exceeds limits of the arm, leaves the training's region or is for another arm."""
     at, own = contract["goal"]["columns"], contract["law"]["joint"]
     place, q, dq = (plan[:, slice(*at[name])] for name in ("place", "q", "dq"))
     low, high, most = (np.array([s if v is None else v for v in own[k]]) for k, s in BOUNDS.items())
@@ -69,19 +69,19 @@ def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None
             raise BundleError(f"row {row} of the plan is {1e3 * off:.1f} mm from where its joint angles take the arm")
 
 
-BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # keys of the law, and what null means
+BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # keys of the law, and values for null
 
 
 class PolicyThread:
-    """A thread that computes the actions, so that the 1 kHz cycle does not wait. Two one-item mailboxes need no lock.
+    """A thread that computes the actions, so that the 1 kHz loop does not wait for the policy.
 
     Args:
-        act: maps an observation to an action.
+        act: function that maps an observation to an action.
     """
 
     def __init__(self, act: Callable[[np.ndarray], np.ndarray]):
         self._act = act
-        self._seen: deque[tuple] = deque(maxlen=1)  # append replaces an old item; both calls are atomic
+        self._seen: deque[tuple] = deque(maxlen=1)  # append replaces an old item; append and pop are atomic
         self._made: deque[tuple] = deque(maxlen=1)
         threading.Thread(target=self._run, daemon=True).start()
 
@@ -90,7 +90,7 @@ class PolicyThread:
         self._seen.append((motion, seen, setpoint))
 
     def newest(self, motion: int) -> np.ndarray | None:
-        """Return the newest command, or None if the caller has it already or it belongs to another motion."""
+        """Return the newest command of motion number `motion`, or None if there is no new command."""
         try:
             of, command = self._made.pop()
         except IndexError:
@@ -112,7 +112,7 @@ class PolicyThread:
 
 @contextmanager
 def stopped_by_signals(runtime: Any) -> Iterator[None]:
-    """Let `SIGNALS` bring the arm to rest instead of ending the program. Call this in the main thread."""
+    """Bring the arm to rest on a signal of SIGNALS instead of ending the program; call only in the main thread."""
 
     def stop(number: int, frame: Any) -> None:
         runtime.stop(signal.Signals(number).name)

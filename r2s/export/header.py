@@ -1,4 +1,4 @@
-"""Make contract.hpp: the contract as C++ constants, and the control law, for the loop in examples/libfranka."""
+"""Make contract.hpp: the contract's constants and control law in C++, for the control loop in examples/libfranka."""
 
 import json
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ PARAMETERS = 7  # number of parameters of the largest friction family
 
 
 def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
-    """Return a C++17 header: model, safety filter, control law and observation.
+    """Return a C++17 header with arm model, safety filter, control law and observation.
 
     Args:
         contract: see contract.py. policy_sha256: digest of policy.onnx. law: C++ body of the law, `Controller.cpp`.
@@ -63,7 +63,7 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
 
 
 def _push(push: Mapping[str, Any] | None) -> list[str]:
-    """Return the constants of the push limit (zeros without one) and the reflex thresholds of a Franka arm."""
+    """Return the C++ constants of the push limit, 0 if there is none, and of a Franka arm's reflex thresholds."""
     own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
         PUSH_VECTOR, [0.0] * 3
     )
@@ -80,7 +80,7 @@ def _push(push: Mapping[str, Any] | None) -> list[str]:
 
 
 def _surface(contract: Mapping[str, Any]) -> list[str]:
-    """Return the constants for plans on a surface and for the arm model that estimates the contact force."""
+    """Return the C++ constants of plans on a surface and of the arm model for the estimate of contact force."""
     goal, model = contract["goal"], contract["control"]["model"]
     trained, family = goal["trained"], model["friction"]["family"]
     names, given = FRICTION[family], model["friction"]["parameters"]
@@ -111,7 +111,7 @@ OWN = {"own_offset": "offset_Nm", "load": "load", "drag_sin": "drag_sin_Nm", "dr
 
 
 def _fences(contract: Mapping[str, Any]) -> list[str]:
-    """Return the constants for the allowed start and the region of goals; a missing limit becomes infinity."""
+    """Return the C++ constants of the allowed start and the region of goals; a missing limit is infinite."""
     start, trained = contract["start"], contract["goal"].get("trained") or {}
     near, far = trained.get("shoulder_distance_m", (0.0, None))
     numbers = {"start_within": start["within_rad"], "start_fastest": start["fastest_rad_per_s"], "goal_nearest": near}

@@ -1,6 +1,6 @@
 """Compute the inverse dynamics of the identified arm in NumPy, as r2s/physics/inverse_dynamics.py does.
 
-The runtime of a bundle needs it for the setpoints of control=computed_torque and for the estimate of contact force.
+A bundle needs inverse dynamics for the setpoints of control=computed_torque and to estimate contact force.
 `r2s export` copies this module into r2s_runtime.py of a bundle.
 """
 
@@ -21,10 +21,10 @@ FRICTION = {
 
 
 class InverseDynamics:
-    """Inverse dynamics of the identified arm, and the setpoints that follow from a plan.
+    """Inverse dynamics of the identified arm, and the setpoints of a plan.
 
     Args:
-        contract: contract of the bundle. `control.model` is the identified arm, `model` the arm's nominal model.
+        contract: contract of the bundle, with the identified arm `control.model` and the nominal arm `model`.
     """
 
     def __init__(self, contract: dict[str, Any]):
@@ -43,9 +43,9 @@ class InverseDynamics:
         self._sign, self._slides = number["sign_rad_per_s"], number["load_sign_rad_per_s"]
 
     def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
-        """Return the setpoints (rows, 3 n + n n) for the first `rows` rows of a joint motion (T, n) sampled at `hz`.
+        """Return setpoints (rows, 3 n + n n) of a joint motion (T, n), sampled at `hz`, for its first `rows` rows.
 
-        A setpoint is feedforward, Nm, q_d, dq_d, and the mass matrix row by row. Computing it takes longer than 1 ms.
+        A setpoint is feedforward, Nm, q_d, dq_d and the mass matrix row by row. Its computation takes over 1 ms.
         """
         n = q.shape[1]
         out = np.empty((rows, 3 * n + n * n))
@@ -61,7 +61,7 @@ class InverseDynamics:
         return out
 
     def equations(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm for a motion; the arm itself compensates gravity."""
+        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm without the arm's own gravity compensation."""
         self._own.place(q)
         self._nominal.place(q)
         mass, bias = self._own.equations(dq)

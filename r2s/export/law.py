@@ -1,6 +1,6 @@
 """Run driver and safety filter in NumPy, as r2s/arm/driver.py and r2s/physics/safety_filter.py do on an arm.
 
-`r2s export` copies this module, with others, into r2s_runtime.py of a bundle, so it imports nothing from r2s.
+`r2s export` copies this module into r2s_runtime.py of a bundle, so this module imports nothing from r2s.
 """
 
 from collections.abc import Sequence
@@ -14,23 +14,23 @@ OVER = 3  # last phase of a stop: the contact needs no further action, see push.
 
 
 class BundleError(ValueError):
-    """Error: a bundle cannot run here, or its runtime was called wrongly; the message is one line."""
+    """A bundle does not fit the arm, or a program calls the runtime wrongly; the message is one line."""
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
-    """Return a list from a contract as an array (n,). `none` replaces null, because JSON has no infinity."""
+    """Return a contract's list as an array (n,), with `none` in place of null, because JSON has no infinity."""
     return np.array([none if v is None else v for v in values], dtype=float)
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a x b (..., 3); np.cross takes three times as long."""
+    """Return the cross product of a and b (..., 3), three times as fast as np.cross."""
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     u, v, w = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
 
 class Model:
-    """Kinematics and dynamics of an arm, from the entry `model` of a contract. `place` sets the joint angles."""
+    """Kinematics and dynamics of an arm, from a contract's entry `model`, at the joint angles that `place` sets."""
 
     def __init__(self, model: dict[str, Any]):
         self.n = len(model["links"])
@@ -70,7 +70,7 @@ class Model:
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
 
-        The torque comes from Newton-Euler recursion, the matrix from the sum of J_k^T (m, I)_k J_k over the links k.
+        Newton-Euler recursion yields the torque, and a sum of J_k^T (m, I)_k J_k over the links k the mass matrix.
         """
         R, p, z, n = self.frame, self.origin, self.axis, self.n
         spin = z * dq[:, None]
@@ -108,14 +108,14 @@ class Model:
 
 
 class Driver:
-    """Control law, low-pass and safety filter, called once per cycle. The torque obeys the arm's limits.
+    """Control law, low-pass and safety filter; a call returns a torque command within the arm's limits.
 
     Attributes:
-        effort: (n,) Nm, the target torque after the low-pass. stopping: why the arm is being stopped, or None.
+        effort: (n,) Nm, the target torque after the low-pass. stopping: reason of the present stop, or None.
         limited: number of cycles of this motion in which the safety filter changed the torque.
 
     Args:
-        law: entry `law` of a contract. model: `Model` of the arm. soft_start_s: time in which torque fades in, s.
+        law: a contract's entry `law`. model: the arm's `Model`. soft_start_s: s, duration of the torque's fade-in.
         control: the contract's `Control`; None: commands are torques. push: the contract's `PushLimit`, or None.
     """
 
@@ -143,7 +143,7 @@ class Driver:
 
     @property
     def done(self) -> bool:
-        """Whether a stop has ended, because the arm is at rest or the time for a stop is over."""
+        """Whether a stop has ended: either the arm is at rest, or the stop has lasted its longest duration."""
         over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
         return self.stopping is not None and self._damped > 0 and (self._rests or over)
 
@@ -154,7 +154,7 @@ class Driver:
 
         Args:
             q, dq: joint state (n,) rad, rad/s, in this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            command: input (c,) of the controller; None: unchanged. placed: whether `model.place(q)` was called.
+            command: (c,), new command; None: the previous command. placed: whether the caller did `model.place(q)`.
         """
         j, c = self._j, self._number
         seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
@@ -228,10 +228,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to the effort that respects the joint bounds and the push limit.
-
-        The second value is whether the safety filter changed the effort.
-        """
+        """Return the torque (n,) Nm nearest to the effort within all limits, and whether the filter changed it."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -252,7 +249,7 @@ class Driver:
     def _bounded(
         self, tau: np.ndarray, dq: np.ndarray, ddq: np.ndarray, bounds: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to tau with accelerations within bounds, and whether it differs from tau.
+        """Return the torque (n,) Nm nearest to tau with acceleration in bounds, and whether this differs from tau.
 
         ddq: acceleration (n,) rad/s^2 due to tau. bounds: inverse mass matrix, lowest and highest ddq (n,) rad/s^2.
         """
@@ -285,7 +282,7 @@ class Driver:
         return speed
 
     def _stops(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the torques (n,) Nm that stops at the bounds would add, found by block principal pivoting."""
+        """Return the torques (n,) Nm that keep ddq between `low` and `high`, found by block principal pivoting."""
         c = self._number
         side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))
         push = np.zeros_like(ddq)

@@ -1,4 +1,4 @@
-"""Make and follow the plans of a policy that tracks a trajectory; in training, r2s/tasks/track.py does so.
+"""Make and follow the plans of a policy that tracks a trajectory, as r2s/tasks/track.py does in training.
 
 A plan is a timed path with a row per control step: position and velocity of the end effector, and angles, speeds and
 accelerations of the joints. `r2s export` copies this module into r2s_runtime.py of a bundle.
@@ -30,10 +30,10 @@ def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Follower:
-    """Follow a plan: return the observation sources and the controller's setpoint for each control step.
+    """Follow a plan: a call returns the observation sources and the controller's setpoint of a control step.
 
     Args:
-        contract: contract with plans as goals. control, model: made from it; `model` is not used.
+        contract: contract with plans as goals. control: the contract's `Control`. model: not used.
     """
 
     def __init__(self, contract: dict[str, Any], control: Control, model: Model | None = None):
@@ -61,12 +61,12 @@ class Follower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return the observation sources of a control step and the `setpoint`; `goal` is the reference position.
+        """Return the observation sources and the `setpoint` of a control step; `goal` is the reference position.
 
-        After the last step the reference stays at the end of the path.
+        After the last step the reference remains at the end of the path.
 
         Args:
-            step: number of the control step, from 0. seen: q, dq (n,) rad, rad/s, and the end effector `ee` (3,) m.
+            step: number of the control step, from 0. seen: q, dq (n,) rad, rad/s, end-effector position `ee` (3,) m.
             limited: share of the last control period in which the safety filter changed the command.
         """
         row, at, plan = min(step, self._steps), self._at, self._plan

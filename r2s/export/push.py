@@ -1,7 +1,7 @@
 """Limit contact force and closing speed, and stop an arm whose tip presses on a surface, in NumPy.
 
-r2s/physics/push_limit.py, which has the derivation, and r2s/physics/contact_stop.py do the same in r2s. `r2s export`
-copies this module into r2s_runtime.py of a bundle.
+r2s itself uses compiled versions in r2s/physics: push_limit.py, with the derivation, and contact_stop.py. `r2s
+export` copies this module into r2s_runtime.py of a bundle.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ BEGINS, PRESSES, CLEAR = range(3)  # phases of a stop, before OVER
 
 
 class PushLimit:
-    """The push limit of one arm. In every cycle call `see`, then `stop` if the arm is being stopped, then `limit`.
+    """Limit one arm's contact force. In every cycle call `see`, then (during a stop) `stop`, then `limit`.
 
     Args:
         law: entry `law` of a contract. model: the arm's `Model`; call `model.place(q)` in every cycle before `see`.
@@ -35,7 +35,7 @@ class PushLimit:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the estimated force and the phase of a stop, before a motion."""
+        """Prepare the next motion: reset the estimated contact force and the phase of a stop."""
         self._resisted, self._speed = 0.0, 0.0
         self._before: float | None = None  # closing speed one cycle ago, m/s; None: tip far from the plane
         self.phase, self._felt, self._from, self._pull = BEGINS, 0.0, 0.0, 0.0
@@ -62,7 +62,7 @@ class PushLimit:
         self._dq, self._mass, self._bias = dq, mass, bias
 
     def _bound(self, last: np.ndarray) -> float:
-        """Return the largest allowed `lever @ torque`, m/s^2, inwards. last: torque (n,) Nm of the previous cycle."""
+        """Return the upper bound of `lever @ torque`, inward acceleration by torque, m/s^2. last: previous torque."""
         p, c, mobility = self._p, self._c, self._mobility
         if self._height > p["near_m"]:
             self._resisted, self._before = 0.0, None
@@ -111,7 +111,7 @@ class PushLimit:
         return out, True
 
     def stop(self, held: np.ndarray, cycles: int) -> tuple[np.ndarray, float]:
-        """Return the target torque (n,) Nm for a cycle of a stop, and the factor on all allowed speeds that it needs.
+        """Return the target torque (n,) Nm in a stop, and the share of the allowed joint speeds that it uses.
 
         Args:
             held: torque (n,) Nm that the driver adds to the target. cycles: number of cycles since the stop began.

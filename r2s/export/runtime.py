@@ -1,4 +1,4 @@
-"""Run a bundle of `r2s export` on an arm. This file needs NumPy and ONNX Runtime, and nothing of r2s.
+"""Run a bundle of `r2s export` on an arm. This file needs NumPy and ONNX Runtime, but not r2s.
 
     python r2s_runtime.py BUNDLE         check the bundle, and print what it requires of an arm
 
@@ -8,8 +8,8 @@
         while not runtime.done:          # every millisecond
             tau = runtime(q, dq, tau_J_d, goal)
 
-If the policy follows plans, pass the plan to `reset`, and no goal in the cycles. `Runtime.plan` makes a plan from a
-joint motion. contract.json has the bundle's requirements; if the arm misses one, BundleError says so in one line.
+If the policy follows plans, pass a plan to `reset` and no goal to `runtime`. `Runtime.plan` makes a plan from a joint
+motion. contract.json lists the bundle's requirements; BundleError names one that the arm does not meet.
 """
 
 import hashlib
@@ -73,14 +73,14 @@ def load(folder: str | Path) -> dict[str, Any]:
 
 
 class Runtime:
-    """A policy with its controller and driver. It maps the joint state to the torque command, cycle by cycle.
+    """Run a policy with its controller and driver: in every cycle, map the joint state to the torque command.
 
     Attributes:
         contract: content of contract.json. driver: the `Driver`, which makes the torque obey the arm's limits.
 
     Args:
         folder: the bundle. arm: the arm on which it runs. soft_start_s: time over which the torque fades in, s.
-        live: whether the arm's clock does not wait for computations; if so, the policy runs in a separate thread.
+        live: whether the arm runs in real time; if so, the policy runs in a separate thread.
 
     Raises:
         BundleError: the bundle is damaged or made for another arm.
@@ -115,8 +115,8 @@ class Runtime:
         """Prepare the next motion, which begins at rest with zero torque.
 
         Args:
-            plan: (rows, columns) as `goal` of the contract describes, if the policy follows plans. The arm has to be
-                at the joint angles of the first row. Setpoints for computed torque take 0.1 s to compute.
+            plan: (rows, columns), in the format of the contract's entry `goal`; None if goals are points. The arm
+                must be at the joint angles of the first row. Setpoints for computed torque take 0.1 s to compute.
 
         Raises:
             BundleError: the plan is missing, has another shape, is not finite, or exceeds the arm's limits or the
@@ -134,12 +134,12 @@ class Runtime:
         self._motion += 1
 
     def stop(self, why: str = "asked for") -> None:
-        """Bring the arm to rest from the next cycle on. `driver.stopping` stays at the reason of the first call."""
+        """Bring the arm to rest from the next cycle on. `driver.stopping` is `why` of the first call."""
         self.driver.stopping = self.driver.stopping or why
 
     @property
     def done(self) -> bool:
-        """Whether the driver has brought the arm to rest; `driver.stopping` is the reason."""
+        """Whether the driver has brought the arm to rest. The reason is `driver.stopping`."""
         return self.driver.done
 
     def __call__(
@@ -155,8 +155,8 @@ class Runtime:
         During a motion, a goal outside the region of the training's goals brings the arm to rest.
 
         Raises:
-            BundleError: an argument has another shape, there is no plan, or the motion is over. In the first cycle
-                also: the goal is outside the training's region, or the arm is not at rest at the start posture.
+            BundleError: an argument has a wrong shape, there is no plan, the motion is over, or, in the first cycle,
+                the goal is outside the training's region or the arm is not at rest at the start posture.
         """
         if self.done:
             raise BundleError(f"the motion is over, {self.driver.stopping}: call reset before the next one")
@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Raise BundleError if start or goal is outside the training's region; after the first cycle only stop."""
+        """Raise BundleError for a start or first goal outside the training's region; stop the arm at a later one."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)
@@ -207,7 +207,7 @@ class Runtime:
     def _look(
         self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray | None
     ) -> dict[str, np.ndarray]:
-        """Return the observation sources of this control step; call `model.place(q)` before."""
+        """Return {name: values} from which `observe` makes the observation; call `model.place(q)` first."""
         ee, jacobian = self._model.hand()
         made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort, "tau_J_d": tau_J_d}
         if self._follower is not None:
@@ -221,7 +221,7 @@ class Runtime:
         return made | {"pull": jacobian.T @ made["error"]}
 
     def observe(self, made: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the observation (d,) float32, computed from the sources that `_look` returns."""
+        """Return the observation (d,) float32, computed from the result of `_look`."""
         scaled = [made[of] if by is None else made[of] / by for of, by, _ in self._entries]
         parts = [np.tanh(x) if tanh else x for x, (_, _, tanh) in zip(scaled, self._entries, strict=True)]
         return np.concatenate(parts).astype(np.float32)
@@ -233,11 +233,11 @@ class Runtime:
     def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the plan of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2. Call it between motions.
 
-        Rows are one control step apart. The motion has to begin and end at rest. The first `steps` + 1 rows are the
-        path; further rows follow, one for each row that the policy previews.
+        Rows are one control step apart. The motion must begin and end at rest. The first `steps` + 1 rows are the
+        path; the rows after it are those that the policy previews at the path's end.
 
         Raises:
-            BundleError: goals are points or plans on a surface, or the motion has another shape.
+            BundleError: the policy's goals are points or plans on a surface, or the motion has a wrong shape.
         """
         if self.contract["goal"]["kind"] != "plan":
             kinds = {"point": "points", "surface": "plans on a surface"}[self.contract["goal"]["kind"]]

@@ -1,8 +1,8 @@
-"""Check and follow plans on a surface, for policies that press and wipe; in training, tasks/surface_task.py does so.
+"""Check and follow plans on a surface, for policies that press and wipe; training uses tasks/surface_task.py instead.
 
-A plan has a row per control step: the point of the path on the nominal plane, the plane's normal, the depth of the
-target below the point, the desired force, the path's velocity, the start posture, and the controller's setpoint. This
-module imports only what a bundle contains: `r2s export` copies it into r2s_runtime.py of the bundle.
+A plan's row for a control step contains the path's point on the nominal plane, the plane's normal, the target's depth
+below this point, the desired force, the path's velocity, the start posture and the controller's setpoint. This module
+imports only NumPy and modules that `r2s export` copies with it into r2s_runtime.py.
 """
 
 from typing import Any
@@ -65,7 +65,7 @@ class SurfaceFollower:
     """Follow a plan on a surface: return the observation sources and the controller's setpoint for each control step.
 
     Args:
-        contract: contract with plans on a surface as goals. control, model: made from it; `control` is not used.
+        contract: contract with plans on a surface as goals. control, model: controller (not used) and arm model.
     """
 
     def __init__(self, contract: dict[str, Any], control: Control, model: Model):
@@ -88,7 +88,7 @@ class SurfaceFollower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return the observation sources of a control step and the `setpoint`.
+        """Return {name: values} for the observation of a control step, and the controller's `setpoint`.
 
         After the last step the target stays at the end of the plan.
 

@@ -1,4 +1,4 @@
-"""Make those entries of a contract that only policies which press or wipe need: plans on a surface, push limit."""
+"""Make the contract's entries for policies that press or wipe: format of plans on a surface, push limit."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndar
 
 
 def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return the entry `goal` for plans on a surface: their format, and the ranges of the training's plans."""
+    """Return the contract's entry `goal` for plans on a surface: their format, and their ranges during training."""
     columns = columns_of(robot.n, task.control(robot).setpoint_size)
     point, normal = task.plane(robot)
     trained = {"point_m": point.tolist(), "normal": normal.tolist(), "spread_m": task.spread}
@@ -52,9 +52,9 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
 
 
 def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return the start posture, rad, of the first example plan, and the allowed distance of each joint from a start.
+    """Return the start posture, rad, of an example plan, and each joint's allowed deviation from a plan's start.
 
-    Within this distance the tip is certainly above the surface.
+    If no start angle deviates by more, the tip certainly starts above the surface.
     """
     q = task.goals(robot, np.random.default_rng(0), 1)[0, START : START + robot.n]
     lever = np.abs(task.plane(robot)[1] @ Tip(robot)(q)[1]).sum()

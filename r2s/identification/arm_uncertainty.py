@@ -32,11 +32,11 @@ class Arm:
 def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
     """Return a correction factor (n,) for a payload's torque in each joint, and its standard deviation (n,).
 
-    The torque of an unloaded arm shows only the product of sensor gain and masses. If the masses in the robot's file
-    are wrong, the estimated gains absorb this error, and the computed torque of a payload would have the same error.
-    The factor corrects it. Sensor gains are independent between joints, but the relative error is the same for all
-    masses. Its likely value minimizes the sum of squares of gains and mass error, with standard deviations GAIN and
-    MASSES.
+    The torque of an unloaded arm determines only the product of sensor gain and masses. If the masses in the robot's
+    file are wrong, the estimated gains compensate this error, and the computed torque of a payload is wrong by the
+    same factor. Sensor gains are independent between joints, but all masses have the same relative error. The most
+    likely mass error minimizes the sum of squares of gains and mass error, divided by their standard deviations GAIN
+    and MASSES.
     """
     space, n = arm.space, arm.robot.n
     if "gain" not in space.blocks or LINK[0] in space.blocks:
@@ -50,7 +50,7 @@ def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sliding_sign(torque: TorqueResidual) -> np.ndarray:
-    """Return the sign of friction (F, n) at the instants of a residual's motion; if joints may rest, it is smooth."""
+    """Return the sign of friction (F, n) at F instants of a motion; it changes smoothly if joints may rest."""
     if torque.space.nominal.family.has_memory:
         return torque.motion.bristle
     dq = torque.motion.friction_dq
@@ -60,10 +60,10 @@ def sliding_sign(torque: TorqueResidual) -> np.ndarray:
 def arm_directions(
     torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
 ) -> np.ndarray:
-    """Return the residual's change (T, n, r) Nm by one standard deviation along each of r independent directions.
+    """Return the residual's change (T, n, r) Nm due to one standard deviation of each of r independent arm errors.
 
     Args:
-        torque: the residual. x: (P,) parameters of the arm. samples: (S, P), draws of their posterior, or None.
+        torque: the residual. x: (P,) parameters of the arm. samples: (S, P), posterior draws of x, or None.
         friction_drift: standard deviation of friction's change since the calibration, as a share of each joint's
             friction. offset_drift: (n,) Nm, standard deviation of the offset's change.
     """

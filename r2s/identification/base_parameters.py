@@ -1,8 +1,8 @@
 """Base parameters: the fewest combinations of inertial parameters on which joint torque depends.
 
-Torque is linear in ten standard parameters per link and one per rotor, but many of them only act in combination. The
-regressor has a column per parameter. Its QR decomposition without pivoting, at random states, selects the first
-independent columns; the other parameters are regrouped with these (Gautier, J. Robotic Systems 8(4), 1991).
+Torque is linear in ten standard parameters per link and one per rotor, but many act only in combination. The
+regressor has a column per parameter. A QR decomposition of the regressor at random states, without pivoting, selects
+the first independent columns; the others are regrouped with these (Gautier, J. Robotic Systems 8(4), 1991).
 """
 
 from typing import NamedTuple
@@ -77,7 +77,7 @@ def base_table(space: ParameterSpace, found: ParameterEstimate, rotors: bool) ->
 
 
 def _combination(row: np.ndarray, names: list[str], first: int) -> str:
-    """Return a row of the matrix as a sum of parameter names that begins with that of column `first`."""
+    """Return a row of the matrix as text, "zz[2] + 0.1 my[3]", which begins with the name of column `first`."""
     others = [k for k in np.flatnonzero(row).tolist() if k != first]
     parts = [f"{'-' if row[k] < 0 else '+'} {_factor(abs(row[k]))}{names[k]}" for k in others]
     return " ".join([names[first], *parts])

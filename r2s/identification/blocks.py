@@ -1,7 +1,7 @@
 """Divide a recording into blocks with independent errors, the clusters of a posterior's covariance.
 
 Model error lasts longer than noise: torque ripple at low speed lasts seconds, and recurs when motion is repeated. So
-a block lasts several correlation times of the residual. If residuals recur, repetitions of a motion are one block.
+each block spans several correlation times of the residual. If residuals recur, a block joins repetitions.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def blocks_of(
 
     Args:
         t: (T,) s, rising within a trajectory. q: (T, n) rad. period: s, of a repeated motion; None: no repetition.
-        residual: (T, n), residual of a fit; None: blocks last `shortest_s`, with separate blocks per repetition.
+        residual: (T, n), residual of a fit; None: blocks last `shortest_s` and repetitions have separate blocks.
     """
     run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of times that the clock has restarted
     steps = np.diff(t)[np.diff(run) == 0]
@@ -46,7 +46,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return blocks (T,) of phase, joined over repetitions `visit` (T,) except where their q (T, n) differ."""
+    """Return blocks (T,) joined over the repetitions `visit` (T,), except where a repetition's q (T, n) differs."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -58,7 +58,7 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
     """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,).
 
-    It is the integral of squared autocorrelation, an upper bound even for oscillating scores (residual times slope).
+    The squared autocorrelation's integral bounds this time even for oscillating scores (residual times slope).
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))
@@ -92,7 +92,7 @@ def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
 
 
 def _labels(*keys: np.ndarray) -> np.ndarray:
-    """Return for each moment the number (T,) of its combination of keys (T,)."""
+    """Number the distinct combinations of keys, each (T,), from 0; return the number (T,) at each moment."""
     out = np.zeros(len(keys[0]), dtype=int)
     for key in keys:
         index = np.unique(key, return_inverse=True)[1]

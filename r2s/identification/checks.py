@@ -85,7 +85,7 @@ def check_ramps(robot: Robot, ramps: Ramps) -> None:
 
 
 def _check_joints(robot: Robot, recording: Recording, what: str) -> None:
-    """Raise UserError if `what` has another number of joints or exceeds the position limits."""
+    """Raise UserError if a recording, named `what`, has a wrong number of joints or exceeds the position limits."""
     if recording.n_joints != robot.n:
         raise UserError(f"{what}: expected {robot.n} joints of {robot.name}, got {recording.n_joints}")
     out = np.maximum(robot.q_min - MARGIN - recording.q.min(0), recording.q.max(0) - robot.q_max - MARGIN)

@@ -1,8 +1,8 @@
 """Assess what each of several recordings adds to an identification, and whether one contradicts the others.
 
-For each recording there are two further fits: one without it, and one to it alone. Both take a few steps of least
-squares on torque, starting at the fit to all recordings. A recording's rows are weighted by the residual of the fit
-to it alone, because the residual of a fit to contradicting recordings is more than noise.
+Two further fits assess a recording: a fit to all other recordings, and a fit to this recording alone. Both start at
+the fit to all recordings and need only a few least-squares steps on torque. A recording's rows are weighted by its
+residual in the fit to it alone, because contradicting recordings would increase the residual of a common fit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,10 +22,10 @@ from r2s.recordings.recording import Recording
 CONTRADICTS = 2.0  # ratio of sums of squares: one fit to all recordings, over a separate fit to one of them
 WORSE = 4.0  # ratio of a recording's RMSE, fitted alone, to the others'; above it the model does not fit
 CARRIED = 0.5  # a body on the last link is reported if it explains this share of the squared left-out error
-LEAST_MASS = 0.01  # of the arm's mass: least mass of such a body
+LEAST_MASS = 0.01  # least mass of such a body, relative to the arm's mass
 ROUNDS = 3  # reweighted fits of each recording alone
 STEPS, FTOL = 10, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by less (relative)
-USED_S, RATE_HZ = 120.0, 50.0  # s of a longer recording that are compared; rows per second
+USED_S, RATE_HZ = 120.0, 50.0  # s, longest part of a recording that is compared; rows per second
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +35,10 @@ class Contribution:
     Attributes:
         label, torque, seconds: name, kind of torque and length of the recording. use: "training" or "validation".
         rmse: (n,) Nm, error of the fit to all recordings.
-        left_out: (n,) Nm, error of a fit to the other recordings. narrower: (P,) ratio of 95 % interval widths: fit
-            without this recording over fit with it. Both are None for validation.
-        alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio, see CONTRADICTS; 1 if there is
-            no other recording. body_kg: mass on the last link that explains the contradiction; nan if none does.
+        left_out: (n,) Nm, error of a fit to the other recordings. narrower: (P,) ratio of 95 % interval widths
+            without and with this recording. For validation, left_out and narrower are None.
+        alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio of sums of squares, see
+            CONTRADICTS; 1 for one recording. body_kg: mass on the last link that explains the contradiction, or nan.
     """
 
     label: str
@@ -105,12 +105,12 @@ def _torque(space: ParameterSpace, recording: Recording, cutoff_hz: float) -> To
 
 
 def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
-    """Return the sum of squares of all parts at u (P,)."""
+    """Return the sum of squares of all residuals in `parts` at u (P,)."""
     return sum(float((p(p.space.from_unit(u)[None]) ** 2).sum()) for p in parts)
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the fit (P,) to the recordings `parts`, started at u (P,); prior: rows (B,) at u and Jacobian (B, P)."""
+    """Return the fit (P,) to the residuals `parts`, started at u (P,). prior: residual (B,) at u and its Jacobian."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:

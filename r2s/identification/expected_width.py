@@ -1,8 +1,8 @@
 """Predict the widths of the 95 % intervals of an identification before it runs.
 
-A few least-squares steps on torque with all terms estimate the noise and a point at which to linearize the model. The
-widths are those of `posterior` at this point. The slow parts of an identification are skipped: comparison of
-families, selection of terms, convergence, replays, breakaway.
+A few least-squares steps on torque, with all model terms, estimate the parameters and the noise. `posterior`
+linearizes the model at these parameters and computes the widths. The slow parts of an identification are skipped:
+comparison of friction families, selection of terms, convergence, replays and breakaway torques.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 STEPS, FTOL = 6, 1e-2  # most Jacobians between reweightings; a fit ends at a smaller relative gain of a step
-USED_S = 120.0  # s of a longer recording that are used
+USED_S = 120.0  # s, longest part of a recording that is used
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class ExpectedWidths:
     Attributes:
         space: the parameters. width: (P,) SI units. share: (P,) ratio of posterior to prior standard deviation.
         identifiable: (P,) whether the data will determine the value, by the same rule as in `conclude`.
-        late: s, lateness and its standard deviation. It is the lateness of measured or motor torque relative to the
-            motion, or of the motion relative to commands.
+        late: s, time shift and its standard deviation: by how much measured or motor torque is later than the motion,
+            or the motion is later than commands.
     """
 
     space: ParameterSpace
@@ -84,7 +84,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
 
 
 def _lateness(problem: Problem, u: np.ndarray) -> tuple[float, float]:
-    """Return the lateness of tau, in s, that the parameters do not explain, and its standard deviation in s."""
+    """Return the time shift of tau, s, that the parameters do not explain, and the shift's standard deviation, s."""
     data = problem.torque_data
     r, j = data(problem.space.from_unit(u[None]))[0], data.jacobian(u)
     change = (data.motion.command(0.0, 0.0) - data.motion.command(SIM_DT, 0.0)) / SIM_DT

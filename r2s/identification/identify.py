@@ -47,7 +47,7 @@ from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 STANDSTILL = 0.02  # rad/s; for commanded torque, friction below this speed is not a function of velocity
-CLEAR = 1.5  # times dq_min: below this speed a replayed joint may stick
+CLEAR = 1.5  # a replayed joint slower than this multiple of dq_min may stick
 MAX_BATCH = 64  # candidates replayed at once
 SELECTED_S = 240.0  # s; the selection of family and terms uses at most this much of a recording
 REWEIGHTS = 2  # further fits of a local search, each with weights from the residual of the previous fit
@@ -56,7 +56,7 @@ Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
 
 class History:
-    """Progress rows of an identification. A step stores its rows with its arrays, so a resumed run restores them."""
+    """Progress rows of an identification. Each step stores its progress rows and its arrays for a resumed run."""
 
     def __init__(self, report: Report, memo: Memo):
         self.rows: list[dict] = []
@@ -78,13 +78,13 @@ class History:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """State of an identification between two steps.
+    """Input and result of each step of an identification.
 
     Attributes:
         robot, nominal, recording, searches, settings, ramps: see `identify`. `select_family` sets nominal.family.
         prior: {parameter: standard deviation, SI units}. terms: model terms that are estimated besides friction.
         families: {family: error of held-out torque}; empty if the user chose the family.
-        space: the parameter space. `fit_breakaway` and `fit_stiction` add the results of their steps to it.
+        space: the parameter space. `fit_breakaway` adds breakaway commands, `fit_stiction` the stiction model.
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
         edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
             sliding (only Stribeck families).
@@ -111,12 +111,12 @@ class State:
 
     @property
     def commanded(self) -> bool:
-        """Whether the recorded torque is a command. Only commands can be replayed and show delay and breakaway."""
+        """Whether the recorded torque is a command. Replays, delay and breakaway require commands."""
         return self.recording.torque == "commanded"
 
     @property
     def slowest(self) -> float:
-        """Speed in rad/s; only torque rows of faster joints are used."""
+        """Joint speed in rad/s above which torque rows are used."""
         return STANDSTILL if self.commanded else 0.0
 
     @property
@@ -130,7 +130,7 @@ class State:
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Return an arm's sliding after breakaway; None if its friction has no Stribeck rise, or has bristles."""
+        """Return an arm's motion after breakaway, or None if its friction has no Stribeck effect or has bristles."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)
@@ -150,13 +150,13 @@ def identify(
     """Estimate the parameters of an arm, with intervals.
 
     Args:
-        robot: the arm. nominal: start of the searches; parameters that are not estimated have its values.
+        robot: the arm. nominal: start of the searches, and values of all parameters that are not estimated.
         recording: the training motion; only commanded torque allows replay residuals.
         searches: one or more searches; each starts at the solution of the previous one.
         settings: parameters, bounds, prior, and how residuals are computed.
         ramps: recordings of the breakaway protocol; without them, a scan on the recording finds breakaway torques.
         report: function that is called with a row of progress after every step or generation.
-        memo: function of a step's name and a function that computes its arrays; it may return stored arrays instead.
+        memo: called as memo(name, make) for a step; returns make(), the step's arrays, or arrays stored under `name`.
 
     Raises:
         UserError: the recording does not fit the arm or hardly moves.
@@ -185,7 +185,7 @@ def select_family(s: State) -> State:
 
 
 def settle_lateness(s: State) -> State:
-    """Choose whether to correct the lateness of link-side torque and of dq; without correction a delay stays 0."""
+    """Choose whether to correct the lateness of link-side torque and of dq; an uncorrected delay is 0."""
     nominal = replace(s.nominal, late_alike=False)
     if s.recording.torque != "measured" or DELAY in s.settings.stated:
         return replace(s, nominal=nominal)
@@ -248,7 +248,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return prior knowledge of values in `space`: what the user states, else an earlier identification's result."""
+    """Return the prior of values in `space` from the user's statements, else from an earlier identification."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated
@@ -257,7 +257,7 @@ def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, Array
 
 
 def fit(s: State) -> State:
-    """Run the searches one after the other; discard a replay fit that contradicts the torque of moving joints."""
+    """Run the searches in order; discard a replay fit that explains the torque of moving joints clearly worse."""
     problem, u = s.problem, s.u
     for k, search in enumerate(s.searches):
         v, problem = _run(s, f"search {k + 1}", search, problem, u)
@@ -297,7 +297,7 @@ def fit_presliding(s: State) -> State:
 
 
 def reweight(s: State) -> State:
-    """Repeat the last search, if it is local, with weights from its residual; finally decide if a lag is needed."""
+    """Repeat a local last search with rows weighted by its residual, and decide whether the data need a lag."""
     search = s.searches[-1]
     if not search.local:
         return s
@@ -317,7 +317,7 @@ def reweight(s: State) -> State:
 
 
 def fit_breakaway(s: State) -> State:
-    """Set the breakaway torques from the ramps, with the offset and other torques of the fitted arm."""
+    """Compute breakaway torques: the ramps' commands plus the offset and other torques of the fitted arm."""
     arm, space = s.fitted(), s.space
     if not s.commanded or s.ramps is None:
         return replace(s, dynamics=arm)
@@ -364,10 +364,10 @@ def _run(
 
 
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
-    """Return whether v (P,) explains the torque clearly worse than u (P,), which was fitted to it.
+    """Return whether values v (P,) explain the torque clearly worse than u (P,), which was fitted to torque.
 
-    Two correct estimates differ by their estimation errors, and this alone raises the sum of squares by about P. The
-    sum itself has the relative error ALIKE, because the number of independent rows is uncertain.
+    The estimation error of a correct v raises the sum of squares by about P. The sum of squares has the relative
+    error ALIKE, because the number of independent rows is uncertain.
     """
     fitted = problem.on_torque.cost(u)
     rise = problem.on_torque.cost(v) - fitted
@@ -375,11 +375,11 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return the solution u (P,) of a local search; the lag, index `at`, stays nominal unless the data need it.
+    """Return the solution u (P,) of a local search that estimates the lag u[at] only if the data need it.
 
-    If torque changes slowly, a short lag acts like a delay. The data need the lag if it lowers the cost by more than
-    the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). This comparison omits the block
-    that favours the lag most, because the rows of one block are correlated.
+    If torque changes slowly, a short lag acts like a delay. The data need the lag if estimating it lowers the cost by
+    more than the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). Both costs omit the
+    block that favors the lag most, because the rows of a block are correlated.
     """
     having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
     u = start.copy()

@@ -1,9 +1,9 @@
 """Represent prior knowledge of an arm's parameters as a normal distribution of named values.
 
-Sources are an earlier identification, recordings of another kind of torque, or the user (stated.py).
-Between two dates, friction and offsets drift: x_now = x_then + w with w ~ N(0, drift^2). So the earlier posterior is
-widened by the drift before it becomes a prior (the prediction step of a Kalman filter; Kalman 1960). The reported
-drift is the estimate of w from the data of both dates.
+The source is an earlier identification, recordings of another kind of torque, or the user (stated.py). Between two
+dates, friction and offsets drift by w ~ N(0, drift^2), so that x_now = x_then + w. The prior has the covariance of
+the earlier posterior plus diag(drift^2) (the prediction step of a Kalman filter; Kalman 1960). r2s reports an
+estimate of the drift w from the data of both dates.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,8 +18,8 @@ from r2s.identification.posterior import Z_95
 
 BODY = (*OF_LINKS, *PAYLOAD)  # shared by all kinds of torque; friction, offsets and gains differ between kinds
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # parameters that drift besides those of the friction law
-FLOOR = 1e-4  # least standard deviation over `ParameterSpace.usual`, as all draws may be clipped at a bound
-FAR = 5.0  # standard deviations in the worst of about thirty directions, above which knowledge and data disagree
+FLOOR = 1e-4  # least standard deviation over `ParameterSpace.usual`, since all draws may be clipped at a bound
+FAR = 5.0  # standard deviations in the worst of about thirty directions, above which prior and data disagree
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Known:
     """A normal distribution of named values, which a problem uses as an `ExtraResidual`.
 
     Attributes:
-        names: K names such as coulomb[2]. mean: (K,) in SI units; of logarithmic parameters, their logarithm.
+        names: K names such as coulomb[2]. mean: (K,) in SI units, or the logarithm of logarithmic parameters.
         covariance: (K, K), drift included. drift: (K,) standard deviation of the drift since the earlier date, or 0.
     """
 
@@ -38,7 +38,7 @@ class Known:
 
     @staticmethod
     def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
-        """Return the knowledge from an identification with values x (P,) and posterior draws (S, P).
+        """Return the prior that an identification with values x (P,) and posterior draws (S, P) yields.
 
         drift: standard deviation of the change of friction, offsets and drag since that identification, relative to
             the larger of the value and its standard deviation among arms (`ParameterSpace.usual`).
@@ -60,7 +60,7 @@ class Known:
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return this distribution joined with an independent one; values in both are taken from `other`."""
+        """Return the joint distribution with the independent `other`, which replaces values that both contain."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)
@@ -71,16 +71,16 @@ class Known:
         return Known((*own.names, *other.names), mean, covariance, drift)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return the whitened deviation (C, K) of candidates x (C, P) from the mean, in standard deviations."""
+        """Return the deviations (C, K) of candidates x (C, P) from the mean, whitened by the covariance."""
         at = [space.names.index(name) for name in self.names]
         off = coordinates(self.names, x[:, at]) - self.mean
         return np.linalg.solve(np.linalg.cholesky(self.covariance), off.T).T
 
 
 def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[float, str]:
-    """Return by how many standard deviations x (P,) contradicts the prior, and the name of the worst value.
+    """Return the largest deviation of x (P,) from the prior, in standard deviations, and the name of that value.
 
-    The number is the largest deviation along a principal axis of the prior's correlation matrix.
+    Deviations are measured along the principal axes of the prior's correlation matrix.
     """
     known = known.where(lambda name: name in space.names and name not in space.fixed)
     if not known.names:
@@ -113,12 +113,12 @@ def coordinates(names: Sequence[str], x: np.ndarray) -> np.ndarray:
 def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.ndarray) -> pd.DataFrame:
     """Return a table of values that may drift: then, now, and the difference with its 95 % interval, in SI units.
 
-    The difference is w in x_now = x_then + w, given the data of both dates. Let then ~ N(m, P), Q = diag(drift^2),
-    S = P + Q, and now ~ N(x, V) after the new data. Then w ~ N(G (x - m), G V G^T + P - P S^-1 P) with G = Q S^-1
-    (the Rauch-Tung-Striebel smoother, AIAA Journal 3(8), 1965).
+    The difference is the drift w in x_now = x_then + w, estimated from the data of both dates. With x_then ~ N(m, P),
+    Q = diag(drift^2), S = P + Q, and x_now ~ N(x, V) after the new data, the Rauch-Tung-Striebel smoother (AIAA
+    Journal 3(8), 1965) yields w ~ N(G (x - m), G V G^T + P - P S^-1 P), where G = Q S^-1.
 
     Args:
-        known: prior of the new identification. space, x, samples: its parameters, values (P,) and draws (S, P).
+        known: prior of an identification. space, x, samples: parameters, values (P,) and posterior draws (S, P).
     """
     known = known.where(lambda name: name in space.names and name not in space.fixed)
     at = [space.names.index(name) for name in known.names]

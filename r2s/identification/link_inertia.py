@@ -1,4 +1,4 @@
-"""Describe a link's mass, centre of mass and inertia tensor by ten parameters that are always physically consistent.
+"""Describe a link's mass, center of mass and inertia tensor by ten parameters that are always physically consistent.
 
 Log-Cholesky parameters describe the pseudo-inertia J relative to the nominal link (Rucker and Wensing, RA-L 7(2),
 2022): J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
@@ -17,8 +17,8 @@ PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z")
 def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     """Return [[Sigma, h], [h^T, m]] (..., 4, 4) about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
 
-    Sigma, h and m are the second moment, first moment and mass. About the centre of mass, Sigma is positive definite
-    if the tensor's principal moments are positive and satisfy the triangle inequality, else eigenvalues are raised.
+    Sigma, h and m are second moment, first moment and mass. The second moment about the center of mass is positive
+    definite if principal moments are positive and satisfy the triangle inequality, else its eigenvalues are raised.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)
@@ -67,7 +67,7 @@ def add_point_mass(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mass (..., n) kg, com (..., n, 3) m, tensor (..., n, 3, 3) with a point mass added to the last link.
 
-    A point mass suffices, because a gripper's tensor about its own centre is small compared with m r^2.
+    A point mass suffices, because a gripper's tensor about its own center is small compared with m r^2.
 
     Args:
         mass, com, inertia: properties of the links without the point mass.

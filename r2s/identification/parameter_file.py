@@ -27,7 +27,7 @@ from r2s.recordings.speed_noise import MAX_NOISE
 
 SIDES = ("negative", "positive")
 FIXED = ("phi", "offset", "inertia", "mass", "com", "armature", "load", "drag", "gain", "speed_noise")
-# limits that no arm exceeds: friction and offsets, Nm; distance of a link's centre of mass from its joint, m
+# limits that no arm exceeds: friction and offsets, Nm; distance of a link's center of mass from its joint, m
 MOST_NM, FARTHEST_M = 1e4, 10.0
 
 
@@ -41,7 +41,7 @@ def save_parameters(
     """Write parameters.yaml (value, unit, nominal, bounds, 95 % interval and identifiability) and posterior.npz.
 
     Args:
-        path: the parameters.yaml to write; posterior.npz goes to the same folder and serves dr=identified.
+        path: the parameters.yaml to write; posterior.npz, which dr=identified reads, is written to the same folder.
         space, found: the parameters and their estimate.
         source: origin of the estimate (recording, search, run). note: further entries of parameters.yaml.
     """
@@ -65,7 +65,7 @@ def save_parameters(
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in FIXED}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
-    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for people; `load_parameters` skips it
+    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; `load_parameters` skips it
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
     with atomic_write(path.with_name("posterior.npz")) as part:  # first, so parameters.yaml never exists alone
@@ -83,7 +83,7 @@ def load_parameters(
     option through which the user named the folder, for error messages.
 
     Raises:
-        UserError: no such run or file, another robot's parameters, an untrusted friction family, or a damaged file.
+        UserError: the file is missing or damaged, belongs to another robot, or names an untrusted friction family.
     """
     if Path(folder).is_dir() and not (Path(folder) / "parameters.yaml").is_file():
         raise UserError(f"{option}: {folder} has no parameters.yaml; is it a finished identification?")
@@ -148,7 +148,7 @@ def load_posterior(folder: str | Path, space: ParameterSpace, option: str = "dr=
     """Return the posterior draws (S, P) of the parameters in `space` from posterior.npz beside parameters.yaml.
 
     Raises:
-        UserError: there is no posterior.npz, it has other parameters, or it is damaged.
+        UserError: posterior.npz is missing, damaged, or contains other parameters.
     """
     path = Path(folder)
     path = (path if path.is_dir() else path.parent) / "posterior.npz"

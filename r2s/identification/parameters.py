@@ -1,6 +1,6 @@
 """The parameter vector of an identification: blocks, bounds, map to the unit cube, and the dynamics it describes.
 
-A block is one parameter. It has a value per joint or link (a friction coefficient, offset, inertia) or one for the
+A block is one parameter: a value per joint or link (a friction coefficient, offset, inertia), or one value for the
 whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are mapped by
 their logarithm. Inertia has two parametrizations: `inertia_scale`, one factor per link as in the paper (Table III:
 NEW is a multiple of OLD), and `link_...`, the ten log-Cholesky parameters of a link (link_inertia.py).
@@ -49,7 +49,7 @@ def torque_like() -> set[str]:
 
 
 def sizes(largest: np.ndarray) -> dict[str, Any]:
-    """Return {parameter: scale}: `largest` (n,) Nm for a torque-like parameter, its maximum for the payload mass."""
+    """Return {parameter: scale}: `largest` (n,) Nm for torque-like parameters, max(largest) for the payload mass."""
     return dict.fromkeys(torque_like(), largest) | {PAYLOAD[0]: largest.max()}
 
 
@@ -61,10 +61,10 @@ class ParameterSpace:
         blocks: parameter names in the order of x; each has n values, or one for the whole arm.
         n: number of joints.
         lower, upper: (P,) bounds in SI units.
-        nominal: start values of a search, and the values of all parameters that are not in x.
+        nominal: dynamics at which a search starts; parameters that are not in x have their nominal value.
         robot: the arm; inertia blocks are relative to its links.
-        breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. A breakaway
-            torque is this command plus the offset; without a command (NaN or None) it is nominal.
+        breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. A breakaway torque is
+            this command plus the offset. If the command is unknown (NaN or None), the breakaway torque is nominal.
         fixed: names of values that the user fixed; their bounds are too narrow for a search (stated.py).
     """
 
@@ -111,7 +111,7 @@ class ParameterSpace:
         return np.arange(at, at + self.size(name))
 
     def expand(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
-        """Return a vector (P,) from `values`, {block: one value or (n,)}; blocks that it lacks get `default`."""
+        """Return the vector (P,) of `values`, {block: one value or (n,)}, and of `default` for all other blocks."""
         return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
     @cached_property
@@ -237,8 +237,8 @@ class ParameterEstimate:
     """Estimate of a parameter vector; arrays are (P,), in SI units.
 
     Attributes:
-        x: values. low, high: 95 % interval. identifiable: whether the data determine each value. samples: (S, P),
-            draws of the posterior.
+        x: estimates. low, high: ends of 95 % intervals. identifiable: whether the data determine each value. samples:
+            (S, P), draws of the posterior.
     """
 
     x: np.ndarray

@@ -1,6 +1,6 @@
 """Predict the 95 % interval widths that a recording of a planned motion will yield, to choose the motion.
 
-Parameters, bounds and prior are those of the later identification. The torque is linearized at the nominal arm.
+The prediction assumes the later identification's parameters, bounds and prior, and linearizes at the nominal arm.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class PlannedWidths:
         chosen: parameters such as "offset" or "offset[3]" whose widths `score` averages; empty: all.
 
     Raises:
-        UserError: `chosen` contains an unknown parameter.
+        UserError: a name in `chosen` is not an estimated parameter.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class PlannedWidths:
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return minus the mean log of chosen widths (B,), with each of B motions alone added to those so far."""
+        """Return minus the mean log width (B,) of the chosen values, for each of B motions added to those so far."""
         some = slice(None, None, 1 + len(t) // MOST_ROWS)
         information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
         return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)
@@ -118,5 +118,5 @@ class PlannedWidths:
 
     @property
     def identifiable(self) -> np.ndarray:
-        """(P,) whether the motions so far will determine each value, by the rule of an identification's result."""
+        """(P,) whether each value will be identifiable from the motions so far, by the rule of `conclude`."""
         return Z_95 * self.share < 1.0 / SHARPER

@@ -37,14 +37,14 @@ class Posterior(NamedTuple):
 def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     """Return draws about the fit u (P,) from a normal distribution with a cluster-robust covariance.
 
-    Errors within a block are correlated. So the covariance is H^-1 (sum of s s^T + prior) H^-1; the score s is a
-    block's part of the gradient (White, Econometrica 48(4), 1980; clusters: Liang and Zeger, Biometrika 73(1), 1986),
-    minus the mean score, which is not 0 at a bound. If blocks are few, the fit follows the error of each, so its
-    residual is too small; a factor from the block's share of the information corrects this (CR2 of Bell and
-    McCaffrey, Survey Methodology 28(2), 2002). Student's t widens the draws, because few blocks show scatter poorly.
-    If one block determines a direction, the scatter is too small, so the covariance is at least that of independent
-    rows. No bootstrap over blocks is used: some of its H would have hardly any information on a value that few blocks
-    determine, and the resulting tails describe no arm.
+    Errors within a block are correlated. So, with the total information H, the covariance is H^-1 (sum of s s^T +
+    prior) H^-1. A block's score s is its part of the gradient (White, Econometrica 48(4), 1980; clusters: Liang and
+    Zeger, Biometrika 73(1), 1986), minus the mean score, which is not 0 at a bound. With few blocks, the fit adapts
+    to the error of each block and makes the block's residual too small; a factor from the block's share of the
+    information corrects this (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). Student's t widens the
+    draws, because few blocks are a small sample. The covariance is at least that of independent rows, because a
+    direction that one block determines has too little scatter. A bootstrap over blocks would draw samples with hardly
+    any information on a value that few blocks determine, and yield tails that describe no arm.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -64,9 +64,9 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
 
 
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return information (K, P, P) and score (K, P) of each block, the prior's information (P, P), and a factor.
+    """Return K blocks' information (K, P, P) and score (K, P), the prior's information (P, P), and the data's RMS.
 
-    The factor is the RMS of the data rows in standard deviations, but at least 1.
+    The RMS of the data rows, in standard deviations, is raised to at least 1.
     """
     clusters, p = problem.clusters, len(u)
     count, square, seen, row = int(clusters.max()) + 1, 0.0, 0, 0
@@ -86,20 +86,20 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return a square root (P, P) of the covariance root root^T, raised where least least^T is larger.
+    """Return a square root (P, P) of the larger of two covariances, root root^T and least least^T, by direction.
 
-    Directions are compared, not single parameters: the sum of two correlated ones is known far better than each.
+    Directions are compared, because the sum of two correlated values is known far better than each of these values.
     """
     axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
     return least @ (axes * np.maximum(seen, 1.0))
 
 
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return `steps` (S, P) from u, changed to end in the cube: values outside are clipped, the others compensate.
+    """Return `steps` (S, P) from u, changed to end in the cube: values outside are clipped, the others adapted.
 
-    The other values minimize the sum of squares, whose Hessian is 2 h (P, P). Clipping alone would bias sums: an
-    offset, for example, is correlated with an asymmetry at its bound. Values are clipped one at a time, the farthest
-    first, because this often brings a correlated value back into the cube.
+    Given the clipped values, the others minimize the sum of squares, whose Hessian is 2 h (P, P). Without this
+    adaptation, sums of correlated values would be biased, for example an offset plus an asymmetry at its bound. The
+    value farthest outside is clipped first, because this often brings correlated values back into the cube.
     """
     steps = steps.copy()
     for step in steps:

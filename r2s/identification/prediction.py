@@ -29,9 +29,9 @@ def prediction_errors(
 ) -> dict:
     """Return the errors of the identified and the nominal arm on a recording, as an entry of summary.json.
 
-    The errors are torque RMSE per joint and, for commanded torque, position_rmse_mrad over replays of `window_s`, and
-    ee_error_mm, the mean end-effector distance after each of the HORIZONS that trajectories reach. If no trajectory
-    lasts `window_s`, there is no position_rmse_mrad. A long recording is represented by parts spread over it.
+    The entry contains the torque RMSE of each joint. For commanded torque, it also contains position_rmse_mrad, over
+    replays of `window_s` (if a trajectory is as long), and ee_error_mm, the mean end-effector distance after each of
+    the HORIZONS that trajectories reach. From a long recording, the errors use parts spread over it.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}

@@ -20,7 +20,7 @@ FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bound
 TAIL = 25.0  # for link-side torque, the prior is Student's t: degrees of freedom plus 1
 # implicit friction: least significance of its effect in standard deviations; range of actual over expected size
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
-ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more, as nominal friction may be off by tens of Nm
+ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more: nominal friction may be off by tens of Nm
 FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by less (relative)
 Report = Callable[[dict], None]
 
@@ -38,11 +38,11 @@ class Problem:
     """A least-squares problem on the unit cube, with rows of data, prior and extra residuals in standard deviations.
 
     Attributes:
-        data: the residual that is fitted to the recording, of replays or of torque.
+        data: the residual to minimize, either of replays or of torque.
         torque_data: the torque residual, for a fast start; it may be `data` itself.
         sigma: (P,) prior standard deviation about the nominal value, or about its logarithm for logarithmic
             coordinates; inf means a flat prior.
-        extra: residuals of further sources.
+        extra: further residual rows, see `ExtraResidual`.
     """
 
     data: ReplayResidual | TorqueResidual
@@ -90,7 +90,7 @@ class Problem:
     def prior_width(self) -> np.ndarray:
         """(P,) the prior's standard deviation on the unit cube, for comparison with the posterior's.
 
-        A flat prior gets the standard deviation among arms in general (`ParameterSpace.usual`). All are limited to
+        For a flat prior, it is the standard deviation among arms in general (`ParameterSpace.usual`). It is at most
         UNIFORM, the standard deviation of a uniform distribution over the bounds.
         """
         stated = np.where(np.isinf(self.sigma), self.space.usual, self.sigma)
@@ -98,17 +98,17 @@ class Problem:
 
     @property
     def weight(self) -> np.ndarray:
-        """(P,) slope of each prior residual with respect to its coordinate on the unit cube."""
+        """(P,) derivative of each value's prior residual with respect to the value's coordinate on the unit cube."""
         return self.space.width / self.sigma
 
     def fixed(self, at: np.ndarray) -> "Problem":
-        """Return the problem with a very narrow prior that fixes the values at indices `at` at nominal."""
+        """Return the problem with a very narrow prior that fixes the values with indices `at` at nominal."""
         sigma = self.sigma.copy()
         sigma[at] = FIXED * self.space.width[at]
         return replace(self, sigma=sigma)
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with a flat prior for the values `names`, because an extra residual is their prior."""
+        """Return the problem with a flat prior for the values `names`, whose prior is an extra residual."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
@@ -120,7 +120,7 @@ class Problem:
         return self.with_torque_data(self.torque_data.reweighted(self.space.from_unit(u), fitted=True))
 
     def reweighted(self, u: np.ndarray, fitted: bool) -> "Problem":
-        """Return the problem with all residuals of data reweighted at u (P,); see `TorqueResidual.reweighted`."""
+        """Return the problem with replays and torque rows reweighted at u (P,); see `TorqueResidual.reweighted`."""
         x = self.space.from_unit(u)
         out = self.with_torque_data(self.torque_data.reweighted(x, fitted))
         return replace(out, data=self.data.reweighted(x, fitted)) if self.uses_replays else out
@@ -146,7 +146,7 @@ class Problem:
         return _differences(self._prior, u)
 
     def prior_information(self, u: np.ndarray) -> np.ndarray:
-        """Return J^T J (P, P), with the Jacobian J of the prior and extra rows at u (P,)."""
+        """Return the information J^T J (P, P) of the prior and extra rows, whose Jacobian at u (P,) is J."""
         j = self.prior_rows(u)[1]
         return j.T @ j
 
@@ -161,7 +161,7 @@ class Problem:
 
 
 def _differences(residual: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a residual (R,) and its Jacobian (R, P) at u (P,) by finite differences towards the cube's centre."""
+    """Return a residual (R,) and its Jacobian (R, P) at u (P,) by finite differences towards the cube's center."""
     h = np.where(u > 0.5, -STEP, STEP)
     r = residual(np.concatenate([u[None], u + np.diag(h)]))
     return r[0], ((r[1:] - r[0]) / h[:, None]).T
@@ -199,9 +199,9 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
     """Return whether the recording comes from a simulator with implicit friction; u (P,) is a fit to its torque.
 
-    Implicit integration evaluates friction at the velocity half a step ahead; a continuous-time arm does not. The
-    effect must have about the expected size and exceed `significant` standard deviations. A rotor inertia that the
-    model lacks has a similar effect, a hundred times larger.
+    Implicit integration evaluates friction at the velocity half a step ahead, unlike a physical arm. Such an effect
+    must exceed `significant` standard deviations. The effect must also have about the expected size, because a rotor
+    inertia that the model lacks has a similar effect that is a hundred times larger.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]

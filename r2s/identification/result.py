@@ -1,4 +1,4 @@
-"""The result of an identification: values, intervals, and what the data do not determine."""
+"""The result of an identification: values, intervals, and the parameters that the data do not determine."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ EDGE = 5e-4  # a value closer to a bound than this share of its range is at the 
 RIDGE = 1e-6  # information added to every value on the unit cube, as some values have a flat prior and no data
 UNSEEN = 0.9  # ratio of posterior to prior sigma, above which the data hardly determine a value
 SHARPER = 4.0  # a value is identifiable if half its 95 % interval is less than its prior's sigma divided by this
-NULL_SHARE = 0.5  # ratio of posterior to prior sigma, above which a direction counts as decided by the prior
-LISTED_PARTS, LEAST_PART = 6, 0.2  # most values listed for such a direction, and least component of a listed value
+NULL_SHARE = 0.5  # ratio of posterior to prior sigma, above which the prior decides a direction
+LISTED_PARTS, LEAST_PART = 6, 0.2  # most values listed per null direction; least component of a listed value
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class IdentificationResult:
     """Result of an identification.
 
     Attributes:
-        space, found: the parameters and their estimate.
-        history: a row per step or generation of each search.
+        space, found: the parameter space, and the estimate of its values.
+        history: one row for each step or generation of a search.
         families: {"sigmoid": error of held-out torque relative to the best, ...}; empty if the user chose the family.
-        null_directions: combinations of parameters that mainly the prior decides, widest first. Each is a pair (ratio
-            of posterior to prior sigma, {name: component}).
-        unseen: names of values that stay nominal, because the data hardly determine them.
+        null_directions: parameter combinations that the prior decides more than the data, widest first, as pairs
+            (ratio of posterior to prior sigma, {name: component}).
+        unseen: names of the parameters that r2s left at nominal values, because the data hardly determine them.
         edges: breakaway commands from ramps; None without ramps.
         refused: whether r2s discarded the replays, because they contradicted the torque fit.
-        prior_rows: (B,) residual rows of prior, ramps and earlier knowledge; Jacobian (B, P) on the unit cube.
+        prior_rows: residuals (B,) of prior, ramps and earlier knowledge, and their Jacobian (B, P) on the unit cube.
     """
 
     space: ParameterSpace
@@ -50,7 +50,7 @@ class IdentificationResult:
 
     @property
     def x(self) -> np.ndarray:
-        """(P,) the values, SI units."""
+        """(P,) the identified values in SI units."""
         return self.found.x
 
     @property
@@ -60,7 +60,7 @@ class IdentificationResult:
 
     @property
     def at_bounds(self) -> list[str]:
-        """Messages, one for each value at a search bound other than 0; the best value may lie beyond this bound."""
+        """One message for each value at a nonzero search bound, because this bound may be too narrow."""
         s, u, unit, lines = self.space, self.space.to_unit(self.found.x), units(), []
         for block in s.blocks:
             for k, at in enumerate(s.where(block)):
@@ -76,7 +76,7 @@ class IdentificationResult:
 
     @property
     def note(self) -> dict[str, Any]:
-        """Entries that describe the identification in parameters.yaml."""
+        """Entries of parameters.yaml about the identification itself, such as the values that stayed nominal."""
         null = [{"share_of_prior_left": round(s, 2), **parts} for s, parts in self.null_directions]
         out = {"unseen_and_left_nominal": self.unseen, "decided_by_the_prior": null}
         out |= {"families_compared": self.families, "replays_refused": self.refused}
@@ -90,8 +90,8 @@ class IdentificationResult:
         """Parameter space and estimate for parameters.yaml, including the breakaway torques from ramps, if any.
 
         The interval of a breakaway torque combines Student's t (friction/repeatability.py) with the uncertainty of
-        the offset. If no ramp released a joint, the interval lies between the largest torque without motion and the
-        bound. The breakaway torque is then not identifiable, and all draws have the same value.
+        the offset. If no ramp moved a joint, its breakaway torque is not identifiable: the interval extends from the
+        largest torque without motion to the bound, and all posterior draws equal the estimate.
         """
         if self.edges is None:
             return self.space, self.found
@@ -100,9 +100,9 @@ class IdentificationResult:
         sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
         got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
         edges = self.space.dynamics(f.samples).breakaway
-        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # half-width due to the offset
+        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # half-width from the offset alone
         most = student.ppf(0.975, freedom)
-        # policies train on these draws, and Student's far tails for few degrees of freedom describe no arm
+        # policies train on these draws; for few degrees of freedom, the far tails of Student's t are unrealistic
         drawn = np.clip(np.random.default_rng(0).standard_t(freedom, edges.shape), -2 * most, 2 * most)
         edges = np.where(got, edges + scale * drawn, x)
         edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
@@ -112,7 +112,7 @@ class IdentificationResult:
         limit = np.maximum(self.space.robot.tau_max, np.abs([x, low, high]).max((0, 2)))
         low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -limit), np.minimum(high[:, 0], 0.0)
         high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], limit), np.maximum(low[:, 1], 0.0)
-        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone takes the place of the prior's sigma
+        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone replaces the prior's sigma
         columns = [[a[..., 0], a[..., 1]] for a in (x, low, high, got & (half < zone / SHARPER), edges)]
         own = f.x, f.low, f.high, f.identifiable, f.samples
         space = replace(
@@ -126,13 +126,13 @@ class IdentificationResult:
 
 
 def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], **story: Any) -> IdentificationResult:
-    """Return the result; values that the data hardly determine are set back to nominal.
+    """Reset the values that the data hardly determine to nominal, and return the result of the identification.
 
     Args:
         problem: the solved problem.
-        space: the parameters, with the breakaway torques and stiction model that were estimated after the fit.
-        sure: the fields of `Posterior`: fit, draws and information.
-        story: the fields history, families, edges and refused of `IdentificationResult`.
+        space: the parameter space, with the breakaway torques and the stiction model estimated after the fit.
+        sure: the fields of `Posterior` by name.
+        story: further fields of `IdentificationResult`: history, families, edges, refused.
     """
     u = np.array(sure["u"], dtype=float)
     steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
@@ -144,7 +144,7 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
     seen = inside & (-0.5 * (low + high) < prior / SHARPER)
     ends = space.from_unit(u + low), space.from_unit(u - high)
     found = ParameterEstimate(space.from_unit(u), *ends, seen, space.from_unit(u + steps))
-    # in units of the prior's sigma, a direction on which only the prior has information has an eigenvalue of 1
+    # in units of the prior's sigma, a direction without information from the data has an eigenvalue of 1
     h = h + np.diag(np.where(np.isinf(problem.sigma), prior**-2.0, 0.0))
     free = [k for k, name in enumerate(space.names) if name not in space.fixed]
     searched = [space.names[k] for k in free]
@@ -161,13 +161,13 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
 
 
 def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Set poorly determined values of u (P,) back to `start`; return u and (P,) bool, whether each was set back.
+    """Reset poorly determined values of u (P,) to `start`; return the new u, and a mask (P,) of the reset values.
 
-    The data may determine values together but not one by one, like the masses of two consecutive links. So a value is
-    set back only if the others, refitted, still explain data and prior: the sum of squares may rise by 1 in total.
+    Data may determine only a combination of values, such as the summed mass of two consecutive links. So a value is
+    reset only if a refit of the other values fits almost as well: all resets raise the sum of squares by at most 1.
 
     Args:
-        u, start: (P,) fit and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.
+        u, start: (P,) fitted and nominal values on the unit cube. h: (P, P), half the Hessian of the sum of squares.
         share: (P,) ratio of posterior to prior sigma.
     """
     best, unseen = u, np.zeros(len(u), dtype=bool)

@@ -15,22 +15,22 @@ from r2s.physics.friction import family as friction_family
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of `identify`, as in conf/identify; terms and prior are those for the recorded kind of torque.
+    """Settings of `identify`, as in conf/identify, with the terms and prior for the recorded kind of torque.
 
     Attributes:
-        bounds: {"phi1": [low, high], ...} for every parameter that may be estimated; a bound is a number or (n,).
+        bounds: {"phi1": [low, high], ...} for every parameter that may be fitted; a bound is a number or (n,).
             Bounds of torque-like parameters are relative to the largest torque (terms.py: `scaled_bounds`).
         prior: {"inertia_scale": sigma or None (flat), ...} in the same units, see `scaled_prior` and `Problem`.
-        terms: model terms that are estimated besides friction, see terms.py.
+        terms: model terms to estimate besides friction, see terms.py.
         family: friction family; auto selects it by cross-validation.
-        window_s: s, length of replayed windows (commanded torque).
-        stride: ms, time over which angles are averaged before they are compared (commanded torque).
+        window_s: s, length of a replayed window; used only with commanded torque.
+        stride: ms, averaging time of the compared angles; used only with commanded torque.
         cutoff_hz: cutoff of the zero-phase filter for torque.
-        breakaway: without ramps, breakaway torques are scanned up to this multiple of the identified friction
-            (commanded torque only: a link-side sensor does not measure motor torque). None: they stay nominal.
+        breakaway: if a recording of commanded torque has no ramps, breakaway torques are searched up to this multiple
+            of the identified friction. None: breakaway torques stay nominal.
         folds: number of folds of the cross-validation within the recording.
-        candidate_terms: terms that are added if they improve held-out prediction; `link` replaces `inertia_scale`.
-        prunable_terms: terms that are removed if held-out prediction stays as good without them.
+        candidate_terms: terms to add if they improve held-out prediction; `link` replaces `inertia_scale`.
+        prunable_terms: terms to remove if held-out prediction stays as good without them.
         stated: the user's mean, width or fixed value per parameter (stated.py).
         known: prior knowledge from an earlier identification, or from another kind of torque (known.py).
         seed: seed of the posterior's draws.

@@ -1,4 +1,4 @@
-"""Read a user's statements about an arm: prior mean and width, or fixed value, per parameter and joint (SI units)."""
+"""Read the values that a user states for an arm: prior mean and width, or a fixed value, in SI units."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,13 +15,13 @@ from r2s.physics.friction import family, known_families
 
 Stated = Mapping[str, Mapping[str, Any]]  # {"coulomb": {"mean": [3.1, None, 2.0], "width": 0.2}, ...}
 KEYS = ("mean", "width", "fixed")
-TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to the width of its original bounds
+TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to the width of its usual bounds
 
 
 def check_stated(stated: Stated, n: int | None = None) -> None:
     """Raise UserError for an unknown parameter or key, or a value that is neither a number nor a list of n of them.
 
-    If n is None, lengths are not checked.
+    n: number of joints; None: the lengths of the lists are not checked.
     """
     check_parameters("identify.prior", stated)
     for name, entry in stated.items():
@@ -67,7 +67,7 @@ def _check(where: str, value: Any, count: int | None, positive: bool) -> None:
 
 
 def _values(entry: Mapping[str, Any], key: str, count: int) -> np.ndarray:
-    """Return the values (count,) that an entry states under a key; nan where it states nothing."""
+    """Return the values (count,) of the entry's `key`, such as "mean"; nan for joints without a value."""
     value = entry.get(key)
     parts = value if isinstance(value, list | tuple) else [value]
     return np.broadcast_to(np.array([np.nan if x is None else x for x in parts], dtype=float), count).copy()
@@ -89,10 +89,10 @@ def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
 
 
 def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the prior that the user states by mean and width, for values in `space`; None if none is stated.
+    """Return the user's prior (mean and width) for values in `space`; None if the user states no mean and no width.
 
-    A mean without a width gets its width from `prior`; a width without a mean is centred at the nominal value. Widths
-    are standard deviations in SI units; those of logarithmic parameters are divided by the mean.
+    A mean without a width has its width from `prior`; a width without a mean is centered at the nominal value. Widths
+    are standard deviations in SI units; a logarithmic parameter's width is divided by its mean.
 
     Args:
         space: the searched parameters. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.

@@ -1,4 +1,4 @@
-"""Terms of the model besides friction: the parameters of each term, with bounds and prior in SI units."""
+"""Model terms besides friction: the parameters of each term, and their bounds and prior in SI units."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -32,7 +32,7 @@ NOTHING: Stated = {}
 
 
 def optional_friction() -> list[str]:
-    """Return the friction parameters of all families that are estimated only if a term names them."""
+    """Return the optional friction parameters of all families; r2s estimates them only if `terms` contains them."""
     return list(dict.fromkeys(name for f in known_families() for name in f.optional))
 
 
@@ -70,10 +70,10 @@ def search_space(
     recording: Recording,
     stated: Stated = NOTHING,
 ) -> ParameterSpace:
-    """Return the parameter space of the friction family and of those terms that affect the recorded kind of torque.
+    """Return the parameter space of the friction family and of the terms that affect the recorded kind of torque.
 
     bounds: see `scaled_bounds`; friction parameters without an entry have the bounds of their family, in SI units.
-    stated: the user's statements, of which only fixed values are used here (stated.py).
+    stated: the user's values (stated.py), of which only fixed ones are used here.
 
     Raises:
         UserError: a term, or the whole family, has no bounds.
@@ -96,10 +96,10 @@ def search_space(
 def scaled_bounds(
     bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
 ) -> dict[str, Sequence[ArrayLike]]:
-    """Return `bounds` in SI units; its entries for torque-like parameters are relative to the largest torque.
+    """Convert `bounds` to SI units; bounds of torque-like parameters are relative to the largest torque.
 
-    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. So for
-    motor torque, these bounds extend at least to the largest torque.
+    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. So with
+    motor torque, the bounds of torque-like parameters extend at least to the largest torque.
     """
     out = dict(bounds)
     for name, size in _sizes(robot, recording).items():
@@ -116,8 +116,8 @@ def scaled_prior(
 ) -> dict[str, ArrayLike]:
     """Return the priors' standard deviations in SI units, without flat priors (None).
 
-    In `prior`, entries for torque-like parameters are relative to the largest torque, and those for logarithmic ones
-    have no unit. A viscous coefficient in the arm's file is a guess; its standard deviation is at least its value.
+    In `prior`, values of torque-like parameters are relative to the largest torque; logarithmic parameters have no
+    unit. A viscous coefficient of the arm's file is a guess, so its standard deviation is at least its value.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():
@@ -131,5 +131,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return `sizes` for each joint's torque limit, or its largest recorded torque where that is larger."""
+    """Return `sizes` for each joint's largest torque: its limit or, if larger, its largest recorded torque."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

@@ -1,4 +1,4 @@
-"""Test whether the nominal arm explains recorded torque, or another joint order, mounting or mass does."""
+"""Test whether the nominal arm explains recorded torque, or whether another joint order, mounting or mass does."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -12,19 +12,19 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia, nominal_torque, regressor
 from r2s.physics.robot import Robot
 
-MASS, MASS_LEFT = 3.0, 0.1  # a mass is reported if wrong by this factor; most misfit that a correction may leave
+MASS, MASS_LEFT = 3.0, 0.1  # factor from which a wrong mass is reported; largest share of misfit after a correction
 CARRIED = 3  # number of last links whose mass is not judged, because a payload may be undeclared
-TILTED = np.radians(20)  # least angle of a mounting that is reported; uncertain masses may cause smaller ones
+TILTED = np.radians(20)  # least reported angle of a mounting; uncertain masses can cause smaller fitted angles
 INERTIA = 0.3, 4.0  # allowed factor of the nominal torque: errors of tensors, payloads, sensor gains
-FRICTION, OFFSET = 0.5, 0.1  # largest fitted friction and offset, of tau_max
+FRICTION, OFFSET = 0.5, 0.1  # largest fitted friction and offset, relative to tau_max
 MAX_LEFT = 2.0  # upper limit of a joint's unexplained share
-# gravity is judged where it changes: least RMS of the change, of tau_max; factor by which correlated rows raise the
-# standard error of the share of gravity; largest standard error
+# gravity is judged in joints where it changes: least RMS change, relative to tau_max; factor by which correlated rows
+# raise the standard error of gravity's share; largest standard error
 CHANGES, CORRELATED, MAX_SIGMA = 0.01, 3.0, 0.15
 
 
 class Moments(NamedTuple):
-    """Motion and torque, q, dq, ddq, tau (T, n), zero-phase filtered; dq and ddq are time derivatives of q."""
+    """Motion q, dq, ddq and torque tau, each (T, n), zero-phase filtered; dq and ddq are time derivatives of q."""
 
     q: np.ndarray
     dq: np.ndarray
@@ -33,14 +33,14 @@ class Moments(NamedTuple):
 
 
 class Unexplained:
-    """The share of squared recorded torque that the model does not explain; `seen` are the S judged joints."""
+    """Compute the share of recorded torque that the model does not explain; `seen`: indices of S judged joints."""
 
     def __init__(self, robot: Robot, m: Moments, gravity: bool):
         self.robot, self.m = robot, m
         self.seen, self.need = np.arange(robot.n), self.inverse_dynamics(gravity)
 
     def with_need(self, need: np.ndarray) -> "Unexplained":
-        """Return a copy with another nominal torque `need` (T, n) Nm."""
+        """Return a copy of this object that compares tau with another nominal torque, `need` (T, n) Nm."""
         out = copy(self)
         out.need = need
         return out
@@ -50,17 +50,17 @@ class Unexplained:
         return nominal_torque(self.robot, self.m.q, self.m.dq, self.m.ddq, gravity)
 
     def fit(self, parts: np.ndarray) -> np.ndarray:
-        """Return the factors (K,), equal for all joints, with which torques (K, T, n) Nm best fit tau - `need`."""
+        """Fit tau - `need` by a weighted sum of the torques `parts` (K, T, n) Nm; return the weights (K,)."""
         rows = np.concatenate(self._apart([*parts, self.m.tau - self.need]))
         return np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0]
 
     def misfit(self) -> float:
-        """Return sum (tau - nominal torque)^2 / sum tau^2, after each joint's friction and offset are removed."""
+        """Return sum (tau - nominal torque)^2 / sum tau^2, both without each joint's fitted friction and offset."""
         left, whole = np.square(np.concatenate(self._apart([self.m.tau - self.need, self.m.tau]))).sum(0)
         return float(left / max(whole, 1e-12))
 
     def scaled(self) -> tuple[np.ndarray, float]:
-        """Return for each joint the factor (S,) of nominal torque that fits tau best, and the remaining misfit."""
+        """Fit tau by a multiple of each joint's nominal torque; return the factors (S,) and the remaining misfit."""
         factors, left, whole = [], 0.0, 1e-12
         for need, tau in (x.T for x in self._apart([self.need, self.m.tau])):
             factors.append(need @ tau / max(need @ need, 1e-12))
@@ -68,7 +68,7 @@ class Unexplained:
         return np.array(factors), left / whole
 
     def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return (T, K) per joint: K torques (T, n) as shares of tau_max, minus their fitted friction and offset."""
+        """Return, per judged joint, (T, K): the K `torques` over tau_max, minus their fitted friction and offset."""
         out = []
         for j in self.seen.tolist():
             own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
@@ -77,7 +77,7 @@ class Unexplained:
         return out
 
     def gravity_shares(self) -> np.ndarray | None:
-        """Return the share of nominal gravity torque in tau, for joints whose motion determines it, or None."""
+        """Return the share of nominal gravity torque that tau contains, per joint whose motion determines it."""
         inertial = self.inverse_dynamics(False)
         weight, shares = self.inverse_dynamics(True) - inertial, []
         for j in self.seen:
@@ -93,15 +93,15 @@ class Unexplained:
         return np.array(shares) if shares else None
 
     def each(self, tau: np.ndarray) -> np.ndarray:
-        """Return the unexplained share (S,) of each judged joint's tau (T, n) after a fit with its motion."""
+        """Fit each judged joint's tau (T, n) with that joint's motion, and return the unexplained shares (S,)."""
         return np.array([self._share(j, tau[:, j]) for j in self.seen.tolist()])
 
     def pairs(self) -> np.ndarray:
-        """Return (S, S): element j, k is the unexplained share of tau's column k, fitted with joint j's motion."""
+        """Fit every column k of tau with the motion of every joint j; return the unexplained shares [j, k] (S, S)."""
         return np.array([[self._share(j, self.m.tau[:, k]) for k in self.seen] for j in self.seen.tolist()])
 
     def _share(self, j: int, tau: np.ndarray) -> float:
-        """Return the share of tau (T,) that joint j's nominal torque, rotor, friction and offset do not explain."""
+        """Fit tau (T,) by nominal torque, rotor, friction and offset of joint j, and return the unexplained share."""
         most, m = self.robot.tau_max[j], self.m
         slow = [m.ddq[:, j], np.tanh(m.dq[:, j] / WIDTH_DQ), m.dq[:, j]]
         scale = most / np.maximum([np.sqrt((x**2).mean()) for x in slow], 1e-9)
@@ -113,7 +113,7 @@ class Unexplained:
 
 
 def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for other joint orders of tau or all signals: by name, rotated, reversed, swapped."""
+    """Return (misfit, message) for tau or all signals in other joint orders: by name, rotated, reversed, swapped."""
     robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}
@@ -141,7 +141,7 @@ def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for each link that would need another mass, with moments in proportion to the mass."""
+    """Return (misfit, message) for each link that fits tau only with another mass and, in proportion, inertia."""
     robot, m, out = left.robot, left.m, []
     y = regressor(robot, m.q, m.dq, m.ddq, robot.gravity if gravity else None)
     standard, names = LinkInertia(robot.mass, robot.com, robot.inertia).standard(), robot.model(gravity=False)
@@ -159,7 +159,7 @@ def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def mounting(left: Unexplained) -> list[tuple[float, str]]:
-    """Return (misfit, message) for a direction of gravity fitted to the torque, as of an arm on a wall, or []."""
+    """Fit the direction of gravity to the torque; return [(misfit, message)] for another mounting, otherwise []."""
     robot, size = left.robot, float(np.linalg.norm(left.robot.gravity))
     inertial = left.inverse_dynamics(False)
     parts = np.array([left.inverse_dynamics(g) - inertial for g in np.eye(3)])

@@ -1,9 +1,9 @@
 """Check a recording's units, signs, joint order, gravity and clock against the arm's model.
 
-dq is compared with the slope of q, its integral with q (r2s/recordings/clock.py), and torque with the nominal arm's
-torque for the same motion. The checks are coarse on purpose. A nominal arm that is wrong by a factor of 3, an
-undeclared payload, any friction and sensor offsets pass; a factor of 1000, of 57.3 or of -1, another joint order or
-mounting do not. Most checks refuse a recording only if a correction leaves a quarter of the unexplained part or less.
+r2s compares dq with the slope of q, the integral of dq with q (r2s/recordings/clock.py), and tau with nominal torque.
+The checks are coarse on purpose. They accept a nominal arm that is wrong by a factor of 3, an undeclared payload, any
+friction, and sensor offsets. The checks refuse a signal that is wrong by a factor of 1000, 57.3 or -1, and another
+joint order or mounting. Most checks refuse only if a correction removes at least three quarters of the misfit.
 """
 
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # low-pass cutoff, rate and number of compared rows
-EDGE = 100  # ms, dropped at both ends of a trajectory, where the filter has transients
-JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s used of a longer recording: units; clock; clock, per part
+EDGE = 100  # ms, removed from both ends of a trajectory, where the filter has transients
+JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s examined in a long recording: units; clock; clock, per part
 SLOWEST_HZ = 5.0  # sampling rate below which only the clock is judged
 MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
 STILL = 0.02  # rad, range of a joint up to which the joint is treated as at rest
-REFUSED, CORRECTED = 0.5, 0.25  # largest unexplained share; a correction must reduce it at least to this fraction
-SUSPECT = 0.3  # misfit above which other joint orders are tried; correct recordings had 0.006 to 0.21
-TURNED = 0.05  # misfit above which other mountings are tried; a mounting (3 numbers) must leave a tenth of it
-HELD = 0.05  # of tau_max: a joint with a larger RMS nominal torque is judged even at rest
+REFUSED, CORRECTED = 0.5, 0.25  # largest accepted unexplained share; largest fraction left by a valid correction
+SUSPECT = 0.3  # misfit above which other joint orders are tested; correct recordings had 0.006 to 0.21
+TURNED = 0.05  # misfit above which other mountings are tested; a valid one (3 numbers) leaves at most a tenth of it
+HELD = 0.05  # a joint whose RMS nominal torque exceeds this share of tau_max is judged even at rest
 HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity: range in torque with gravity; most without
 CURRENT = 0.005  # A/Nm, least ratio of a current to torque: no arm's joint has 200 Nm/A
 OVER_LIMIT = 3.0  # largest allowed torque over tau_max
@@ -47,11 +47,11 @@ class DataError(UserError):
 
 @dataclass(frozen=True)
 class Judged:
-    """Results of `check_units`; nan or None where the motion does not determine a result.
+    """Measured values of `check_units`; nan or None for a value that the motion does not determine.
 
     Attributes:
         clock: (n,) ratio of the change of q to the integral of dq. scale: (n,) ratio of dq to the slope of q.
-        misfit: unexplained share of the torque's square. shares: (S,) share of nominal gravity in each joint's tau.
+        misfit: unexplained share of the squared torque. shares: share of nominal gravity torque in tau, by joint.
     """
 
     clock: np.ndarray
@@ -61,7 +61,7 @@ class Judged:
 
 
 def check_units(robot: Robot, recording: Recording) -> Judged | None:
-    """Check clock, dq and tau, and return the results, or None if there are too few rows.
+    """Check the clock, dq and tau of a recording; return the measured values, or None for too few rows.
 
     Raises:
         DataError: dq or tau has another unit, sign or joint order, tau is implausible, or the clock is wrong.
@@ -108,7 +108,7 @@ def _check_clock(recording: Recording) -> np.ndarray:
 
 
 def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Compare the slope of q (T, n) with dq (T, n), both rad/s; return their ratio (n,), nan for joints at rest."""
+    """Compare dq (T, n) with the slope of q (T, n), rad/s; return their ratio (n,), nan for joints at rest."""
     size = np.sqrt((slope**2).mean(0))
     seen, ratios = np.flatnonzero(size > MOVING), np.full(len(size), np.nan)
     if not len(seen):
@@ -146,7 +146,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints that other columns fit far better, and these columns, or None; pairs: see `Unexplained.pairs`."""
+    """Return the joints whose motion fits other joints' columns far better, and these columns, or else None."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():
@@ -157,7 +157,7 @@ def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _check_torque(
     robot: Robot, m: Moments, recording: Recording, moved: np.ndarray
 ) -> tuple[float | None, np.ndarray | None]:
-    """Compare tau with the nominal arm's torque for the same motion; return `misfit` and `shares` of `Judged`."""
+    """Compare tau with the nominal arm's torque for the same motion; return (`Judged.misfit`, `Judged.shares`)."""
     gravity = recording.torque != "commanded"
     most = np.quantile(np.abs(recording.tau), 0.99, axis=0) / robot.tau_max
     left = Unexplained(robot, m, gravity)
@@ -222,7 +222,7 @@ def _check_torque(
 
 
 def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, str, str]]:
-    """Return (remaining misfit, check, description) of corrections of some joints: other columns or other signs."""
+    """Return (remaining misfit, check, description) for swapped columns, and for the other sign in some joints."""
     seen, out, pairs = left.seen, [], left.pairs()
     if (swap := _swapped(pairs, own)) is not None:
         order = np.arange(len(seen))
@@ -238,7 +238,7 @@ def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, s
 
 
 def _listed(joints: Sequence[int] | np.ndarray) -> str:
-    """Return " 3" or "s 1, 2, 3", numbers from 1, for joint indices from 0."""
+    """Return the text that follows "joint" for joint indices from 0: " 3" or "s 1, 2, 3", counted from 1."""
     return f"{'s' * (len(joints) > 1)} {', '.join(str(j + 1) for j in joints)}"
 
 

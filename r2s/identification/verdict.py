@@ -1,7 +1,7 @@
 """Judge a recording before a fit: pass, warn or fail for each check, and expected interval widths.
 
-A recording fails if the checks of an identification refuse it (checks.py, unit_checks.py). Each line also shows what
-its check measured.
+A recording fails if the checks of an identification would refuse it (checks.py, unit_checks.py). Each line of a
+verdict also shows the values that its check measured.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,14 +31,14 @@ OFF_CLOCK = 0.03  # largest error of dq's scale; filters and elastic gears cause
 LATE_S = 1e-3  # s, or half a row: the resolution of a log
 SURE = 2.0  # standard deviations, half-width of the shown interval of lateness
 LOADED = 0.7, 1.4  # range of gravity's share without an undeclared load: masses in files are accurate to a third
-SPEEDS_S = 600.0  # s of a longer recording whose speeds are examined
-FAST, SLOW = 0.2, 0.05  # of dq_max: a friction curve needs speeds from below SLOW to above FAST
-LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # of a joint's moving rows: least share below SLOW, and in each direction
+SPEEDS_S = 600.0  # s, length of the part of a longer recording whose speeds are examined
+FAST, SLOW = 0.2, 0.05  # relative to dq_max; a friction curve needs speeds from below SLOW to above FAST
+LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # least share of a joint's moving rows: slower than SLOW; in each direction
 
 
 @dataclass(frozen=True)
 class Line:
-    """Outcome of a check: verdict, finding, advice, and the measured values by name (arrays are per joint)."""
+    """Result of a check: verdict, finding, advice, and the measured values by name (arrays: one value per joint)."""
 
     check: str
     verdict: str
@@ -52,33 +52,33 @@ class Line:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcomes of all checks of a recording, and the expected widths (None if a check fails)."""
+    """The results of all checks of a recording, and the expected interval widths (None if a check fails)."""
 
     lines: tuple[Line, ...]
     expected: ExpectedWidths | None = None
 
     @property
     def fails(self) -> list[Line]:
-        """Lines of the checks that refuse the recording."""
+        """Results of the checks that refuse the recording."""
         return [line for line in self.lines if line.verdict == FAIL]
 
     @property
     def warnings(self) -> list[Line]:
-        """Lines of the checks that warn."""
+        """Results of the checks that end with a warning."""
         return [line for line in self.lines if line.verdict == WARN]
 
     @property
     def worst(self) -> str:
-        """The verdict on the whole recording, which is the verdict of the worst check."""
+        """The verdict on the whole recording: the worst verdict of its checks."""
         return FAIL if self.fails else WARN if self.warnings else PASS
 
     def refuse(self, name: str = "") -> None:
-        """Raise UserError about the first failed check, if any; the message begins with `name`, of the recording."""
+        """Raise UserError for the first failed check, if any; the message begins with the recording's `name`."""
         for line in self.fails:
             raise UserError(f"{name}{line.found}")
 
     def document(self) -> dict[str, Any]:
-        """Return the verdict for a JSON file."""
+        """Return the verdict as a dict that JSON can store."""
         lines = [
             {"check": x.check, "verdict": x.verdict, "found": x.found, "advice": x.advice}
             | {k: v.tolist() if isinstance(v, np.ndarray | np.generic) else v for k, v in x.values.items()}
@@ -96,7 +96,7 @@ def judge(robot: Robot, nominal: Dynamics, recording: Recording, settings: Setti
     """Return the verdict on a recording.
 
     Args:
-        robot, nominal: the arm, and the dynamics at which an identification starts.
+        robot, nominal: the arm, and the dynamics from which an identification starts.
         recording: the recording, with its period if the motion repeats (`Recording.in_phase`).
         settings: settings of the identification.
     """
@@ -254,13 +254,13 @@ def _listed(joints: Sequence[int] | np.ndarray) -> str:
 
 
 def _span(x: np.ndarray, form: str = "{:.3g}") -> str:
-    """Return the range of the values that are not nan, such as "0.98 to 1.02"."""
+    """Return the range of x as text, such as "0.98 to 1.02"; nan is ignored."""
     low, high = form.format(np.nanmin(x)), form.format(np.nanmax(x))
     return low if low == high else f"{low} to {high}"
 
 
 def with_validation(verdict: Verdict, error: UserError | None, name: str = "") -> Verdict:
-    """Return the verdict with a line about validation file `name`; error: why the file is refused, or None."""
+    """Add the result of the validation file `name` to a verdict: it fails if there is an `error`, else it passes."""
     check = f"validation {name}".strip()
     line = Line(check, FAIL, str(error)) if error else Line(check, PASS, "holds other motion")
     return replace(verdict, lines=(*verdict.lines, line))

@@ -16,15 +16,15 @@ RANGES = "mass", "table", "friction", "damping", "bristle"
 
 @dataclass(frozen=True, kw_only=True)
 class BoxRandomization(UniformRandomization):
-    """Arms from `UniformRandomization`, each with its own random box.
+    """Draw arms from `UniformRandomization`, each with its own random box.
 
-    mass ~ log U(mass); stiffness ~ log U(stiffness); table, friction, damping, bristle ~ U
-    x, y ~ U(-spread, spread) and yaw ~ U(-yaw, yaw) about the nominal place
+    Mass and stiffness are log-uniform, the other ranges uniform. The box's place deviates from the nominal place by
+    x, y ~ U(-spread, spread) and yaw ~ U(-yaw, yaw).
 
     Attributes:
-        size: (3,) m, edges of the box. mass (kg), table, friction (coefficients at table, tip), stiffness (N/m),
+        size: (3,) m, edges of the box. mass (kg), table, friction (coefficients at table and tip), stiffness (N/m),
             damping (s/m), bristle (m): ranges [least, most], see `Surface`.
-        spread (m), yaw (degrees): see above. point (3,) m, normal (3,): of the table; None: see `table_frame`.
+        spread: m. yaw: degrees. point, normal: (3,) m and (3,), plane of the table; None: see `table_frame`.
 
     Raises:
         UserError: a range is malformed, the box would tilt, or there is no tool.
@@ -56,7 +56,7 @@ class BoxRandomization(UniformRandomization):
         check_number("dr.yaw", self.yaw, "[0, 180]")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return random dynamics of m arms, each with its box."""
+        """Return random dynamics of m arms, each with a random box."""
 
         def drawn(low: float, high: float) -> np.ndarray:
             return rng.uniform(low, high, m)

@@ -1,9 +1,9 @@
 """Checkpoints of a training: the state in one file, and the transitions of the replay buffer in files called chunks.
 
-Each transition is written once. The state names the chunks that belong to it, so an interrupted write leaves the
-previous checkpoint intact. A chunk is removed when the buffer has overwritten all of it. So the chunks contain the
-buffer, and older transitions of at most one checkpoint interval. All files contain only tensors, numbers and names,
-so torch.load(weights_only=True) can read them.
+Each checkpoint writes only the new transitions, as one chunk. The file of the state lists the chunks that belong to
+it, so an interrupted write does not damage the previous checkpoint. A chunk is deleted after the replay buffer
+has overwritten all its transitions; until then, the oldest chunk can also contain overwritten transitions. All files
+contain only tensors, numbers and names, so torch.load(weights_only=True) can read them.
 """
 
 import errno
@@ -28,12 +28,12 @@ class Checkpoint:
 
     @property
     def env_steps(self) -> int:
-        """Environment steps at the checkpoint; 0 if there is none."""
+        """Number of environment steps at the checkpoint; 0 without a checkpoint."""
         path = self.folder / "state.pt"
         return load_tensors(path, "resume")["seen"] if path.is_file() else 0
 
     def save(self, state: dict[str, Any], replay: Replay) -> None:
-        """Write the state and the transitions since the last call; remove chunks that the buffer has overwritten."""
+        """Write the state and the transitions since the last call; delete chunks that the buffer no longer needs."""
         self.folder.mkdir(parents=True, exist_ok=True)
         seen, first = replay.seen, replay.seen - len(replay)
         begin = max(self._chunks[-1] if self._chunks else 0, first)
@@ -47,7 +47,7 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill `replay`, an empty buffer, with the saved transitions and return the state; None without a checkpoint.
 
-        Every transition returns to its former row, so a restored generator draws the same batches.
+        Every transition has the same row as before, so a restored random generator draws the same batches.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.
@@ -74,7 +74,7 @@ class Checkpoint:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-# parts of torch's RuntimeError on a full disk; which one appears depends on where the write fails
+# words in torch's RuntimeErrors for a full disk; the error depends on where the write fails
 DISK_FULL = ("PytorchStreamWriter", "iostream error", "inline_container.cc")
 
 
@@ -90,7 +90,7 @@ def save_tensors(path: Path, content: dict[str, Any]) -> None:
 
 
 def load_tensors(path: Path, option: str) -> dict[str, Any]:
-    """Return what `save_tensors` wrote: tensors, numbers and names, never a pickled object.
+    """Load a file of `save_tensors`: tensors, numbers and names, never a pickled object.
 
     Raises:
         UserError: the file is missing or damaged; the message begins with `option`.

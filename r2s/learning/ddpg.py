@@ -1,8 +1,8 @@
 """Deep Deterministic Policy Gradient (Lillicrap et al. 2016, arXiv:1509.02971).
 
-The losses equal those of `torchrl.objectives.DDPGLoss` with both networks delayed; the tests compare them. Two
-differences from the paper: the critics have LayerNorm instead of batch norm, and exploration noise is white. Fujimoto
-et al. 2018 found white noise as good as the paper's Ornstein-Uhlenbeck process.
+The losses equal those of `torchrl.objectives.DDPGLoss` with target networks for actor and critic; the tests compare
+them. This version differs from the paper in two ways: the critics have LayerNorm instead of batch norm, and the
+exploration noise is white. Fujimoto et al. 2018 found white noise as good as the paper's Ornstein-Uhlenbeck process.
 """
 
 from collections.abc import Mapping

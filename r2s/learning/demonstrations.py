@@ -1,7 +1,7 @@
 """Demonstrations: a model-based controller with noise fills the replay buffer before the first update.
 
-Off-policy learners need only good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random torques
-hardly ever reach a goal and stay there. The controller does both, and noise explores around its motion.
+Off-policy learners can learn from any good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random
+torques hardly ever bring an arm to its goal and stop it there. A controller does so, and noise varies the motion.
 """
 
 import math
@@ -17,12 +17,12 @@ from r2s.tasks.push import PushTask
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-NOISE = 0.3  # standard deviation on the last arm's action; first value tried, on development seeds 0 to 2 of reach
-KEPT = 0.9  # correlation of the noise between steps: white noise hardly moves an arm
+NOISE = 0.3  # standard deviation on the last arm's action; first tested value, on development seeds 0 to 2 of reach
+KEPT = 0.9  # correlation of the noise between steps; white noise hardly moves an arm
 
 
 class Demonstrator:
-    """A model-based controller with noise; the noise's standard deviation grows from 0 on arm 0 to NOISE on the last.
+    """A model-based controller with noise; its standard deviation rises from 0 (first arm) to NOISE (last arm).
 
     Args:
         reference: the controller, with the interface of `r2s.learning.networks.Policy`.
@@ -39,7 +39,7 @@ class Demonstrator:
 
 
 def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstrator | None:
-    """Return the demonstrator for reaching with torque, or for pushing with a Cartesian impedance, else None.
+    """Return the demonstrator for the task; None if neither the reaching nor the pushing baseline supports it.
 
     Args:
         robot, task: the arm and its task. dynamics: model of one arm, the center of the training's randomization.

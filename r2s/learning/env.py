@@ -1,7 +1,7 @@
 """A task as a batch-locked TorchRL environment on simulated arms.
 
-One step of all arms: action -> command of the task's controller -> one control period of r2s/learning/vector_arms.py
--> observation, reward terms, truncation. Episodes are truncated and never terminate, so critics bootstrap at the end.
+In a step, the task's controller converts actions to commands, and the arms run one control period (vector_arms.py).
+Episodes are truncated and never terminate, so critics bootstrap from the last observation of an episode.
 """
 
 from collections.abc import Mapping
@@ -21,11 +21,11 @@ from r2s.physics.robot import Robot
 from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State, Task, observation_scale, observe
 
-GROUPS = 8  # groups of arms that reset together: resetting four arms costs hardly more than resetting one
+GROUPS = 8  # groups of arms that reset together; a reset of four arms takes hardly longer than a reset of one
 
 
 class TaskEnv(EnvBase):
-    """`nsim` arms at a task, with new goals and dynamics at every reset.
+    """Simulate `nsim` arms that perform a task, with new goals and dynamics at every reset.
 
     Keys: `observation` (nsim, d), `action` (nsim, a) in [-1, 1], `reward` (nsim, 1) under `weights`,
     `reward_terms` (nsim, k), `distance` (nsim, 1) m, `truncated`, `terminated`, `done`.
@@ -33,10 +33,10 @@ class TaskEnv(EnvBase):
     Args:
         robot, task: the arm and its task.
         draw: domain randomization, called at every reset; a `Pushes` also applies joint torques at every step.
-        nsim: number of arms. nthread: threads, 0: all cores.
-        seed: seed of goals, starts and draws.
-        stagger: whether GROUPS groups of arms end their first episode at different times.
-        reward: terms and weights; None: terms and `paper_weights` of the task.
+        nsim: number of arms. nthread: number of threads; 0: all cores.
+        seed: seed of goals, starts and dynamics.
+        stagger: whether the arms, in GROUPS groups, end their first episodes at different times.
+        reward: reward terms and weights; None: the terms and `paper_weights` of the task.
     """
 
     batch_locked = True
@@ -86,7 +86,7 @@ class TaskEnv(EnvBase):
     def set_progress(self, progress: float) -> None:
         """Set the reward weights for the spent share of a training, 0 to 1; for training loops of other libraries.
 
-        The reward's factor adapts to the steps since the last call, as in `r2s.learning.train.train`.
+        `Reward.adapt` computes the factor of the weights from the steps since the last call, as in `train`.
         """
         if self._seen_steps:
             mean = self._seen / self._seen_steps
@@ -122,7 +122,7 @@ class TaskEnv(EnvBase):
         return state
 
     def _drawn(self, m: int) -> Dynamics:
-        """Return the dynamics of m arms; their speed noise is at least a draw from U(0, task.speed_noise)."""
+        """Draw the dynamics of m arms, and raise each arm's speed noise to at least U(0, task.speed_noise)."""
         drawn = self.draw(self.rng, m)
         if not self.task.speed_noise:
             return drawn
@@ -130,9 +130,9 @@ class TaskEnv(EnvBase):
         return replace(drawn, speed_noise=np.maximum(drawn.speed_noise, noise))
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Return the step, and the state of the next step, with truncated episodes reset.
+        """Run one step, reset truncated episodes, and return the step and the initial state of the next step.
 
-        EnvBase does the same with checks and copies, which take a fifth of the time of a step of 32 arms.
+        EnvBase's method also makes checks and copies; with 32 arms, these take a fifth of a step's time.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)
@@ -170,7 +170,7 @@ class TaskEnv(EnvBase):
         return self.reward.judge(self.task, state, ddq, self.goal, self._scale)
 
     def state(self) -> dict[str, Any]:
-        """Return the state of simulation and generators, as arrays, numbers and names, for `set_state`."""
+        """Return the state of simulation and random generators, as arrays, numbers and names, for `set_state`."""
         own = {name: getattr(self, name).copy() for name in ("goal", "_dq", "_count", "_scale")}
         return own | {"arms": self.arms.state(), "rng": self.rng.bit_generator.state, "_stagger": self._stagger}
 

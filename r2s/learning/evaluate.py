@@ -1,8 +1,8 @@
 """Evaluation in simulation: 200 deterministic episodes, the same for every policy.
 
-There are two sets of goals, starts and dynamics. During a training, SELECTION chooses the best policy. REPORT yields
-the reported measures and selects no policy. But settings of conf/algo and conf/reward were compared on REPORT, so
-benchmarks/minutes.py uses a third set.
+The seed sets the goals, starts and dynamics of the episodes. A training selects its best policy on episodes of the
+seed SELECTION. The reported measures come from episodes of the seed REPORT, which select no policy. However, they
+helped to choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
 """
 
 from collections.abc import Callable
@@ -25,21 +25,21 @@ def generators(seed: int) -> list[np.random.Generator]:
 
 
 def fixed_episodes(robot: Robot, task: Task, count: int, seed: int = REPORT) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts (count, n) rad and goals (count, ...), the same for every policy, simulator and arm."""
+    """Return starts (count, n) rad and goals (count, ...), which are the same for every policy, simulator and arm."""
     starts, goals, _ = generators(seed)
     drawn = task.goals(robot, goals, count)
     return task.begin(task.starts(robot, starts, count), drawn), drawn
 
 
 def fixed_draws(draw: Draw, count: int, seed: int = REPORT) -> Dynamics:
-    """Return the dynamics of the arms in the fixed episodes."""
+    """Return the dynamics of the arms in the episodes of `fixed_episodes`."""
     return draw(generators(seed)[2], count)
 
 
 def make_evaluation(
     robot: Robot, task: Task, draw: Draw, *, episodes: int = 200, nthread: int = 0, seed: int = REPORT
 ) -> Callable[[PolicyLike], Episodes]:
-    """Return a function policy -> Episodes that runs all fixed episodes in parallel, each with its random dynamics.
+    """Return a function policy -> Episodes, which runs the fixed episodes in parallel on arms with random dynamics.
 
     The function raises FloatingPointError if an action or a reward is not finite.
     """

@@ -1,7 +1,7 @@
-"""A task as Gymnasium environments: `ArmVectorEnv`, a batch of simulated arms, and `ArmEnv`, one of them.
+"""A task as Gymnasium environments: `ArmVectorEnv` for a batch of simulated arms, `ArmEnv` for a single arm.
 
 Each arm of a batch has its own random generator, so arm i runs the same episodes as a single arm with the same seed.
-Observations are normalised with the scales of the task, as in r2s's policies.
+Observations are normalized with the scales of the task, as in r2s's policies.
 """
 
 from typing import Any
@@ -26,10 +26,10 @@ SEEDS = 2**63  # number of seeds for an arm's episodes
 
 
 class SeparateArms(VectorArms):
-    """`VectorArms` with one generator per arm, `streams`, for sensor noise and for the torques of `Pushes`."""
+    """`VectorArms` with a random generator per arm, `streams`, for sensor noise and for the torques of `Pushes`."""
 
     def seed(self, seed: int | np.random.SeedSequence) -> None:
-        """Restart the generators of all arms from this seed."""
+        """Restart the random generators of all arms from this seed."""
         super().seed(seed)
         self.streams = self._rng.spawn(self.width)
 
@@ -60,21 +60,21 @@ class SeparateEnv(TaskEnv):
 
 
 class ArmVectorEnv(gym.vector.VectorEnv):
-    """`num_envs` simulated arms at a task, stepped together.
+    """Simulate `num_envs` arms that perform a task, and step them together.
 
-    Observations (num_envs, d) float32 are normalised by the task's scales and clipped to 10. Actions (num_envs, a)
-    are clipped to [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal, m; `info["reward_terms"]`
-    (num_envs, k) are the unweighted terms of the reward, 0 for an arm that has just restarted. Episodes are
-    truncated after `task.steps` steps.
+    Observations (num_envs, d) float32 are normalized and clipped to [-10, 10]. Actions (num_envs, a) are clipped to
+    [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal, m. `info["reward_terms"]` (num_envs, k) are
+    the unweighted terms of the reward, 0 for an arm that has just restarted. Episodes are truncated after
+    `task.steps` steps.
 
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
-        num_envs: number of arms. nthread: threads, 0: all cores.
-        reward: terms and weights; until `set_progress`, weights at the start of a training. None: as in `TaskEnv`.
+        num_envs: number of arms. nthread: number of threads; 0: all cores.
+        reward: reward terms and weights, None: as in `TaskEnv`. Weights are initial weights until `set_progress`.
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
-        UserError: autoreset_mode is not one of these three.
+        UserError: autoreset_mode is neither NextStep nor SameStep nor Disabled.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
-        """Return observations (m, d), given in SI units, in the normalised form of this environment."""
+        """Normalize observations (m, d) from SI units to the scale of this environment's observations."""
         return ((observation - self.mean) / self.std).clip(-CLIP, CLIP).astype(np.float32)
 
     def reset(
@@ -116,7 +116,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes of all arms, or of the arms of `options["reset_mask"]` (num_envs,) bool.
 
-        seed: with a number, arm i gets seed + i; or a list with one seed per arm; None: the generators continue.
+        seed: a number: arm i has seed + i. A list: one seed per arm. None: the random generators are not restarted.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
@@ -133,10 +133,10 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         """Run one control period.
 
         Raises:
-            UserError: the actions have another shape, or, in mode Disabled, the episode of an arm has ended.
+            UserError: the actions have a wrong shape, or an episode has ended and automatic resets are disabled.
             FloatingPointError: an action is not finite.
         """
-        waiting = self.ended.copy()  # arms that mode NextStep resets in this step; their result is discarded
+        waiting = self.ended.copy()  # arms that the mode NextStep resets in this step, without a result
         if waiting.any() and self.mode == AutoresetMode.DISABLED:
             raise UserError(f"step: the episode of arm {waiting.argmax()} has ended; reset it first")
         action = np.asarray(actions, dtype=np.float32)
@@ -177,7 +177,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
 
 
 class ArmEnv(gym.Env):
-    """One simulated arm: an `ArmVectorEnv` of one arm without automatic resets, with the same arguments."""
+    """A single simulated arm: an `ArmVectorEnv` of one arm without automatic resets; its arguments are the same."""
 
     def __init__(self, robot: Robot, task: Task, draw: Draw, *, reward: Reward | None = None):
         self.batch = ArmVectorEnv(robot, task, draw, nthread=1, reward=reward, autoreset_mode=AutoresetMode.DISABLED)
@@ -189,7 +189,7 @@ class ArmEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; `seed` determines the random numbers of this and all later episodes."""
+        """Start a new episode; `seed` sets the random numbers of this and all later episodes."""
         super().reset(seed=seed)
         self.batch.env.rngs = [self.np_random]
         observation, info = self.batch.reset()
@@ -203,5 +203,5 @@ class ArmEnv(gym.Env):
 
 
 def _single(info: dict[str, Any]) -> dict[str, Any]:
-    """Return the info of the single arm."""
+    """Return the `info` of a batch of one arm as the `info` of this arm."""
     return {"distance": float(info["distance"][0]), "reward_terms": info["reward_terms"][0]}

@@ -25,22 +25,22 @@ class Learner(nn.Module, ABC):
 
     Args:
         scale: mean and standard deviation (d,) that normalize an observation.
-        action_scale: (a,), value of an action of 1 in SI units; part of the policy.
+        action_scale: (a,), factor from an action in [-1, 1] to SI units; part of the policy.
         critics: (number of critics, outputs per critic).
         hidden: units per hidden layer of actor and critics.
         gamma: discount. tau: Polyak step of the target networks. lr: learning rate of Adam.
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
             critics hardly distinguish actions, the policy then prefers small actions to alternating full torque.
         explore_correlation: correlation of an arm's exploration noise between two steps; 0: white. The noise is a
-            first-order process of constant variance. Per displacement, correlated noise accelerates an arm less
-            (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
+            first-order process of constant variance. For the same displacement, correlated noise needs smaller
+            accelerations (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
 
     Raises:
         UserError: a setting has the wrong type or is out of range.
     """
 
     action_scale: Tensor
-    compiled: tuple[str, ...] = ("gradients",)  # methods to compile, which take most of the time
+    compiled: tuple[str, ...] = ("gradients",)  # methods to compile: those with most of the computation
 
     def __init__(
         self,
@@ -83,13 +83,13 @@ class Learner(nn.Module, ABC):
 
     @abstractmethod
     def losses(self, batch: Mapping[str, Tensor], *noise: Any) -> dict[str, Tensor]:
-        """Return the losses of a batch, under names that begin with loss_, and other scalars to log.
+        """Return the losses of a batch, with names that begin with loss_, and other scalars to log.
 
         The random draws are arguments, so that the tests can compare the losses with TorchRL's.
 
         Args:
-            batch: see `update`, with normalized observations.
-            noise: random draws that the algorithm needs.
+            batch: as for `update`, but with normalized observations.
+            noise: random draws of the algorithm.
         """
 
     @abstractmethod
@@ -103,7 +103,7 @@ class Learner(nn.Module, ABC):
     def gradients(self, batch: Mapping[str, Tensor], *noise: Any) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
         """Return `losses` of a batch in SI units, and the gradient of their sum with respect to each of `trained`.
 
-        One function computes both, so that both compile to one graph; `backward` would be a second graph.
+        Losses and gradient are in one function, so that torch compiles one graph; `backward` would need a second one.
         """
         return differentiate(self.losses(self.normalized(batch), *noise), self.trained)
 
@@ -113,16 +113,16 @@ class Learner(nn.Module, ABC):
         return Policy(self.normalizer, self.actor, self.action_scale)
 
     def set_lr(self, share: float) -> None:
-        """Set the learning rate to this share of its initial value."""
+        """Set the learning rate to `share` of its initial value."""
         for group in self.optimizer.param_groups:
             group["lr"] = share * self.lr
 
     def set_exploration(self, share: float) -> None:
-        """Set the standard deviation of exploration to this share of its initial value."""
+        """Set the standard deviation of the exploration noise to `share` of its initial value."""
         self.explore_share = share
 
     def noise(self, like: Tensor) -> Tensor:
-        """Return the standard normal noise (B, a) of the next exploration; each row belongs to an arm."""
+        """Draw standard normal noise (B, a) for the exploration in the next step; row i is for arm i."""
         fresh = torch.randn_like(like)
         if self._noise is not None and self._noise.shape == like.shape:
             kept = self.explore_correlation
@@ -137,14 +137,14 @@ class Learner(nn.Module, ABC):
 
     @property
     def trained(self) -> list[Tensor]:
-        """The parameters that the optimizer changes: all except the target networks'."""
+        """The parameters that the optimizer changes: all except those of the target networks."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def compile(self, batch_size: int) -> bool:  # type: ignore[override]
-        """Compile the losses with their gradient for this batch size, before the first update.
+        """Compile the losses and their gradient for a batch size, before the first update.
 
-        This takes half a minute of one core, or some seconds with a cached result. On a GPU it captures a graph.
-        If compilation fails, for example without a C++ compiler, a warning follows, and the losses stay uncompiled.
+        Compilation takes half a minute on one core, or some seconds with a cached result. On a GPU, torch also
+        captures a CUDA graph. If compilation fails (no C++ compiler), r2s warns and uses the uncompiled losses.
 
         Returns:
             Whether the losses are compiled.
@@ -166,7 +166,7 @@ class Learner(nn.Module, ABC):
             for name, method in eager.items():
                 setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
             traced = dynamo.patch(trace_autograd_ops=True)  # torch.autograd.grad within the graph
-            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # because the update draws noise
+            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # the update draws noise
                 self.update(batch)
         except RuntimeError as error:
             why = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -180,7 +180,7 @@ class Learner(nn.Module, ABC):
         return True
 
     def descend(self, losses: Mapping[str, Tensor], trained: Sequence[Tensor], gradients: Sequence[Tensor]) -> None:
-        """Take one Adam step on the parameters `trained` with their gradients, if the losses are finite.
+        """Change the parameters `trained` by one Adam step with their gradients, if the losses are finite.
 
         Raises:
             FloatingPointError: a loss is not finite; the learner is unchanged.
@@ -195,12 +195,12 @@ class Learner(nn.Module, ABC):
         self.updates += 1
 
     def get_extra_state(self) -> dict:
-        """Return the part of the state dict beyond parameters and buffers."""
+        """Return the state that torch's state dict lacks: optimizer, number of updates, last exploration noise."""
         return {"optimizer": self.optimizer.state_dict(), "updates": self.updates, "noise": self._noise}
 
     def set_extra_state(self, state: dict) -> None:
         """Restore a result of `get_extra_state`."""
-        # torch keeps references to the given moments: without a copy, two learners would share and overwrite them
+        # torch stores references to the loaded moments: without a copy, two learners would share and overwrite them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         noise = state.get("noise")  # older checkpoints have none
         self.updates, self._noise = state["updates"], None if noise is None else noise.to(self.action_scale.device)
@@ -241,7 +241,7 @@ class EntropyLearner(Learner):
 
     Args:
         scale, action_scale, critics, shared: see `Learner`.
-        alpha_init: initial temperature. target_entropy: entropy goal; None: minus the dimension of an action.
+        alpha_init: initial temperature. target_entropy: desired entropy; None: minus the dimension of an action.
     """
 
     entropy_goal: Tensor
@@ -267,7 +267,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Shift the target entropy as a Gaussian's entropy shifts if `share` multiplies all standard deviations."""
+        """Change the target entropy as a Gaussian's entropy changes when its standard deviations scale by `share`."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -276,7 +276,7 @@ class EntropyLearner(Learner):
         """Return critic, actor and alpha losses and the entropy of a batch; see `Learner.losses`.
 
         Args:
-            batch: see `update`, with normalized observations.
+            batch: as for `update`, but with normalized observations.
             noise: two standard normal draws (B, a): for the next action, and for the action in the actor's loss.
         """
 
@@ -294,7 +294,7 @@ class EntropyLearner(Learner):
         return out | {"alpha": self.log_alpha.detach().exp()}
 
     def entropy_losses(self, alpha: Tensor, value: Tensor, action: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        """Return actor and alpha losses and the entropy; value, log_prob (B,): those of action (B, a)."""
+        """Return actor and alpha losses and the entropy; value, log_prob (B,): value, log-density of the actions."""
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.entropy_goal)).mean()
         return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}
@@ -313,14 +313,14 @@ def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor,
 
 
 def total(losses: Mapping[str, Tensor]) -> Tensor:
-    """Return the sum of the losses, the scalars whose names begin with loss_."""
+    """Return the sum of the scalars whose names begin with loss_."""
     return torch.stack([v for k, v in losses.items() if k.startswith("loss_")]).sum()
 
 
 def differentiate(
     losses: Mapping[str, Tensor], trained: Sequence[Tensor]
 ) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
-    """Return the scalars, detached, and the gradient of `total` with respect to the parameters `trained`."""
+    """Return `losses` as detached scalars, and the gradient of `total` with respect to the parameters `trained`."""
     return {k: v.detach() for k, v in losses.items()}, torch.autograd.grad(total(losses), trained)
 
 

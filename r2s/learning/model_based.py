@@ -1,6 +1,6 @@
 """Model-based baselines: minimum-jerk joint motion, computed torque, friction compensation.
 
-Baselines have the interface, observations and rate of a policy, and use the model in which policies train.
+Baselines have the interface, observations and rate of a policy. Their model is the center of the randomization.
 """
 
 import mujoco
@@ -19,16 +19,16 @@ from r2s.tasks.task import Task
 
 STIFF = 12.0  # rad/s, bandwidth of the critically damped feedback; the limit at 50 Hz with the latency of an arm
 POSTURE = 1e-3  # m^2, weight of the start posture in the inverse kinematics
-FAST = 0.9 * ALLOWED  # share of a joint's speed limit, below the share that the safety filter allows
+FAST = 0.9 * ALLOWED  # largest planned share of a joint's speed limit; the safety filter allows the share ALLOWED
 PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (15 / 8)
 
 
 class Oracle:
-    """Minimum-jerk motion with computed torque for B arms, with the `action` of `r2s.learning.networks.Policy`.
+    """A policy for B arms: minimum-jerk motion under computed torque; `action` as in `r2s.learning.networks.Policy`.
 
     Args:
         robot, task: the arm and its task, under control=torque. dynamics: model of one arm.
-        move_s: s, duration of a motion, or longer if a joint would exceed the share FAST of its speed limit.
+        move_s: s, duration of a motion; r2s prolongs it if a joint would exceed the share FAST of its speed limit.
     """
 
     def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
@@ -46,7 +46,7 @@ class Oracle:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d); an effort of zero marks a new episode."""
+        """Return actions (B, n) in [-1, 1] for observations (B, d); an observed effort of 0 starts a new motion."""
         rows, n = observation.numpy().astype(np.float64), self.robot.n
         out = np.empty((len(rows), n))
         for i, row in enumerate(rows):
@@ -61,7 +61,7 @@ class Oracle:
         return torch.from_numpy(np.clip(out / self._torque, -1.0, 1.0).astype(np.float32))
 
     def torque(self, q: np.ndarray, dq: np.ndarray, to: np.ndarray, dto: np.ndarray, ddto: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm at q, dq (n,) for the reference `to`, `dto`, `ddto` (n,)."""
+        """Return the computed torque (n,) Nm at q, dq (n,), for the reference motion `to`, `dto`, `ddto` (n,)."""
         data = self._data
         data.qpos[:], data.qvel[:], data.qacc[:] = q, dq, ddto + 2 * STIFF * (dto - dq) + STIFF**2 * (to - q)
         rigid = np.zeros(self.robot.n)
@@ -71,9 +71,9 @@ class Oracle:
         return rigid + self.dynamics.friction(dto) - self.dynamics.offset
 
     def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
-        """Return q (n,) near `start`, within limits, with the end effector at `goal` (3,) m; damped least squares.
+        """Return q (n,) near `start`, within limits, that brings the end effector to `goal` (3,) m.
 
-        Joints whose friction exceeds the torque limit do not move.
+        The method is damped least squares. Joints whose friction exceeds the torque limit do not move.
         """
         q, jacobian = start.copy(), np.empty((3, self.robot.n))
         low, high = self.robot.q_min + 0.15, self.robot.q_max - 0.15
@@ -93,7 +93,7 @@ class Oracle:
 
 
 class ZeroAction:
-    """A policy with zero actions, for a controller that does the task alone; see `r2s.learning.networks.Policy`.
+    """A policy with zero actions for a task that the controller performs alone; see `r2s.learning.networks.Policy`.
 
     Args:
         action_dim: number of values in an action.
@@ -108,7 +108,7 @@ class ZeroAction:
 
 
 def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | ZeroAction:
-    """Return `algo=computed_torque`: zero actions under control=computed_torque, `Oracle` for reaching with torque.
+    """Return the baseline: an `Oracle` for reaching with control=torque, zero actions for control=computed_torque.
 
     Raises:
         UserError: the task or its controller is not supported.
@@ -124,9 +124,9 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 
 
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
-    """Return `algo=hybrid_force`: zero actions under control=hybrid, which touches the surface and exerts the force.
+    """Return the baseline `algo=hybrid_force`: zero actions under control=hybrid.
 
-    The controller exerts the force in open loop: J^T f plus the friction of its model.
+    The controller alone touches the surface and exerts a force f in open loop: J^T f plus modeled friction torque.
 
     Raises:
         UserError: the controller is not control=hybrid, or the task has no contact.

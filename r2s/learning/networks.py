@@ -7,12 +7,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-CLIP = 10.0  # largest normalised observation, in standard deviations
+CLIP = 10.0  # largest normalized observation, in standard deviations
 LOG_STD = -5.0, 2.0  # bounds of the logarithm of the actor's standard deviation
 
 
 class Normalizer(nn.Module):
-    """(x - mean) / std with fixed mean and std (d,)."""
+    """Normalize observations x to (x - mean) / std, with fixed mean (d,) and std (d,)."""
 
     mean: Tensor
     std: Tensor
@@ -28,10 +28,10 @@ class Normalizer(nn.Module):
 
 
 class Actor(nn.Module):
-    """Gaussian whose tanh is the action: observation (B, d) -> loc, scale (B, a).
+    """Map observations (B, d) to loc and scale (B, a) of a Gaussian whose tanh is the action.
 
-    Deterministic algorithms use only `mode` and do not train the outputs for the scale. With these outputs, policy
-    files of all algorithms have the same format, and compared networks have the same size.
+    Deterministic algorithms use only `mode` and do not train the scale. They still have the outputs for the scale, so
+    that the policies of all algorithms have the same file format and network size.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, hidden: tuple[int, ...]):
@@ -43,7 +43,7 @@ class Actor(nn.Module):
         self.body = nn.Sequential(*layers, nn.Linear(sizes[-1], 2 * act_dim))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return loc and scale of the Gaussian whose tanh is the action."""
+        """Return loc and scale (B, a) of the Gaussian whose tanh is the action."""
         loc, log_std = self.body(observation).chunk(2, -1)
         return loc, log_std.clamp(*LOG_STD).exp()
 
@@ -56,8 +56,8 @@ class Policy(nn.Module):
     """A deterministic policy: observation (B, d) -> action (B, a), both in SI units.
 
     Args:
-        normalizer, actor: networks. scale, offset: (a,), map an action in [-1, 1] to SI units: offset + scale x
-            action, see `r2s.control.controller.Controller`. offset None: zero.
+        normalizer, actor: networks. scale, offset: (a,), convert an action in [-1, 1] to SI units: offset + scale x
+            action, see `r2s.control.controller.Controller`; None: offset 0.
     """
 
     action_scale: Tensor
@@ -74,7 +74,7 @@ class Policy(nn.Module):
         return self.actor.mode(self.normalizer(observation))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return actions in SI units; with control=torque: Nm, without gravity, before low-pass and safety filter."""
+        """Return actions in SI units; with control=torque, target torques in Nm without gravity."""
         return self.action_offset + self.action(observation) * self.action_scale
 
 
@@ -101,7 +101,7 @@ class Critics(nn.Module):
     def frozen(self, observation: Tensor, action: Tensor, count: int | None = None) -> Tensor:
         """Return the outputs (C, B, outputs) of the first `count` critics (None: all) for an actor's loss.
 
-        The gradient reaches the action but not the critics' parameters.
+        The outputs have a gradient with respect to the action, but not to the critics' parameters.
         """
         groups = (self.weight, self.bias, self.norm_scale, self.norm_shift)
         return _outputs(observation, action, *([p.detach()[:count] for p in group] for group in groups))

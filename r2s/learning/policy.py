@@ -1,4 +1,4 @@
-"""Files of a policy: policy.pt for r2s, policy.onnx for other programs, both with inputs and outputs in SI units."""
+"""Files of a policy: policy.pt for r2s and policy.onnx for other programs; inputs and outputs are in SI units."""
 
 import contextlib
 import io
@@ -38,7 +38,7 @@ def save_policy(folder: Path, policy: Policy) -> None:
 
 
 def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
-    """Return the policy of a run folder.
+    """Load the policy of a run folder.
 
     Raises:
         UserError: policy.pt is missing, damaged, or made for another arm or task.
@@ -58,9 +58,9 @@ def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
 
 
 def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
-    """Write policy.onnx: `observation` (B, d) -> action (B, a) in SI units, normalization included.
+    """Write policy.onnx, which maps `observation` (B, d) to an action (B, a), both in SI units.
 
-    The output is named after the controller's action, `torque` by default. For a driver, metadata describe joints,
+    The output has the name of the controller's action, `torque` by default. Metadata for a driver describe joints,
     policy rate, limits, low-pass and controller.
     """
     import onnx
@@ -88,7 +88,7 @@ def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
 
 
 def observation_words(task: Task, control: Controller) -> str:
-    """Return the terms and units of an observation in one line."""
+    """Describe an observation in one line: the names and units of its components."""
     return task.observation_summary + ("; control torque / torque limit" if control.observes_torque else "")
 
 

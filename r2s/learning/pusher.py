@@ -1,9 +1,9 @@
-"""`algo=pusher`: a model-based pusher for `task=push`, a baseline without learning.
+"""A baseline without learning for `task=push`: the model-based pusher `algo=pusher`.
 
-Its model is quasi-static: a frictionless push at a face point p along the inward normal n moves a box with v = n and
-w = (p x n) / r^2 (limit surface of r2s/physics/sliding.py), whatever its mass and friction. From many points on the
-four faces, the pusher selects the one that reduces the error |e|^2 + r^2 e_yaw^2 fastest (steepest descent), minus a
-cost of the way to this point. The pusher has no memory and plans anew in every control period.
+The pusher's model is quasi-static and independent of the box's mass and friction. A frictionless push at a face point
+p along the inward normal n moves the box with v = n and w = (p x n) / r^2 (limit surface of r2s/physics/sliding.py).
+Among many face points, the pusher selects the one with the steepest descent of the error |e|^2 + r^2 e_yaw^2, minus a
+cost for the tip's way to it. The pusher has no memory and plans anew in every control period.
 """
 
 import numpy as np
@@ -18,21 +18,21 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
 
-POINTS, EDGE = 9, 0.75  # points per face, and share of a half edge that they span
-CLEAR = 0.02  # m, clearance between tip and box on the way around it
+POINTS, EDGE = 9, 0.75  # number of points per face; share of a half edge that the points span
+CLEAR = 0.02  # m, clearance between tip and box while the tip moves around the box
 NEAR = 0.012  # m, lateral error of the tip in front of a face, below which the tip pushes
-WAY = 0.4  # 1/m, cost of a point per m of the way to it, as a share of the steepest possible descent
+WAY = 0.4  # 1/m, cost of a point per m of the tip's way to it, as a share of the steepest possible descent
 DONE = 0.008  # m, error below which the pusher stops
-SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, on the way; m, error below which it slows down
-GAIN = 0.25  # gain of the tip speed feedback / damping of the law: 25 Hz and the latency allow little more
+SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, elsewhere; m, error below which a push is slower
+GAIN = 0.25  # tip speed feedback over damping of the impedance law; 25 Hz and the latency allow little more
 
 
 class Pusher:
-    """The pusher for B arms, with the `action` of `r2s.learning.networks.Policy`.
+    """Push boxes with B arms; the `action` has the interface of `r2s.learning.networks.Policy`.
 
     Args:
-        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm,
-            whose friction is compensated.
+        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm, for
+            compensation of its friction.
 
     Raises:
         UserError: the task or its controller is not supported.
@@ -63,7 +63,7 @@ class Pusher:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, 3) in [-1, 1] for observations (B, d)."""
+        """Return actions (B, 3) in [-1, 1] for observations (B, d) in SI units."""
         rows, n = observation.numpy().astype(np.float64), self._n
         own = rows[:, 3 * n + 1 :]
         tip, rate, box, error = own[:, TIP], own[:, TIP_RATE], own[:, BOX], own[:, ERROR]
@@ -76,14 +76,14 @@ class Pusher:
         return torch.from_numpy(np.clip(target @ self._axes / self._scale, -1.0, 1.0).astype(np.float32))
 
     def _friction(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the force (B, 3) N that overcomes the joints' friction at a velocity (B, 3) m/s of the tip."""
+        """Return the tip force (B, 3) N that overcomes the joints' friction at a tip velocity (B, 3) m/s."""
         jacobian = self._task.tip(q)[1]
         inverse = np.linalg.pinv(jacobian)
         torque = self._dynamics.friction(np.einsum("bnk,bk->bn", inverse, velocity))
         return np.einsum("bnk,bn->bk", inverse, torque)
 
     def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip velocity (3,) m/s along the table, and the direction (2,) of the push (none: 0)."""
+        """Return the tip velocity (3,) m/s along the table, and the unit direction (2,) of the push; 0: no push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
         at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), self._reach * error[2]])
@@ -110,7 +110,7 @@ class Pusher:
         return np.array([*(rotation.T @ way), 0.0]), push
 
     def _around(self, at: np.ndarray, to: np.ndarray) -> np.ndarray:
-        """Return the next point (2,) m on a way around the box from `at` to `to`, all in the frame of the box."""
+        """Return the next point of a way from `at` to `to` around the box; points (2,) m are in the box's frame."""
         edge = self._half + self._task.tip_radius
         clear = edge + CLEAR
         corners = clear * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
@@ -127,7 +127,7 @@ class Pusher:
         return corners[seen[int(np.argmin(ways))]]
 
     def _left(self, corners: np.ndarray, first: int, to: np.ndarray, edge: np.ndarray) -> float:
-        """Return the length, m, of the shortest way from the corner `first` along other corners to the point `to`."""
+        """Return the length, m, of the shortest way from the corner `first` past other corners to the point `to`."""
         lengths = []
         for step in (1, -1):
             k, length = first, 0.0
@@ -141,7 +141,7 @@ class Pusher:
 
 
 def _face_points(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (k, 2) m on the faces of a rectangle with half edges (2,) m, and inward normals (k, 2)."""
+    """Return points (k, 2) m on the edges of a rectangle with half edges (2,) m, and the inward normals (k, 2)."""
     points, normals = [], []
     for axis in range(2):
         for side in (-1.0, 1.0):
@@ -154,7 +154,7 @@ def _face_points(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _crosses(a: np.ndarray, b: np.ndarray, half: np.ndarray) -> bool:
-    """Return whether the line from a to b (2,) m crosses a rectangle around 0 with half edges (2,) m."""
+    """Return whether the line from a to b (2,) m crosses a rectangle centered at 0 with half edges `half` (2,) m."""
     low, high = 0.0, 1.0
     for k in range(2):
         step = b[k] - a[k]

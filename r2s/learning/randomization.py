@@ -1,4 +1,4 @@
-"""Domain randomization: random dynamics around a center, with physically valid inertia tensors of all links."""
+"""Domain randomization: random dynamics around nominal ones, with physically valid inertia tensors of all links."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,26 +20,24 @@ from r2s.physics.tip import nominal_plane, tilted
 
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or one for all arms
 
-DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # drawn fields of a `Surface`
-TRIES = 64  # most draws of a tensor; if all are rejected, the link has the center's tensor
+DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # random fields of a `Surface`
+TRIES = 64  # largest number of draws of a tensor; if all are rejected, the link has the center's tensor
 
 
 @dataclass(frozen=True)
 class UniformRandomization:
-    """Uniform draws around a center; the paper uses phi_relative 0.10 and inertia_relative 0.05.
+    """Draw friction parameters and inertia tensors uniformly around a center, as the paper does.
 
-    phi (all 21) ~ center * U(1 - phi_relative, 1 + phi_relative), independent
-    I_xx I_yy I_zz I_xy I_xz I_yz of a link ~ U(physical tensors whose elements are within center * (1 +-
-        inertia_relative)): elements are independent, and unphysical tensors are drawn again
-
-    The paper states independent elements within 5 %. Rejection is necessary: where the triangle inequality is tight,
-    independent elements yield impossible bodies. At 5 %, the Panda's links 4 and 7 accept every draw. Link 1, a rod
-    (I_zz is 0.013 I_xx), accepts 22 %, which correlates I_xx and I_yy by 0.97. Links 2, 3, 5 and 6 accept 47 to 63 %,
-    and no two of their elements correlate by more than 0.6. Each element still spans +-5 %.
+    Each friction parameter phi is center * U(1 - phi_relative, 1 + phi_relative); the paper uses phi_relative = 0.10.
+    Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws
+    are independent, but an unphysical tensor is drawn again, because the tensor of a slender link can violate the
+    triangle inequality. At 5 %, every draw is valid for the Panda's links 4 and 7, 47 to 63 % of the draws for links
+    2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). Rejection correlates elements: I_xx and I_yy of
+    link 1 by 0.97, elements of other links by at most 0.6. Each element still spans +-5 %.
 
     Attributes:
         robot: the arm.
-        center: dynamics of the arm, without a batch dimension.
+        center: nominal dynamics of the arm, without a batch dimension.
         phi_relative, inertia_relative: half widths of the ranges, relative to the center; 0: no variation.
         payload: [least, most] kg, range of each arm's payload, see `with_payloads`; None: no payload.
 
@@ -79,10 +77,10 @@ class UniformRandomization:
 
 @dataclass(frozen=True)
 class PosteriorRandomization:
-    """Draws from an identification's posterior: whole rows of `samples` (S, P) of `space`, which are correlated.
+    """Draw from an identification's posterior: each arm has a random row of `samples` (S, P) in `space`.
 
-    Every row is physically valid: tensor scales are positive, and the full parametrization has no invalid values.
-    payload: see `UniformRandomization`.
+    A whole row preserves the values' correlations. Every row is physically valid: tensor scales are positive, and the
+    full inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
     """
 
     space: ParameterSpace
@@ -100,23 +98,23 @@ class PosteriorRandomization:
 
 @runtime_checkable
 class Pushes(Protocol):
-    """A randomization that applies joint torques at every control step of a training, not of an evaluation."""
+    """A randomization that applies random joint torques at every control step of a training, not of an evaluation."""
 
     def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
-        """Return the torques (m, n) Nm for the next control step of m arms."""
+        """Draw the torques (m, n) Nm for the next control step of m arms."""
         ...
 
 
 @dataclass(frozen=True)
 class ForceRandomization:
-    """Random joint torques instead of random dynamics (Valassakis et al. 2020, arXiv 2008.06686).
+    """Apply random joint torques instead of random dynamics (Valassakis et al. 2020, arXiv 2008.06686).
 
-    tau ~ U(-1, 1) * share * friction level of the joint, drawn at every control step. Like friction, this torque acts
-    after the safety filter.
+    tau ~ U(-1, 1) * share * friction level of the joint, drawn at every control step. Like friction, the torque acts
+    on the joint itself, so the safety filter does not change it.
 
     Attributes:
-        robot: the arm. center: dynamics of the arm, without a batch dimension.
-        share: largest torque, relative to `Dynamics.level`.
+        robot: the arm. center: nominal dynamics of the arm, without a batch dimension.
+        share: largest torque, relative to the joint's friction level `Dynamics.level`.
 
     Raises:
         UserError: the share is negative.
@@ -134,7 +132,7 @@ class ForceRandomization:
         return self.center
 
     def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
-        """Return the torques (m, n) Nm of one control step."""
+        """Draw the torques (m, n) Nm for one control step of m arms."""
         return self.share * self.center.level * rng.uniform(-1.0, 1.0, (m, self.robot.n))
 
 
@@ -150,16 +148,16 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ContactRandomization(UniformRandomization):
-    """Arms from `UniformRandomization`, each with its own random plane near a nominal one.
+    """Draw arms from `UniformRandomization`, each with its own random plane near a nominal plane.
 
-    stiffness ~ log U(stiffness); exponent ~ U({least, most}); damping, friction ~ U; bristle ~ U(bristle)
-    point ~ point + U(-place, place) normal; normal tilted by U(0, tilt) about a random axis
+    Stiffness is log-uniform, the exponent is either end of its range, and damping, friction and bristle are uniform.
+    The plane is displaced by U(-place, place) along its normal and tilted by U(0, tilt) about a random axis.
 
     Attributes:
         point, normal: (3,) m and (3,), nominal plane; None: a table below the tip at home.
         stiffness (N/m), exponent, damping (s/m), friction, bristle (m): ranges [least, most], see `Surface`.
         place: m, largest displacement along the normal. tilt: degrees, largest tilt.
-        surface: run folder of an identified surface, from whose posterior to draw. None: draw from the ranges.
+        surface: run folder of an identified surface, to draw from its posterior; None: draw from the ranges.
 
     Raises:
         UserError: a range is malformed or outside what a surface allows, or the robot has no tool.
@@ -178,7 +176,7 @@ class ContactRandomization(UniformRandomization):
 
     @cached_property
     def _identified(self) -> Surface | None:
-        """All posterior draws of the identified surface; None without an identified surface."""
+        """All posterior draws of the identified surface, as one `Surface` with a batch axis; None: no `surface`."""
         if not self.surface:
             return None
         draws = load_contact(self.surface, "dr.surface").draws
@@ -198,7 +196,7 @@ class ContactRandomization(UniformRandomization):
         check_number("dr.tilt", self.tilt, "[0, 45]")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return random dynamics of m arms, each with its surface."""
+        """Return random dynamics of m arms, each with a random surface."""
         if (known := self._identified) is not None:
             row = rng.integers(len(known.stiffness), size=m)  # type: ignore[arg-type]
             drawn = Surface(**{k: getattr(known, k)[row] for k in DRAWN})
@@ -223,7 +221,7 @@ def posterior_randomization(
     """Return the randomization with the posterior in the run folder `calibration`; `center` is ignored.
 
     Raises:
-        UserError: there is no such folder, or it has no posterior draws.
+        UserError: no folder is named, it does not exist, or it contains no posterior draws.
     """
     if not calibration:
         raise UserError("dr: identified draws from a posterior; give calibration=RUN_FOLDER as well")
@@ -248,8 +246,8 @@ def with_payloads(
 ) -> Dynamics:
     """Return the dynamics of m arms, each with a random payload of [least, most] kg; None: no payload.
 
-    mass ~ U(least, most); center ~ U(ball about the end effector with half the radius that `payload_max` allows);
-    inertia of a ball of water. Gravity compensation does not include the payload.
+    The mass is uniform. The center of mass is uniform in a ball about the end effector, with half the radius that
+    `payload_max` allows. The tensor is that of a ball of water. Gravity compensation does not include the payload.
     """
     if payload is None:
         return dynamics
@@ -261,6 +259,6 @@ def with_payloads(
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:
-    """Return (...) bool: whether the tensor (..., 3, 3) is positive definite and obeys the triangle inequality."""
+    """Return whether each tensor (..., 3, 3) is positive definite and obeys the triangle inequality, (...) bool."""
     moments = np.linalg.eigvalsh(tensor)
     return (moments[..., 0] > 0) & (moments[..., 0] + moments[..., 1] >= moments[..., 2])

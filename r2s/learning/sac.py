@@ -14,11 +14,11 @@ from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class SAC(EntropyLearner):
-    """Learner of a stochastic policy with pessimistic critics.
+    """Learner of a stochastic policy; the smallest value of several critics limits overestimation.
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.
-        n_critics: number of critics; target and actor loss use the smallest of their values.
+        n_critics: number of critics; target and actor loss use the smallest value.
     """
 
     def __init__(self, scale: tuple[Tensor, Tensor], action_scale: Tensor, *, n_critics: int = 2, **shared: Any):

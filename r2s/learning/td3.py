@@ -1,7 +1,7 @@
 """Twin Delayed Deep Deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477).
 
-TD3 changes DDPG in three ways: the target uses the smaller value of two critics, the target's action has noise, and
-the actor and the target networks change only in every other update. The losses equal those of
+TD3 differs from DDPG in three ways: the target uses the smaller value of two critics, the target's action has noise,
+and only every other update changes the actor and the target networks. The losses equal those of
 `torchrl.objectives.TD3Loss` with the paper's squared error; the tests compare them.
 """
 
@@ -16,13 +16,13 @@ from r2s.learning.learner import DeterministicLearner, differentiate, polyak
 
 
 class TD3(DeterministicLearner):
-    """Learner of a deterministic policy with pessimistic critics.
+    """Learner of a deterministic policy; the smallest value of several critics limits overestimation.
 
     Args:
         scale, action_scale, shared: see `DeterministicLearner`.
-        n_critics: number of critics; the target uses the smallest of their values, the actor loss the first critic.
+        n_critics: number of critics; the target uses the smallest value, the actor loss uses the first critic.
         smoothing_std, smoothing_clip: standard deviation and limit of the noise on the action in the target.
-        policy_delay: critic updates per update of the actor and of the target networks.
+        policy_delay: number of critic updates per update of the actor and the target networks.
     """
 
     last_actor_loss: Tensor
@@ -57,16 +57,16 @@ class TD3(DeterministicLearner):
         return {"loss_critic": self._critic_loss(batch, noise), "loss_actor": self._actor_loss(batch)}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step; return the losses, with the previous actor loss if this update has none."""
+        """Do one gradient step; return the losses. Without an actor update, the actor loss is the previous one."""
         critics, actor = list(self.critics.parameters()), list(self.actor.parameters())
         out, gradients = self._critic_gradients(batch, torch.randn_like(batch["action"]))
-        due = self.updates % self.policy_delay == 0  # also in the first update: every logged row has an actor loss
+        due = self.updates % self.policy_delay == 0  # true in the first update, so every logged row has an actor loss
         if due:
             if self.action_scale.is_cuda and "_actor_gradients" in vars(self):
-                # compiled for a GPU, each method is a captured graph; the second overwrites outputs of the first
+                # compiled for a GPU, each method is a CUDA graph; the second graph overwrites outputs of the first
                 out, gradients = {k: v.clone() for k, v in out.items()}, [g.clone() for g in gradients]
             more, of_actor = self._actor_gradients(batch)
-            self.last_actor_loss = more["loss_actor"].clone()  # a captured graph overwrites its outputs
+            self.last_actor_loss = more["loss_actor"].clone()  # a CUDA graph overwrites its outputs
             self.descend(out | more, [*critics, *actor], [*gradients, *of_actor])
             polyak(self.targets, self.critics, self.tau)
             polyak(self.target_actor, self.actor, self.tau)

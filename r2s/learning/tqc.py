@@ -19,7 +19,7 @@ class TQC(EntropyLearner):
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.
-        n_critics, n_quantiles: numbers of critics, of atoms per critic. drop_per_critic: omitted atoms per critic.
+        n_critics: number of critics. n_quantiles: atoms per critic. drop_per_critic: omitted atoms per critic.
     """
 
     def __init__(
@@ -55,13 +55,13 @@ class TQC(EntropyLearner):
 
 
 def quantile_huber(quantiles: Tensor, target: Tensor) -> Tensor:
-    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): mean over pairs, summed over critics.
+    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): the sum of the critics' mean losses.
 
-    A pair with difference delta = target - quantile costs |tau - [delta < 0]| huber(delta). tau is the fraction of
-    the quantile, huber(delta) is delta^2 / 2 within 1 and |delta| - 1/2 beyond.
+    A quantile and a target atom have the loss |tau - [delta < 0]| huber(delta). Here delta is target minus quantile,
+    and tau is the quantile's probability. huber(delta) is delta^2 / 2 for |delta| <= 1, otherwise |delta| - 1/2.
 
     Args:
-        quantiles: (C, B, N). target: (B, M).
+        quantiles: (C, B, N), N quantiles of C critics. target: (B, M), M target atoms.
     """
     n = quantiles.shape[-1]
     tau = ((torch.arange(n, device=quantiles.device) + 0.5) / n)[:, None]

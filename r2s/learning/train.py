@@ -1,13 +1,13 @@
 """The training loop of all algorithms: act, step all arms, store, update, evaluate at intervals.
 
-The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows the spent share.
-With env_steps alone, runs with equal seeds and numbers of threads are equal bit for bit, even if stopped and resumed.
-With minutes, the curriculum depends on the clock.
+The budget limits wall-clock minutes, environment steps, or both; its spent share sets the curriculum. With only
+env_steps, runs with equal seeds and numbers of threads are equal bit for bit, even if stopped and resumed. With
+minutes, the curriculum depends on the clock.
 
-The arms step in their own thread while the learner updates, so updates use the transitions before this step. On
-one core, step and updates alternate with the same result. One shared team of OpenMP threads would be slower for both:
-after an update these threads spin for milliseconds on the cores that the physics then needs, and on a busy machine
-each of their barriers waits for a thread that the system has suspended.
+The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
+one core, steps and updates alternate, with the same result. OpenMP threads shared by both would make both slower.
+After an update, OpenMP threads spin for milliseconds on the cores that the physics needs, and on a busy machine each
+OpenMP barrier waits for a thread that the system has suspended.
 """
 
 import copy
@@ -37,10 +37,10 @@ LOG_UPDATES = 1000  # updates between two rows of metrics.csv
 
 @dataclass(frozen=True)
 class Budget:
-    """The length of a training: minutes of wall clock or env_steps, whichever ends first.
+    """The length of a training: it ends after `minutes` of wall-clock time or `env_steps`, whichever is first.
 
     Raises:
-        UserError: neither minutes nor env_steps is given, or a value is not positive.
+        UserError: neither minutes nor env_steps is set, or a value is not positive.
     """
 
     minutes: float | None
@@ -55,7 +55,7 @@ class Budget:
                 check_number(f"budget.{name}", value, "(0, inf)")
 
     def spent(self, seconds: float, env_steps: int) -> float:
-        """Return the spent share of the budget; the training ends at 1."""
+        """Return the share of the budget that the training has used; the training ends at 1."""
         time_share = seconds / (60.0 * self.minutes) if self.minutes else 0.0
         step_share = env_steps / self.env_steps if self.env_steps else 0.0
         return max(time_share, step_share)
@@ -68,14 +68,14 @@ class Loop:
     Attributes:
         batch_size: transitions per update. updates_per_step: updates per step of all arms.
         learning_starts: environment steps before the first update, with actions of the demonstrator or random ones.
-        replay_size: capacity of the replay buffer.
-        lr_decay, lr_end: from the share lr_decay of the budget on, the learning rate falls linearly to lr_end times
-            its initial value.
-        explore_end: factor to which the standard deviation of exploration falls geometrically over the budget.
+        replay_size: capacity of the replay buffer in transitions.
+        lr_decay, lr_end: after the share lr_decay of the budget, the learning rate falls linearly to lr_end times its
+            initial value.
+        explore_end: ratio of final to initial exploration noise, which falls geometrically over the budget.
         eval_env_steps: environment steps between two evaluations; a training ends with one more evaluation.
-        compile: compile the losses first, within the budget. concurrent: step the arms in their own thread.
-        matmul: precision of matrix products in updates, see torch.set_float32_matmul_precision. "medium" rounds their
-            factors to bfloat16 if the processor has instructions for it; "auto": see `fastest_matmul`.
+        compile: compile the losses first, within the budget. concurrent: step the arms in a separate thread.
+        matmul: precision of float32 matrix products in updates, as in torch.set_float32_matmul_precision: "medium"
+            allows bfloat16 factors; "auto" selects the precision by `fastest_matmul`.
 
     Raises:
         UserError: a value is out of range.
@@ -108,7 +108,7 @@ class Loop:
             raise UserError(f"matmul: expected auto, medium, high or highest, got {self.matmul!r}")
 
     def lr_share(self, spent: float) -> float:
-        """Return the factor of the learning rate when this share of the budget is spent."""
+        """Return the learning rate, relative to its initial value, after the share `spent` of the budget."""
         return 1.0 - (1.0 - self.lr_end) * max(0.0, spent - self.lr_decay) / max(1.0 - self.lr_decay, 1e-9)
 
 
@@ -143,9 +143,9 @@ def train(
         env: arms, task and reward.
         algo: a learner, for example r2s.learning.tqc.TQC.
         evaluate: policy -> Episodes, see r2s/learning/evaluate.py.
-        loop, budget: settings.
+        loop, budget: settings of the loop, and length of the training.
         demonstrator: acts in the first loop.learning_starts environment steps; None: uniform random actions.
-        checkpoint: written after every evaluation; if its file exists, the training continues from it.
+        checkpoint: where to save the training after every evaluation; a saved training continues.
         callbacks: functions for logs and progress.
 
     Raises:
@@ -168,7 +168,7 @@ def train(
         if run.updates % LOG_UPDATES < loop.updates_per_step or run.updates == loop.updates_per_step:
             callbacks.log(run.metrics(losses))
         if run.env_steps >= run.next_eval:
-            while run.next_eval <= run.env_steps:  # if several are due after the first, random steps, one is enough
+            while run.next_eval <= run.env_steps:  # one evaluation, even if several are due after the random steps
                 run.next_eval += loop.eval_env_steps
             callbacks.evaluated(run.evaluate())
             if checkpoint:
@@ -178,11 +178,11 @@ def train(
 
 
 class Training:
-    """The state of a training: arms, learner, replay buffer and counters; arguments as in `train`.
+    """The state of a training: arms, learner, replay buffer and counters; the arguments are those of `train`.
 
     Attributes:
-        env_steps, updates: counters. next_eval: value of env_steps from which the next evaluation is due.
-        factor: last result of `Reward.adapt`, `Reward.factor` at first. evaluation: the last row of evaluations.csv.
+        env_steps, updates: counters. next_eval: value of env_steps at which the next evaluation is due.
+        factor: `Reward.factor`, then the last result of `Reward.adapt`. evaluation: last row of evaluations.csv.
     """
 
     def __init__(
@@ -211,12 +211,12 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time of the training, s, including the runs before a resume."""
+        """Wall-clock time of the training, s, including the time before it was resumed."""
         return time.perf_counter() - self._began
 
     @contextmanager
     def step(self, spent: float) -> Iterator[None]:
-        """Step all arms while the block runs, then store the transitions; `spent`: spent share of the budget."""
+        """Step all arms while the `with` block runs, then store their transitions; spent: spent share of budget."""
         env, state = self._env, self._state
         state["action"] = self._action(state["observation"])
         with self._dated_errors():
@@ -231,7 +231,7 @@ class Training:
         self.env_steps += env.nsim
 
     def _action(self, observation: Tensor) -> Tensor:
-        """Return the actions (nsim, a) for the next step: exploratory, of the demonstrator, or random."""
+        """Return the actions (nsim, a) for the next step: of the learner, of the demonstrator, or random actions."""
         if self.env_steps >= self._loop.learning_starts:
             return self._algo.explore(observation.to(self._device)).cpu()
         return self._demonstrator.action(observation) if self._demonstrator else self._env.action_spec.rand()
@@ -247,7 +247,7 @@ class Training:
         return losses
 
     def metrics(self, losses: dict[str, torch.Tensor]) -> dict[str, float]:
-        """Return a row of metrics.csv; it averages the reward terms over the steps since the last row."""
+        """Return a row of metrics.csv, with reward terms averaged over the steps since the previous row."""
         names, means = self._env.reward.terms(self._env.task), np.mean(self._terms, axis=0)
         self._terms = []
         row = {"env_steps": self.env_steps, "updates": self.updates, "wall_clock_s": self.seconds}
@@ -276,7 +276,7 @@ class Training:
         checkpoint.save(state, self._replay)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint, if there is one."""
+        """Restore the state of a checkpoint; without a saved checkpoint, do nothing."""
         saved = checkpoint.load(self._replay)
         if saved is None:
             return
@@ -291,7 +291,7 @@ class Training:
 
     @contextmanager
     def _dated_errors(self, when: str = "") -> Iterator[None]:
-        """Add the env steps so far to the message of a FloatingPointError that the block raises."""
+        """Add the number of env steps to the message of a FloatingPointError that the `with` block raises."""
         try:
             yield
         except FloatingPointError as error:
@@ -319,20 +319,20 @@ def set_generators(states: Mapping[str, Any], device: torch.device) -> None:
 
 
 def keep_memory() -> None:
-    """Make glibc keep freed memory: otherwise glibc returns large blocks, and updates must page them in."""
+    """Set glibc to reuse freed memory; by default it returns large blocks to the system, which slows every update."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
         libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     except (OSError, AttributeError):
-        pass  # another C library: updates are only slower
+        pass  # another C library: updates are slower, with the same result
 
 
 def fastest_matmul(device: torch.device) -> str:
     """Return the precision for the fastest updates: "medium" (bfloat16) if the device has bfloat16 units.
 
-    With AVX-512 alone, for networks of 128 to 256 units, rounding the factors costs as much time as the faster
-    products save (benchmarks/results/speed.md).
+    A CPU with AVX-512 but without bfloat16 units saves no time with networks of 128 to 256 units, because rounding
+    the factors takes as long as the faster products save (benchmarks/results/speed.md).
     """
     units = device.type == "cuda" or torch.cpu.get_capabilities().get("amx_bf16", False)
     return "medium" if units else "highest"
@@ -340,7 +340,7 @@ def fastest_matmul(device: torch.device) -> str:
 
 @contextmanager
 def matmul_precision(precision: str) -> Iterator[None]:
-    """Set the precision of float32 matrix products in the block; outside, such as in policies, it is "highest"."""
+    """Set the precision of float32 matrix products in a `with` block; elsewhere the precision is "highest"."""
     torch.set_float32_matmul_precision(precision)
     try:
         yield
@@ -349,21 +349,21 @@ def matmul_precision(precision: str) -> Iterator[None]:
 
 
 def _tensors(node: Any) -> Any:
-    """Return nested dicts with tensors instead of arrays, because torch loads tensors without pickle."""
+    """Convert the arrays in nested dicts to tensors, which torch loads without pickle."""
     if isinstance(node, dict):
         return {k: _tensors(v) for k, v in node.items()}
     return torch.from_numpy(np.ascontiguousarray(node)) if isinstance(node, np.ndarray) else node
 
 
 def _arrays(node: Any) -> Any:
-    """Return nested dicts with arrays instead of tensors."""
+    """Convert the tensors in nested dicts to arrays."""
     if isinstance(node, dict):
         return {k: _arrays(v) for k, v in node.items()}
     return node.numpy() if isinstance(node, torch.Tensor) else node
 
 
 def _transition(step) -> dict[str, Tensor]:
-    """Return the part of a step that updates use."""
+    """Return the transitions of a step: the values that the replay buffer stores and an update needs."""
     after = step["next"]
     return {
         "observation": step["observation"],

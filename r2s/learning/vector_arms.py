@@ -16,20 +16,20 @@ NOISES = "_sigma", "_noise", "_pose_noise"
 
 
 class VectorArms:
-    """`width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
+    """Simulate `width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
-    Every ms of a control period: command -> control law -> soft start, low-pass, clip, rate limit -> safety filter ->
-    delay and lag -> physics. Kinematics follow afterwards. A `State` has true speeds and, separately, sensor noise.
+    Stages in every ms of a control period: control law, soft start, low-pass, clip, rate limit, safety filter, delay
+    and lag, physics. Kinematics follow after the period. A `State` has true speeds and, separately, sensor noise.
 
     Attributes:
-        speeds: None, because true speeds need no smoothing.
+        speeds: None, because simulated speeds are exact, without noise to smooth out.
 
     Args:
         robot, task: the arm, and the task with its controller.
         dynamics: dynamics of `width` arms, or of one arm for all arms.
-        nthread: threads, 0: all cores.
-        soft_start_s: s, fade-in of an episode's torque.
-        seed: seed of the sensor noise, which restarts whenever all arms are placed.
+        nthread: number of threads; 0: all cores.
+        soft_start_s: s, time over which the torque of an episode fades in.
+        seed: seed of the sensor noise; the noise restarts whenever all arms are placed.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class VectorArms:
         self.sim.drive(filter_limits(robot, torque), torque, task.cutoff_hz, soft_start_s, task.push_limit)
         self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
         self.speeds = None
-        self._limited = np.zeros(width)  # limited cycles before the last step
+        self._limited = np.zeros(width)  # number of limited cycles before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
         self.seed(seed)
         self._sigma, self._noise = np.zeros((2, width, robot.n))
@@ -88,7 +88,7 @@ class VectorArms:
         self._seed, self._rng = seed, np.random.default_rng(seed)
 
     def _sense(self, at: np.ndarray | slice = ALL) -> None:
-        """Draw the sensor noise of these arms for the current state."""
+        """Draw the sensor noise of the arms `at` for the current state."""
         if self._sigma.any():
             sigma = self._sigma[at]
             self._noise[at] = sigma * self._rng.standard_normal(sigma.shape)
@@ -121,7 +121,7 @@ class VectorArms:
         return self.read()
 
     def end(self) -> np.ndarray:
-        """Return (width,) False: simulated arms do not stop."""
+        """Return whether each arm has stopped, (width,) bool: always False, because simulated arms do not stop."""
         return self._stopped
 
     def state(self) -> dict:

@@ -1,1 +1,1 @@
-"""The arm and its physics: links, friction, limits, and the simulator of many arms at once."""
+"""The arm and its physics: links, friction, limits, and a simulator for many arms at once."""

@@ -1,7 +1,7 @@
-"""The torque path, one millisecond at a time: soft start, low-pass, clip and rate limit, and the delay of the motors.
+"""The path from target torque to joint torque, in steps of 1 ms: soft start, low-pass, clip, rate limit, motor delay.
 
 Training, evaluation and hardware share this code, so a policy has the same latency on the arm as in simulation. The
-safety filter (safety_filter.py) acts between rate limit and delay: in training inside the physics step
+safety filter (safety_filter.py) acts between rate limit and delay: in a simulation within the physics step
 (mujoco_callback.py), on an arm in r2s/arm/driver.py.
 """
 
@@ -23,8 +23,8 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
     """Return one joint's low-pass state and effort, Nm, after one cycle: soft start, low-pass, clip, rate limit.
 
     Args:
-        target: Nm, in this cycle. filtered, effort: Nm, of the previous cycle. cycle: number of this cycle, from 1.
-        factor: gain of the low-pass. fade: duration of the soft start, cycles.
+        target: Nm, target torque. filtered, effort: Nm, of the previous cycle. cycle: current cycle, from 1.
+        factor: gain of the low-pass. fade: duration of the soft start in cycles.
         tau_max: Nm, largest effort. step_max: Nm, largest change of the effort per cycle.
     """
     faded = target
@@ -41,7 +41,7 @@ def condition(target, state, settings, nstep, out):
     """Apply `condition_joint` to m arms; write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`.
 
     Args:
-        target: (m, n) Nm. state: low-pass state (m, n) Nm, effort (m, n) Nm and cycle count (m,), updated here.
+        target: (m, n) Nm. state: low-pass state (m, n) Nm, effort (m, n) Nm, cycle count (m,); all are updated.
         settings: factor, fade, tau_max (n,) Nm and step_max (n,) Nm per cycle of `condition_joint`.
     """
     filtered, effort, cycle = state
@@ -57,14 +57,14 @@ def condition(target, state, settings, nstep, out):
 
 
 class Actuation:
-    """Soft start, low-pass, clip and rate limit of the target torques of m arms.
+    """Convert the target torques of m arms to efforts, by soft start, low-pass, clip and rate limit.
 
     Attributes:
-        last: (m, n) Nm, the effort, after all four stages. filtered: (m, n) Nm, after the low-pass.
+        last: (m, n) Nm, last effort. filtered: (m, n) Nm, state of the low-pass.
 
     Args:
-        robot: sets torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
-        soft_start_s: s, time over which the torque of a motion fades in; 0: no fade.
+        robot: the arm with its torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
+        soft_start_s: s, time over which the torque of a motion fades in; 0: no soft start.
     """
 
     def __init__(self, robot: Robot, m: int, *, cutoff_hz: float, soft_start_s: float = 0.0):
@@ -75,7 +75,7 @@ class Actuation:
         self._tau_max, self._step_max = robot.tau_max, robot.step_max
 
     def reset(self, ids: np.ndarray | None = None) -> None:
-        """Start the arms `ids` (all by default) from zero torque."""
+        """Reset the arms `ids` (all by default) to zero torque."""
         at = slice(None) if ids is None else ids
         for array in (self.filtered, self.last, self._cycle):
             array[at] = 0
@@ -90,22 +90,22 @@ class Actuation:
 
 
 MAX_DELAY = 0.02  # s, longest pure delay of the model
-# Steps by which a semi-implicit simulation responds too early: there q(k+1) - 2 q(k) + q(k-1) = h^2 a(k), whereas on
-# an arm the torques of steps k - 1 and k contribute half each.
+# Number of steps by which a semi-implicit simulation responds too early: in it, q(k+1) - 2 q(k) + q(k-1) = h^2 a(k),
+# whereas on an arm the torques of steps k - 1 and k contribute half each.
 EARLY = 0.5
-SLOTS = int(MAX_DELAY / SIM_DT) + 3  # commands in the delay line
+SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 
 
 @njit(cache=True)
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    A command that arrives within a step acts for the rest of that step. The lag obeys dm/dt = (u - m) / lag; the
-    mean torque over a time s, from the state m, is u + (m - u) (1 - exp(-s / lag)) lag / s.
+    A command that arrives during a step acts for the rest of the step. The motor torque m follows the command u with
+    dm/dt = (u - m) / lag, so its mean over a time s is u + (m - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
-        line: (SLOTS, n) Nm, the command of cycle k in row k % SLOTS. motor: (n,) Nm, state of the lag.
-        cycle: number of the newest command, at least SLOTS. delay, lag: steps.
+        line: (SLOTS, n) Nm, recent commands: that of cycle k is in row k % SLOTS. motor: (n,) Nm, motor torque.
+        cycle: number of the newest command, at least SLOTS. delay, lag: in steps.
     """
     whole = int(delay)
     late = delay - whole
@@ -122,7 +122,7 @@ def motor_torque(line, motor, cycle, delay, lag, out):
 
 @njit(cache=True)
 def delayed(tau, delay, lag, steps, line, motor, cycle, out):
-    """Write each arm's mean torque per step for commands that are delayed by `delay` and lagged by `lag` steps."""
+    """Write each arm's mean torque per step for commands that pass a delay and a lag, both in steps."""
     for i in range(tau.shape[0]):
         for k in range(steps):
             line[i, cycle[i] % SLOTS] = tau[i, k]
@@ -131,16 +131,16 @@ def delayed(tau, delay, lag, steps, line, motor, cycle, out):
 
 
 def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Convert delay and lag from s to steps for `motor_torque`; the delay is at most MAX_DELAY, plus EARLY."""
+    """Convert delay and lag from s to steps for `motor_torque`; limit the delay to MAX_DELAY, then add EARLY."""
     steps = np.clip(np.asarray(delay) / SIM_DT, 0.0, MAX_DELAY / SIM_DT) + EARLY
     return steps, np.asarray(lag) / SIM_DT
 
 
 class Motors:
-    """Delay and lag between the commands and the joint torques of m simulated arms.
+    """Convert the commands of m simulated arms to joint torques, by a pure delay and then a first-order lag.
 
-    They are a pure delay, then a first-order lag, as on an arm in continuous time. The simulation responds half a
-    step early (EARLY); this class compensates for it.
+    Delay and lag act in continuous time, as on an arm. The simulation responds half a step too early (EARLY), so this
+    class delays torques by another half step.
     """
 
     def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):
@@ -161,7 +161,7 @@ class Motors:
         self._line[at] = np.asarray(tau)[..., None, :] if np.ndim(tau) else tau
 
     def __call__(self, tau: np.ndarray) -> np.ndarray:
-        """Return (m, nstep, n) Nm at the joints for commands (m, nstep, n) Nm, one per ms."""
+        """Return the joint torques (m, nstep, n) Nm for the commands (m, nstep, n) Nm, one per ms."""
         out = np.empty(tau.shape)
         delayed(tau, self._delay, self._lag, tau.shape[1], self._line, self._motor, self._cycle, out)
         return out

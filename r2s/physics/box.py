@@ -11,11 +11,11 @@ from r2s.physics.surface import Surface
 from r2s.physics.tip import default_plane, nominal_plane
 
 SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; the tip pushes below the hand
-PUSHED_AT = 0.4  # share of the box's height, at which the tip pushes
+PUSHED_AT = 0.4  # height at which the tip pushes, as a share of the box's height
 SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal place, to either side
-FORWARD = 0.25  # share of the end effector's distance from the base at home, by which the nominal place lies ahead
+FORWARD = 0.25  # offset of the nominal place ahead of the tip at home, over the tip's distance from the base
 # Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
-# from a carton on a smooth table to a block of wood on a dry one
+# from a carton on a smooth table to a block of wood on a dry table
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)
 STIFFNESS, DAMPING, BRISTLE = (5e3, 1e5), (0.5, 3.0), (1e-4, 3e-4)
 EXPECTED = {"mass": 0.8, "table": 0.35, "friction": 0.3, "stiffness": 2.5e4, "damping": 1.5, "bristle": 2e-4}
@@ -23,37 +23,37 @@ EXPECTED = {"mass": 0.8, "table": 0.35, "friction": 0.3, "stiffness": 2.5e4, "da
 
 @dataclass(frozen=True)
 class TableFrame:
-    """A frame on a table.
+    """A coordinate frame on a table, at the nominal place of a box.
 
     Attributes:
-        origin: (3,) m, nominal place of a box's base. axes: (3, 3), rows: ahead (away from the base), left, up.
+        origin: (3,) m, origin in the base frame. axes: (3, 3), axes in rows: ahead (away from the arm), left, up.
     """
 
     origin: np.ndarray
     axes: np.ndarray
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Transform points (..., 3) m from the base frame to this frame."""
+        """Transform points (..., 3) m from the base frame to the table frame."""
         return (points - self.origin) @ self.axes.T
 
     def outside(self, points: np.ndarray) -> np.ndarray:
-        """Transform points (..., 3) m from this frame to the base frame."""
+        """Transform points (..., 3) m from the table frame to the base frame."""
         return self.origin + points @ self.axes
 
     def planar(self, pose: np.ndarray) -> np.ndarray:
-        """Return x m, y m and yaw rad (..., 3) of a box from its pose (..., 6): centre, m, and first axis."""
+        """Return x m, y m and yaw rad (..., 3) of a box from its pose (..., 6): center, m, and first axis."""
         x = self.inside(pose[..., :3])
         first = pose[..., 3:] @ self.axes.T
         return np.concatenate([x[..., :2], np.arctan2(first[..., 1:2], first[..., :1])], axis=-1)
 
     def pose(self, planar: np.ndarray, height: float) -> np.ndarray:
-        """Return the pose (..., 6) of a box from x, y and yaw (..., 3) and the height of its centre, m."""
+        """Return the pose (..., 6) of a box from x, y and yaw (..., 3) and the height of its center, m."""
         x, y, yaw = np.moveaxis(planar, -1, 0)
         centre = self.outside(np.stack([x, y, np.full_like(x, height)], axis=-1))
         return np.concatenate([centre, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1) @ self.axes], axis=-1)
 
     def moved(self, pose: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Return poses (m, 6), displaced by `by` (m, 3): x m, y m and yaw rad in this frame."""
+        """Displace poses (m, 6) of a box by `by` (m, 3): x m, y m and yaw rad in the table frame."""
         c, s = np.cos(by[:, 2:]), np.sin(by[:, 2:])
         first, up = pose[:, 3:], self.axes[2]
         turned = c * first + s * np.cross(up, first)  # `first` is perpendicular to `up`
@@ -75,7 +75,7 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
     """Return boxes that stand on a table.
 
     Args:
-        frame: frame of the table. planar: (..., 3), x m, y m, yaw rad in this frame. size: (3,) m, edges.
+        frame: table frame. planar: (..., 3), x m, y m and yaw rad of the box in it. size: (3,) m, edges.
         law: mass, table, friction, stiffness, damping, bristle and exponent of `Surface`.
     """
     half = 0.5 * np.array(size, dtype=float)
@@ -86,9 +86,9 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
 
 
 def check_size(name: str, size: Any, table: float) -> np.ndarray:
-    """Return the edges (3,) m of a box; raise UserError unless a push at PUSHED_AT moves it without a tilt.
+    """Return the edges (3,) m of a box; raise UserError if a push at PUSHED_AT of its height tilts it.
 
-    A push at the height h that overcomes the friction mu m g tilts a box of half edge a if mu h > a.
+    A push at the height h must overcome the table friction mu m g, so it tilts a box with half edge a if mu h > a.
     """
     if not isinstance(size, list | tuple | np.ndarray) or len(size) != 3:
         raise UserError(f"{name}: expected three edges in m, got {size!r}")

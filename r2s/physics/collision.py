@@ -1,12 +1,12 @@
-"""Compiled collision check of many arms with themselves and the table.
+"""Compiled collision check of many arms: each arm with itself, the table and obstacles.
 
-The bodies are the geoms of the robot's file. If the file lets some geoms collide, the others are visual and ignored.
-Planes and height fields are ignored as surroundings. Meshes are replaced by their convex hulls, as in MuJoCo,
-and signed distance fields by their bounding spheres. These pairs are not checked:
+r2s checks the geoms of the robot's file, without planes and height fields. If the file enables collision for some
+geoms, r2s ignores the others. As in MuJoCo, convex hulls replace meshes. Bounding spheres replace signed distance
+fields. The check omits two kinds of pairs:
 
-- with the table: geoms of the base, and of links that only vertical joints move; their height never changes.
-- of two links: neighbours, which touch at their joint, and geoms closer than HOUSING_M at q_home. The latter are
-  parts of one joint's housing that belong to links two apart, as in the Panda's shoulder.
+- A geom and the table, if only vertical joints or no joints move the geom, because its height never changes.
+- Geoms of neighboring links, which touch at their joint, and geoms closer than HOUSING_M at q_home. Such close geoms
+  are parts of one joint's housing on links two joints apart, as in the Panda's shoulder.
 """
 
 from collections.abc import Collection
@@ -27,16 +27,16 @@ from r2s.physics.robot import Robot
 
 TABLE_M = 0.0  # m, default height of the table in the base frame
 HOUSING_M = 0.045  # m, geoms closer than this at q_home are parts of one joint's housing
-LINK, LOCAL, WIDTH = BODY, BODY + 1, BODY + 1 + POSE  # columns of a body: link (-1: the base), pose in the link
+LINK, LOCAL, WIDTH = BODY, BODY + 1, BODY + 1 + POSE  # columns of a body: link (-1: base), pose in the link's frame
 
 
 @dataclass(frozen=True)
 class CollisionPairs:
-    """The pairs of a model's geoms to check.
+    """The pairs of geoms that the collision check compares.
 
     Attributes:
-        above: geoms to keep above the table. pairs: pairs of geoms to keep apart, obstacles first.
-        link: (ngeom,) number of the joint that moves each geom, from 1; 0: the base.
+        above: geoms to check against the table. pairs: pairs of geoms; pairs with an obstacle come first.
+        link: (ngeom,) number of each geom's link, from 1; 0: the base.
     """
 
     above: list[int]
@@ -47,9 +47,9 @@ class CollisionPairs:
 def collision_pairs(
     robot: Robot, model: mujoco.MjModel, *, table: bool = True, may_touch: Collection[tuple[str, str]] = ()
 ) -> CollisionPairs:
-    """Return the pairs of `robot.model` to check; table: whether to check geoms against the table.
+    """Return the pairs of geoms to check; table: whether to check geoms against the table.
 
-    may_touch: pairs of body names, or of a body name and "table", that are not checked.
+    may_touch: pairs of body names, or of a body name and "table", to omit.
     """
     link = np.searchsorted(model.jnt_bodyid, model.body_weldid[model.geom_bodyid], side="right")
     box = np.array([model.geom(g).name.startswith(PREFIX) for g in range(model.ngeom)], dtype=bool)
@@ -78,7 +78,7 @@ def collision_pairs(
 
 
 def link_name(model: mujoco.MjModel, geom: int) -> str:
-    """Return "link 'hand'" for a geom of the body hand, "obstacle 1" for the first obstacle."""
+    """Return the name of a geom's body for messages: "link 'hand'" or, for an obstacle, "obstacle 1"."""
     if model.geom(geom).name.startswith(PREFIX):
         return str(model.geom(geom).name)
     body = model.geom_bodyid[geom]
@@ -86,7 +86,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Geometry: bodies (G, WIDTH), hull vertices (V, 3), body rows of `above` (A,), `pairs` (P, 2), table m."""
+    """Geometry for the compiled check: bodies, hull vertices, rows of bodies to check, and the table's height, m."""
 
     bodies: np.ndarray
     vertices: np.ndarray
@@ -96,20 +96,20 @@ class Scene(NamedTuple):
 
 
 class CollisionCheck:
-    """Collision check of many arms; called with q (m, n) rad, it returns (m,) bool.
+    """Collision check of many arms: a call with q (m, n) rad returns whether each arm collides, (m,) bool.
 
     Attributes:
-        names: the checked pairs, such as "link 'link5' and link 'link1'", in the order of `first_contact`.
-        links, scene: arguments of the compiled functions below.
+        names: names of the checked pairs, such as "link 'link5' and link 'link1'", in the order of the check.
+        links, scene: arrays for the compiled functions `body_poses` and `pair_distance`.
 
     Args:
-        robot: the arm with the geoms of its file.
-        table: m, height of the table in the base frame; -inf: no table. None: TABLE_M, or no table if the arm at
-            q_home reaches below TABLE_M, as a hanging arm does.
-        may_touch: pairs of body names, or of a body name and "table", that are not checked.
+        robot: the arm; its file contains the geoms.
+        table: m, height of the table in the base frame; -inf: no table. None: TABLE_M, but no table for an arm that
+            reaches below TABLE_M at q_home, such as a hanging arm.
+        may_touch: pairs of body names, or of a body name and "table", to omit.
 
     Raises:
-        UserError: a pair touches at q_home.
+        UserError: a checked pair touches at q_home.
     """
 
     def __init__(
@@ -139,11 +139,11 @@ class CollisionCheck:
             raise UserError(f"{robot.name}: {self.names[at_home]} at {table:g} m touch at robot.q_home")
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        """Return whether each arm at q (m, n) rad collides, (m,)."""
+        """Return whether each arm at q (m, n) rad collides, (m,) bool."""
         return self.first_contact(q) >= 0
 
     def first_contact(self, q: np.ndarray) -> np.ndarray:
-        """Return the index (m,) in `names` of the first colliding pair of each arm, -1 for none."""
+        """Return the index (m,) in `names` of each arm's first colliding pair; -1: no collision."""
         q = np.ascontiguousarray(q, dtype=float)
         out = np.empty(len(q), dtype=np.int64)
         _first_contacts(q, self.links, self.scene, out)
@@ -158,7 +158,7 @@ class CollisionCheck:
 
 
 def empty_scene() -> Scene:
-    """Return a scene without pairs."""
+    """Return a scene without bodies and pairs, in which no arm collides."""
     none = np.zeros((0, 2), dtype=int)
     return Scene(np.zeros((0, WIDTH)), np.zeros((0, 3)), np.zeros(0, dtype=int), none, -np.inf)
 
@@ -166,7 +166,7 @@ def empty_scene() -> Scene:
 def _bodies(
     robot: Robot, model: mujoco.MjModel, geoms: list[int], link: np.ndarray, links: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows (G, WIDTH) of these geoms and the vertices (V, 3) of their hulls."""
+    """Return the geoms as rows of `Scene.bodies` (G, WIDTH), and the vertices (V, 3) of their convex hulls."""
     data = mujoco.MjData(model)
     data.qpos[:] = np.zeros(robot.n)
     mujoco.mj_kinematics(model, data)
@@ -189,7 +189,7 @@ def _bodies(
 
 
 def _shape(model: mujoco.MjModel, g: int) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Return kind, radius, half sizes (3,) and hull (V, 3) of a geom."""
+    """Return a geom's kind, radius m, half sizes (3,) m and convex hull (V, 3) m."""
     size, kind, none = model.geom_size[g], mujoco.mjtGeom, np.zeros((0, 3))
     match model.geom_type[g]:
         case kind.mjGEOM_SPHERE:
@@ -215,7 +215,7 @@ def _shape(model: mujoco.MjModel, g: int) -> tuple[int, float, np.ndarray, np.nd
 
 @njit(cache=True, error_model="numpy")
 def body_poses(links, bodies, q, frames, poses):
-    """Write the pose (G, POSE) of each body at q (n,) rad; frames: (n, POSE), any content."""
+    """Write each body's pose (G, POSE) at q (n,) rad; frames: (n, POSE), work array."""
     link_frames(links, q, frames, np.empty((len(links), 3)))
     for g in range(len(bodies)):
         body, link = bodies[g], int(bodies[g, LINK])
@@ -231,7 +231,7 @@ def body_poses(links, bodies, q, frames, poses):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
-    """Return the distance of pair k, m, or a lower bound if it is above `enough` m; work: (10, 3), any content."""
+    """Return the distance, m, of pair k, or a lower bound if this exceeds `enough` m; work: (10, 3), work array."""
     bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]

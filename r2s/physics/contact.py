@@ -1,19 +1,19 @@
 """Contact of a tool's tip with a surface in one step of 1 ms, implicit in stiffness, damping and friction.
 
-Normal force: the law of Hunt and Crossley (surface.py), averaged over the tip's path in the step. The mean of K d^e
-is (V(d1) - V(d0)) / (d1 - d0) with its potential V. This discrete gradient (Gonzalez, J. Nonlinear Science 6, 1996)
-conserves the energy of a bounce at any stiffness, even if the tip touches or lifts within the step. In a
+Normal force: the law of Hunt and Crossley (surface.py), averaged over the tip's path in a step. The mean of K d^e is
+(V(d1) - V(d0)) / (d1 - d0), where V is the potential of K d^e. This discrete gradient (Gonzalez, J. Nonlinear Science
+6, 1996) conserves the energy of a bounce at any stiffness, even if the tip touches or lifts within the step. After a
 semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions. So the path begins at depth d0 =
-d - h rate / 2 and ends at d1 = d0 + h (rate + rate1) / 2, with the penetration rates before and after the step.
+d - h rate / 2 and ends at d1 = d0 + h (rate + rate1) / 2, for penetration rates rate and rate1 before and after it.
 
-Tangential force: bristles whose stiffness is proportional to the normal force F (Canudas de Wit et al., IEEE TAC
-40(3), 1995). With z_s = `bristle`, the deflection z follows dz/dt = v - |v| z / z_s, in backward Euler. The force
+Tangential force: bristles have a stiffness proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
+1995). The deflection z follows dz/dt = v - |v| z / z_s, in backward Euler; z_s is `bristle`. The friction force
 -mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; in sliding it is mu F.
 
-The unknowns are the joint velocities at the end of the step. Both forces are linearized in them about a guess: the
-constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law solves this system,
-so contact forces can start a joint at rest. `start_guess` makes the first guess; `add_contact`, the solution and
-`next_guess` repeat until the guess is accurate, usually once; `finish_contact` ends the step.
+The unknowns are the joint velocities at the end of the step. Both forces are linearized about a guess of these
+velocities; the constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law
+solves this system, so contact forces can start a joint at rest. `start_guess` makes the first guess. `add_contact`,
+the solution and `next_guess` repeat until the guess is accurate, usually once. `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -58,23 +58,23 @@ from r2s.physics.sliding import contact_point_velocity, load_box, move_box, slid
 from r2s.physics.stick_slip import JointForces, coming_velocity
 from r2s.physics.surface import normal_force
 
-RIGID = 1e-6  # m, smallest `bristle`, for a rigid surface: a fiftieth of an encoder's step, seen at a tip
+RIGID = 1e-6  # m, smallest `bristle`, for a rigid surface: a fiftieth of the tip's motion per encoder step
 SLIP = 0.02  # m/s, speed above which bristle damping fades out; without fading, each reversal causes a force pulse
-MARGIN = 1e-3  # m, a tip farther away cannot touch within a step: this would take an acceleration of 2000 m/s^2
+MARGIN = 1e-3  # m, a tip farther away cannot touch within a step: it would need an acceleration of 2000 m/s^2
 FAR = 0.02  # m, a tip farther away would need 20 m/s to touch within a step
 ROUNDS = 12  # largest number of guesses in a step
-TOLERANCE = 1e-4  # relative error of the normal force at which the guesses end
-LATE = 1e-2  # allowed error of the tangential force over the normal force; a guess of load and speed causes it
-BOX_LATE = 1e-3  # allowed relative error of table friction; the guessed speed of the box causes it
-NEGLIGIBLE = 1e-6  # N
-SHORT = 1e-6  # share of the depth; on a shorter path V(d1) - V(d0) is round-off, so the force at mid-path is used
+TOLERANCE = 1e-4  # allowed relative error of the normal force after the last guess
+LATE = 1e-2  # allowed error of the tangential force over the normal force, from guessed normal force and speed
+BOX_LATE = 1e-3  # allowed relative error of table friction, from the guessed speed of the box
+NEGLIGIBLE = 1e-6  # N, force that is treated as 0
+SHORT = 1e-6  # path over depth, below which V(d1) - V(d0) is round-off and the force at mid-path replaces the mean
 
 
 @njit(cache=True, error_model="numpy")
 def mean_force(contact, begin, rate, coming, h):
-    """Return the mean normal force, N, of a step from depth `begin` m, and its derivative by `coming`, N s/m.
+    """Return a step's mean normal force, N, and its derivative with respect to `coming`, N s/m.
 
-    rate, coming: m/s, penetration rates at the beginning and end of the step.
+    begin: m, depth at the beginning. rate, coming: m/s, penetration rates at the beginning and end of the step.
     """
     middle = 0.5 * (rate + coming)
     span = h * middle
@@ -101,9 +101,9 @@ def mean_force(contact, begin, rate, coming, h):
 
 @njit(cache=True, error_model="numpy")
 def _from_box(contact, x, y, z):
-    """Return the distance, m, from a box's surface to a point at x, y, z m from the box's centre; negative inside.
+    """Return the distance, m, from a box's surface to a point at x, y, z m from the box's center; negative: inside.
 
-    It also writes the surface normal there and projects the bristle deflection onto the tangential plane.
+    Also write the surface's normal at the point, and project the bristle deflection onto the tangential plane.
     """
     axes, half, normal = contact[AXES : AXES + 9], contact[HALF : HALF + 3], contact[NORMAL : NORMAL + 3]
     square, face, least, side = 0.0, 0, -np.inf, 1.0
@@ -132,12 +132,12 @@ def _from_box(contact, x, y, z):
 def near(contact, place, anchor, axis, dq, h, jacobian):
     """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch within the step.
 
-    Call it once per step, because it also moves a box that the tip cannot touch.
+    Call `near` once per step, because it also moves a sliding box that the tip cannot touch.
 
     Args:
         contact: (COLUMNS,), updated; if the tip cannot touch, force and deflection become 0.
         place: position (3,) m and rotation (9,) of the link that carries the tool, in the base frame.
-        anchor, axis: (n, 3) m, joint anchors, and joint axes. dq: (n,) rad/s.
+        anchor, axis: (n, 3), position, m, and direction of each joint axis. dq: (n,) rad/s.
     """
     position, R = place
     rate = 0.0
@@ -181,7 +181,7 @@ def near(contact, place, anchor, axis, dq, h, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def _box_rate(contact):
-    """Return what the box's motion adds to the penetration rate, m/s."""
+    """Return the part of the penetration rate, m/s, that the box's motion causes."""
     point, rate = np.empty(3), 0.0
     contact_point_velocity(contact, contact[VELOCITY : VELOCITY + 4], point)
     for k in range(3):
@@ -191,7 +191,7 @@ def _box_rate(contact):
 
 @njit(cache=True, error_model="numpy")
 def _bristles(contact, force, speed, h):
-    """Return spring, N/m, and damper, N s/m, of the friction under a normal force, N, at a sliding speed, m/s.
+    """Return the friction's spring, N/m, and damper, N s/m, for a normal force, N, and a sliding speed, m/s.
 
     Friction is -(spring z + damper v), with deflection z at the beginning and velocity v at the end of a step.
     """
@@ -216,7 +216,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Return rate and speed, m/s, relative to a box that moves at `point` (3,) m/s in the contact; update `slide`."""
+    """Return rate and speed, m/s, relative to a box whose contact point moves at `point` (3,) m/s; update `slide`."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]
@@ -228,7 +228,7 @@ def _relative(contact, rate, slide, point):
 
 @njit(cache=True, error_model="numpy")
 def start_guess(contact, jacobian, dq, h, guess):
-    """Write the first guess (GUESS,): the joint velocities dq (n,) rad/s do not change in the step."""
+    """Write the first guess (GUESS,): after the step, the joint velocities are still dq (n,) rad/s."""
     rate, speed = _velocity(jacobian, dq, guess[SLIDE : SLIDE + 3])
     if contact[MASS] > 0.0:
         point = np.empty(3)
@@ -265,7 +265,7 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
-    """Add the contact with a box; held: N, normal force and minus tangential force (3) at unchanged box velocity."""
+    """Add the contact with a box; held: N, normal and minus tangential force (3) for a box of constant velocity."""
     n, at = contact[NORMAL : NORMAL + 3], np.empty(3)
     for k in range(3):
         at[k] = held[0] * n[k] - held[1 + k]
@@ -286,7 +286,7 @@ def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def next_guess(contact, jacobian, h, coming, guess):
-    """Set the guess to the solution `coming` (n,) rad/s; return whether the old guess was accurate enough."""
+    """Update the guess from the solution `coming` (n,) rad/s; return whether the old guess was accurate enough."""
     force, fast = guess[NORMAL_FORCE], guess[SPEED]
     rate, speed = _velocity(jacobian, coming, guess[SLID : SLID + 3])
     box_late = 0.0
@@ -311,7 +311,7 @@ def next_guess(contact, jacobian, h, coming, guess):
 
 @njit(cache=True, error_model="numpy")
 def finish_contact(contact, h, guess):
-    """Write the contact force and the bristle deflection of a solved step, and move the box."""
+    """Write the contact force and the bristle deflection after a solved step, and move the box."""
     spring, damper, force = guess[SPRING], guess[DAMPER], guess[LINEAR]
     _deflect(contact, guess[SLID : SLID + 3], guess[SPEED], h, (force, spring, damper))
     if contact[MASS] > 0.0:
@@ -320,7 +320,7 @@ def finish_contact(contact, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _deflect(contact, slide, speed, h, terms):
-    """Write the force from terms (normal force, spring, damper), and the deflection after h s at `slide` (3,) m/s."""
+    """Write the contact force and the deflection after h s; terms: normal force N, spring N/m, damper N s/m."""
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0
     z = contact[DEFLECTION : DEFLECTION + 3]
@@ -334,7 +334,7 @@ def _deflect(contact, slide, speed, h, terms):
 
 @njit(cache=True, error_model="numpy")
 def explicit_contact(contact, jacobian, dq, h):
-    """Write force and deflection of an explicit step; h must be much shorter than the contact's oscillation."""
+    """Write force and deflection for an explicit step of h s, much shorter than the contact's oscillation period."""
     tangent = np.empty(3)
     rate, speed = _velocity(jacobian, dq, tangent)
     if contact[MASS] > 0.0:
@@ -362,7 +362,7 @@ def contact_velocity(touch, mass, damping, h, forces, dq_min, work, coming):
     """Solve a step in contact: write the final velocities (n,) to `coming`, force and deflection to the contact.
 
     Args:
-        touch: contact (COLUMNS,) and Jacobian of `near`. work: (2 n + 6, n) at least, any content.
+        touch: contact (COLUMNS,) and Jacobian, as from `near`. work: work array, at least (2 n + 6, n).
         mass, damping, h, forces, dq_min, coming: as for `coming_velocity`.
     """
     contact, jacobian = touch

@@ -1,4 +1,4 @@
-"""Column numbers of the arrays `contact` and `guess` (contact.py, sliding.py); a `Surface` as a `contact` array."""
+"""Layout of the arrays `contact` and `guess` (contact.py, sliding.py), and conversion of a `Surface` to `contact`."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5
 # HALF: half edges, 0 for a plane. AXES: matrix, row by row. NORMAL: for a box, the surface normal at the tip
 HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
 # Columns for a box that slides on a table (sliding.py). MASS: 0 for a fixed surface. WEIGHT: N. TABLE: friction
-# coefficient. REACH: m, moment over force of table friction. UP: table normal. VELOCITY (3): m/s, centre. SPIN:
+# coefficient. REACH: m, moment over force of table friction. UP: table normal. VELOCITY (3): m/s, of center. SPIN:
 # rad/s, about UP. STRAIN (4): m, elastic deflection on the table; the fourth value is REACH times an angle. ARM (3):
-# m, vector from the centre to the contact. LOAD: N, table friction while the box slides.
+# m, vector from the center to the contact. LOAD: N, table friction while the box slides.
 MASS, INERTIA, WEIGHT, TABLE, REACH, UP = range(DEPTH + 1, DEPTH + 7)
 VELOCITY, SPIN, STRAIN, ARM, LOAD = UP + 3, UP + 6, UP + 7, UP + 11, UP + 14
 COLUMNS = LOAD + 1
@@ -65,5 +65,5 @@ def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
 
 
 def box_pose(contact: np.ndarray) -> np.ndarray:
-    """Return the pose (..., 6) of the box, centre, m, and first axis; contact: (..., COLUMNS)."""
+    """Return a box's pose (..., 6), center m and first axis, from `contact` (..., COLUMNS)."""
     return np.concatenate([contact[..., POINT : POINT + 3], contact[..., AXES : AXES + 9 : 3]], axis=-1)

@@ -1,17 +1,17 @@
 """Stop of an arm whose tip presses on a surface: the driver holds the contact force, releases it, or retreats.
 
 If a stop only removed the command, the surface would return its elastic energy F^2 / 2k and push the tip off by up to
-F / k, and joint friction would sustain a force of up to `hidden` (push_limit.py). So a stop commands a target torque:
+F / k, or joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver has three stops:
 
-- hold: J^T R, with the force R that the push limit estimated when the stop began. Nothing moves.
-- release: the tip moves outwards at the speed LEAVE until the force is gone. A velocity loop tracks the joint speeds
-  of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains R and the modelled joint friction; an integral
-  adds up to the same friction again, for an arm with more friction. While the joints move outwards, their friction h
-  pushes the tip inwards, so R = F - h. The motion ends at R = RELEASED - SLIDES h with the modelled h. Then F <=
-  RELEASED + (1 - SLIDES) h if the true friction is at most h, and F <= RELEASED if it is only SLIDES h.
-- retreat: the tip is released, then moves RETREAT_M farther outwards.
+- hold: the target torque is J^T R, with the contact force R that the push limit estimated when the stop began.
+- release: the tip moves outward at the speed LEAVE until the contact force F is gone. A velocity loop tracks the
+  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains R and the modeled friction; an
+  integral adds at most as much again, for an arm with more friction. In this motion, joint friction pushes the tip
+  inward with a force h, so R = F - h. The motion ends at R = RELEASED - SLIDES h, with the modeled h. The remaining F
+  is at most RELEASED + (1 - SLIDES) h if the true friction is at most h, or RELEASED if it is SLIDES h.
+- retreat: the arm releases the tip, then moves it RETREAT_M farther outward.
 
-Every stop obeys the limits of push, speed and acceleration, and all outward motion ends after LEAVES_S.
+Every stop obeys the limits of push, speed and acceleration, and any outward motion ends after LEAVES_S.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from r2s.physics.push_limit import FELT, HEIGHT, HOLD, LEAVE, PHASE, PULL, RESIS
 from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
-RELEASED = 0.5  # N, a tip with a smaller contact force is released
+RELEASED = 0.5  # N, contact force below which a tip is released
 SLIDES = 0.25  # ratio of friction in slow sliding to breakaway friction; 0.35 with conf/friction/paper
 RETREAT_M = 0.01  # m; this space is free, as the tip came from `task.clearance` = 15 mm above the plane
 LEAVES_S = 0.4  # s; then 0.1 s is left to brake. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml
@@ -33,11 +33,11 @@ BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
 @njit(cache=True, error_model="numpy")
 def stop_torque(limit, arm, kinematics, friction, limits, held, target):
-    """Write the target torque (n,) Nm for a cycle of a stop; return the share of the allowed joint speeds it uses.
+    """Write the target torque (n,) Nm of a stop in one cycle; return the largest requested share of an allowed speed.
 
     Args:
         limit, arm, kinematics, friction: see `push_bound`. limits: see `filter_limits`.
-        held: (n,) Nm, torque by which an adapter holds a load; R contains it as resistance, so it is subtracted.
+        held: (n,) Nm, torque with which an adapter holds a load; this function subtracts it from R.
     """
     n = len(target)
     root, row, lever, ddq = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

@@ -1,18 +1,16 @@
 """Compiled control laws, which map a command to joint torques every millisecond.
 
-A control law is a compiled function
+A control law is a compiled function `law(q, dq, command, parameters, memory, out)` with these arguments:
 
-    law(q, dq, command, parameters, memory, out)
+    q, dq: (n,) rad, rad/s, measured in this cycle.
+    command: (c,), constant in a control period: the policy's action in SI units, then the setpoint of the task.
+    parameters: (p,), constant in a motion.
+    memory: (k,), state of the law; 0 when a motion begins.
+    out: (n,) Nm, target torque that the law computes, without gravity.
 
-    q, dq       (n,) rad, rad/s, measured in this cycle
-    command     (c,), set once per control period: the policy's action in SI units, then the setpoint of the task
-    parameters  (p,), fixed for a motion
-    memory      (k,), state of the law; zeros when a motion begins
-    out         (n,) Nm, the target torque, without gravity
-
-The same function runs in MuJoCo's callback during training (mujoco_callback.py), in the driver of every arm
-(r2s/arm/driver.py) and in an exported bundle. The package r2s/control chooses law and parameters. The laws are in
-this package because MuJoCo's callback contains them and numba caches compiled code per folder.
+The same compiled law runs during training in MuJoCo's callback (mujoco_callback.py), on every arm in the driver
+(r2s/arm/driver.py), and in an exported bundle. The package r2s/control selects the control law and its parameters.
+The laws are in r2s/physics because MuJoCo's callback contains them and numba caches compiled code per folder.
 """
 
 from collections.abc import Callable
@@ -56,8 +54,9 @@ def computed_torque_law(q, dq, command, parameters, memory, out):
 
     tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)), updated every `hold` cycles.
 
-    command: torque (n), feedforward (n) Nm, q_d (n) rad, dq_d (n) rad/s, M (n n) kg m^2. parameters: w rad/s, hold
-    cycles. memory: cycles since the update, torque of the update (n).
+    command: torque (n) and feedforward (n) Nm, q_d (n) rad, dq_d (n) rad/s, mass matrix M (n n) kg m^2.
+    parameters: w, rad/s, and `hold`, cycles.
+    memory: cycles since the last update, and torque (n) Nm of this update.
     """
     n = len(q)
     if memory[0] == 0.0:
@@ -78,7 +77,7 @@ _laws: list[Callable] = [*BUILT_IN]
 
 
 def law_number(law: Callable) -> int:
-    """Return the number of a compiled law in `chain`; a new law is registered first."""
+    """Return the number by which `chain` calls a control law; a new law is first compiled and registered."""
     law = law if is_jitted(law) else njit(law)
     if law not in _laws:
         _laws.append(law)
@@ -86,7 +85,7 @@ def law_number(law: Callable) -> int:
 
 
 def registered() -> tuple[Callable, ...]:
-    """Return all laws, in the order of their numbers."""
+    """Return all registered control laws, in the order of their numbers."""
     return tuple(_laws)
 
 
@@ -109,7 +108,7 @@ def _either(own_number: int, own: Callable, others: Callable) -> Callable:
 
 @cache
 def chain(laws: tuple[Callable, ...]) -> Callable:
-    """Return the compiled function (number, q, dq, command, parameters, memory, out) that calls a law by number."""
+    """Return a compiled function (number, q, dq, command, parameters, memory, out) that calls laws[number]."""
     law: Callable = _no_law
     for k in reversed(range(len(laws))):
         law = _either(k, laws[k], law)
@@ -129,7 +128,7 @@ def _run_built_in(number, q, dq, command, parameters, memory, out):
 def run_law(law: Callable, q: np.ndarray, dq: np.ndarray, command: np.ndarray, parameters: np.ndarray, memory: int):
     """Return the torques (m, n) Nm of m arms in the first cycle of a motion, for q, dq (m, n) and command (m, c)."""
     out = np.empty(q.shape)
-    q, dq = np.ascontiguousarray(q), np.ascontiguousarray(dq)  # one type of arrays, so that numba compiles once
+    q, dq = np.ascontiguousarray(q), np.ascontiguousarray(dq)  # one array type, so that numba compiles once
     if law in BUILT_IN:
         _run_built_in(BUILT_IN.index(law), q, dq, command, parameters, np.zeros(memory), out)
         return out

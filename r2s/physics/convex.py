@@ -1,8 +1,8 @@
 """Compiled distance of two convex bodies: spheres, capsules, cylinders, boxes, ellipsoids and convex hulls.
 
-A body is a core, described by its support function, and a radius around it. The distance of two cores follows
-Gilbert, Johnson and Keerthi (IEEE J. Robot. Autom. 4(2), 1988), with the simplex cases of Ericson (Real-Time
-Collision Detection, 2005, ch. 5). The iteration ends early if a lower bound of the distance exceeds `enough`.
+A body consists of all points within a radius of its core, and a support function describes the core. The distance of
+two cores is computed by the algorithm of Gilbert, Johnson and Keerthi (IEEE Journal of Robotics and Automation 4(2),
+1988), with the simplex cases of Ericson (Real-Time Collision Detection, 2005, ch. 5).
 """
 
 import numpy as np
@@ -54,7 +54,7 @@ def support_point(body, vertices, pose, dx, dy, dz):
 
 @njit(cache=True, error_model="numpy")
 def separation(enough, a, pose_a, b, pose_b, vertices, work):
-    """Return the distance of two bodies, m, or only a lower bound if this is above `enough` m; overlap: 0 or less."""
+    """Return the distance of two bodies, m, 0 or less in overlap; above `enough` m, a lower bound of the distance."""
     around = a[RADIUS] + b[RADIUS]
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return np.sqrt(_segments(a, pose_a, b, pose_b)) - around
@@ -81,7 +81,7 @@ def separation(enough, a, pose_a, b, pose_b, vertices, work):
 
 @njit(cache=True, error_model="numpy")
 def _segments(a, p, b, r):
-    """Return the squared distance of two segments (or points), m^2."""
+    """Return the squared distance, m^2, of the cores of two bodies: segments or points."""
     la = a[SIZE + 2] if a[KIND] == SEGMENT else 0.0
     lb = b[SIZE + 2] if b[KIND] == SEGMENT else 0.0
     x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
@@ -98,9 +98,9 @@ def _segments(a, p, b, r):
 
 @njit(cache=True, error_model="numpy")
 def _nearest(s, count, t):
-    """Return the point of a simplex that is nearest to the origin, and the number of corners that span this point.
+    """Return a simplex's point nearest to the origin and the number of corners that span it, 4 for an origin inside.
 
-    s: (4, 3), `count` corners; the spanning ones move to the front. 4: the origin is inside. t: (6, 3), any content.
+    s: (4, 3), the `count` corners; the spanning corners move to the front. t: (6, 3), scratch array.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1

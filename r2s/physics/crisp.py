@@ -1,7 +1,7 @@
 """Export of friction parameters to the YAML of crisp_controllers (ROS 2), in the form of the paper's eq. (5).
 
 The controllers (github.com/utiasDSL/crisp_controllers) add fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
-fp3)) to each joint's torque. The sigmoid family is the same law; for other families, r2s fits this law.
+fp3)) to each joint's torque. r2s fits this law to an arm's friction; a sigmoid without viscous term needs no fit.
 """
 
 from pathlib import Path
@@ -19,13 +19,13 @@ STEEPEST = 100.0  # s/rad, largest fp2: a controller that filters dq chatters wi
 
 
 def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Return the friction (...) Nm at dq (...) rad/s for phi (..., 3): fp1 Nm, fp2 s/rad, fp3 rad/s."""
+    """Return friction (...) Nm at dq (...) rad/s for the parameters phi (..., 3): fp1 Nm, fp2 s/rad, fp3 rad/s."""
     fp1, fp2, fp3 = (phi[..., k] for k in range(3))
     return fp1 / (1 + np.exp(-fp2 * (dq + fp3))) - fp1 / (1 + np.exp(-fp2 * fp3))
 
 
 def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return phi (n, 3) that fits an arm's friction best, and the RMS error (n,) Nm over speeds up to dq_max."""
+    """Return parameters (n, 3) of `sigmoid_law`, fitted to an arm's friction up to dq_max, and RMS errors (n,) Nm."""
     share = np.geomspace(SLOWEST, 1.0, SPEEDS)
     dq = np.concatenate([-share[::-1], share])[:, None] * robot.dq_max
     true = dynamics.friction(dq, np.sign(dq))

@@ -1,6 +1,6 @@
 """Writers of robot descriptions in MJCF, URDF and SDF, with the same links, limits and friction.
 
-Masses, centres of mass, inertia tensors, rotor inertias and friction are the identified ones; all other values are
+Masses, centers of mass, inertia tensors, rotor inertias and friction are those of `dynamics`; all other values are
 those of `robot`. In URDF and SDF a link's frame is its joint's frame at angle zero, so inertia tensors need
 no rotation (ignition-physics 5.1 of Gazebo Fortress misreads a rotated inertial frame).
 """
@@ -24,14 +24,14 @@ HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` in URDF: without them, DART a
 
 @dataclass(frozen=True)
 class Link:
-    """A moving link and its joint, in the form of URDF and SDF.
+    """A moving link and its joint, in the frames of URDF and SDF.
 
     Attributes:
         name, joint: names of the link and of its joint.
         origin: (4, 4) pose of the joint in the parent link's frame, at angle zero.
         axis: (3,) joint axis, in the joint's frame.
         mass: kg. com: (3,) m, in the link's frame. inertia: (3, 3) kg m^2 about `com`, link axes.
-        damping: (3,) coefficients of a polynomial, the first in Nm s/rad. friction: Nm, Coulomb. armature: kg m^2.
+        damping: (3,) polynomial coefficients, the first in Nm s/rad. friction: Nm, Coulomb. armature: kg m^2.
         stiffness: (3,) coefficients of the joint's spring, the first in Nm/rad. springref: rad, zero-torque angle.
     """
 
@@ -53,8 +53,8 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
     """Return the arm's links, from the base outwards, and the pose (4, 4) of the end effector in the last link.
 
     Args:
-        robot: the arm. dynamics: masses, centres of mass, inertia tensors, rotor inertias, friction.
-        friction: whether links get Coulomb and viscous terms, which match the friction at 30 % and 100 % of dq_max.
+        robot: the arm. dynamics: masses, centers of mass, inertia tensors, rotor inertias, friction.
+        friction: whether the links contain Coulomb and viscous friction (`coulomb_viscous`) or none.
     """
     model = robot.model(gravity=True)
     bodies, moving = Bodies(model), model.jnt_bodyid
@@ -90,7 +90,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
 
 
 def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return Coulomb (n,) Nm and viscous friction (n,) Nm s/rad that match the friction at 0.3 and 1 times dq_max."""
+    """Return Coulomb (n,) Nm and viscous coefficients (n,) Nm s/rad from the friction at 0.3 dq_max and dq_max."""
     fast, slow = (dynamics.family.level(dynamics.phi, share * robot.dq_max) for share in (1.0, 0.3))
     viscous = np.maximum((fast - slow) / (0.7 * robot.dq_max), 0.0)
     return np.maximum(fast - viscous * robot.dq_max, 0.0), viscous
@@ -99,7 +99,7 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf; return a message for each format that cannot represent the arm.
 
-    SDF has no rotors, so an arm with armature gets no arm.sdf; as most arms have armature, there is no message.
+    For an arm with armature, as most arms, there is no arm.sdf and no message, because SDF has no rotors.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
@@ -141,9 +141,9 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
 
 
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write the arm as URDF with a link `ee` at the end effector; armature becomes Drake's rotor inertia.
+    """Write the arm as URDF, with a link `ee` at the end effector and armature in Drake's rotor_inertia element.
 
-    URDF itself has no armature. r2s and Drake read Drake's element; other readers ignore it.
+    URDF itself has no element for armature. r2s and Drake read Drake's element; other readers ignore it.
 
     Raises:
         UserError: a joint has a spring or nonlinear damping, which URDF cannot represent.
@@ -219,9 +219,9 @@ def write_world(
 ) -> None:
     """Write the SDF world that r2s/engines/gazebo.py and gazebo_classic.py simulate.
 
-    A step is 1 ms, without a real-time limit. The world has no gravity (libfranka's convention), no limits of
-    velocity or torque (the driver enforces them), and no friction (r2s applies it as a torque). SDF has no rotors, so
-    each rotor becomes joint damping of armature / 1 ms, and r2s/engines cancels the torque of this damping.
+    The physics step is 1 ms, and steps follow without delay. The world has no gravity (libfranka's convention), no
+    limits of velocity or torque (the driver enforces them), and no friction (r2s applies it as a torque). As SDF has
+    no rotors, joint damping of armature / 1 ms represents them, and r2s/engines cancels the torque of this damping.
 
     Args:
         path: file. robot, dynamics: the arm. plugin: the world's plugin element. version: version of SDF.
@@ -243,7 +243,7 @@ def write_world(
 
 
 def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarray, *, world: bool) -> None:
-    """Append the arm's model to `place`; world: whether the model is for `write_world`."""
+    """Append the arm's model to the element `place`; world: True for `write_world`, False for `write_sdf`."""
     model = ET.SubElement(place, "model", name=robot.name)
     parent = "world"
     pose = np.eye(4)
@@ -275,12 +275,12 @@ def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarr
 
 
 def _polynomial(coefficients: np.ndarray) -> str:
-    """Return the first coefficient as text, or all three if the polynomial is nonlinear."""
+    """Return a polynomial's three coefficients as text, or only the first if the others are 0."""
     return words(coefficients if coefficients[1:].any() else coefficients[:1])
 
 
 def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
-    """Raise UserError for nonlinear damping or springs; unless `springs`, also for linear springs."""
+    """Raise UserError if a joint has nonlinear damping, a nonlinear spring or, with springs=False, any spring."""
     for link in links:
         nonlinear = link.damping[1:].any() or link.stiffness[1:].any()
         if nonlinear or (link.stiffness.any() and not springs):
@@ -324,7 +324,7 @@ def pose_words(pose: np.ndarray) -> str:
 
 
 def words(values: np.ndarray) -> str:
-    """Return numbers as text that reads back as the same floats."""
+    """Return numbers as text that represents them exactly."""
     return " ".join(repr(float(v)) for v in values)
 
 

@@ -13,14 +13,14 @@ from r2s.physics.robot import Robot, per_joint
 from r2s.physics.surface import Surface
 
 STICTION_MODELS = ("command", "net")
-CREEP = 2e-3  # rad/s, dq_min of "net": above the speed that a stop leaves after 1 ms, below any motion
+CREEP = 2e-3  # rad/s, dq_min of "net": above the residual speed 1 ms after a stop, below the speed of any motion
 PHI1 = 0.02  # share of tau_max: `phi1` (twice the Coulomb torque) of a joint without declared friction
 MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: largest allowed friction parameter, above that of any arm
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Parameters that identification estimates and domain randomization draws; arrays may have batch axes.
+    """Parameters that identification estimates and domain randomization samples; arrays may have batch axes.
 
     Attributes:
         phi: (..., n, K) parameters of `family`; Nm, s/rad, rad/s for eq. (5) of the paper.
@@ -28,25 +28,25 @@ class Dynamics:
         breakaway: (..., n, 2) Nm, negative and positive breakaway torque, the edges of stiction.
         dq_min: rad/s, speed below which a joint can stick.
         mass: (..., n) kg, com: (..., n, 3) m, link frame.
-        inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
+        inertia: (..., n, 3, 3) kg m^2 about each link's center of mass, link axes.
         armature: (..., n) kg m^2, rotor inertia reflected to the joint; not visible to a link-side torque sensor.
-        load: (..., n) Nm/Nm, load-dependent friction per gravity torque at the joint.
+        load: (..., n) Nm/Nm, ratio of load-dependent friction to the gravity torque at the joint.
         drag: (..., n, 2) Nm, coefficients of sin q and cos q in an angle-dependent offset, such as a cable's torque.
         gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; it
-            describes a recording, not the arm's motion.
-        signal_delay: (...) s, time by which a recording's torque (measured or motor) is later than its angles.
-        late_alike: whether a recording's measured torque and dq are treated as equally late, so that dq is used as
-            logged.
+            changes the recorded torque, but not the arm's motion.
+        signal_delay: (...) s, delay of a recording's torque (measured or motor) after its joint angles.
+        late_alike: whether identification assumes that a recording's measured torque and dq are equally late, and
+            then uses dq as logged.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: the friction law.
-        stiction_model: the torque compared with the breakaway edges. "command", eq. (6) of the paper: command and
-            offset have no effect within the edges. "net": a joint sticks while the sum of all torques on it, with the
-            coupling to other joints, lies within the edges (r2s/physics/stick_slip.py).
-        delay, lag: (...) s, pure delay and first-order lag of the actuation. `Simulator` applies them only if it runs
-            the safety filter; otherwise `Motors` (r2s/physics/actuation.py) does.
+        stiction_model: "command" (eq. (6) of the paper): a command and offset within the breakaway edges do not move
+            a joint at rest. "net": a joint sticks while the sum of all torques on it, with the coupling to other
+            joints, lies within the edges (r2s/physics/stick_slip.py).
+        delay, lag: (...) s, pure delay and first-order lag of the actuation. After `Simulator.drive`, the simulator
+            applies delay and lag; otherwise, `Motors` (r2s/physics/actuation.py) applies them.
         declared_payload: (..., 4) kg and kg m, mass and first moment, in the last link's frame, of the payload
-            declared to gravity compensation (r2s/physics/payload.py); the real payload is part of the last link.
-        surface: the surface that `Robot.tool` may touch (r2s/physics/contact.py), maybe a batch; None: no surface.
+            declared to gravity compensation (r2s/physics/payload.py); the last link includes the real payload.
+        surface: surface that `Robot.tool` may touch (r2s/physics/contact.py), one or a batch; None: no surface.
     """
 
     phi: np.ndarray
@@ -77,7 +77,7 @@ class Dynamics:
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
-        """Return dynamics with nominal links and rotors and friction phi (..., n, K) of a family; the rest is 0."""
+        """Return dynamics with nominal links and rotors, and friction parameters phi (..., n, K); the rest is 0."""
         n = robot.n
         return Dynamics(
             phi=phi,
@@ -96,9 +96,9 @@ class Dynamics:
         )
 
     def holding_contact(self) -> "Dynamics":
-        """Return the dynamics with stiction_model="net" if friction has a jump at rest.
+        """Return the dynamics, with stiction_model="net" if the friction law is discontinuous at rest.
 
-        Eq. (6) compares the command alone with the breakaway edges, so a joint at rest yields to any contact force.
+        With the stiction model of the paper's eq. (6), any contact force would move a joint at rest.
         """
         if self.family.sharp is None:
             return self
@@ -110,7 +110,7 @@ class Dynamics:
 
     @property
     def level(self) -> np.ndarray:
-        """(..., n) Nm, friction at 1 rad/s, the smaller value of both directions."""
+        """(..., n) Nm, magnitude of the friction at 1 rad/s or -1 rad/s, the smaller of both."""
         n = self.phi.shape[-2]
         return np.minimum(self.friction(np.full(n, 1.0)), -self.friction(np.full(n, -1.0))).clip(0.0)
 
@@ -143,10 +143,10 @@ def nominal_dynamics(
 ) -> Dynamics:
     """Return the dynamics that `conf/friction` and `conf/inertia` describe; values: one per joint, or one for all.
 
-    phi1, phi2 and phi3 describe a sigmoid; another family gets the sigmoid's friction at 1 rad/s, and "auto" starts
-    with the sigmoid. With phi1=None, frictionloss and damping of the robot's file are Coulomb and viscous friction,
-    and "auto" starts with this law; a joint without both gets a phi1 of PHI1 times its torque limit. A breakaway
-    torque of None is replaced by the file's frictionloss.
+    phi1, phi2 and phi3 are the parameters of a sigmoid. With phi1=None, the law is Coulomb and viscous
+    friction from frictionloss and damping in the robot's file; for a joint without both, phi1 is PHI1 tau_max. A
+    family other than "auto" is matched to the law's friction at 1 rad/s. The file's frictionloss replaces a breakaway
+    torque of None.
 
     Raises:
         UserError: a list of the wrong length, or a value out of its physical range.

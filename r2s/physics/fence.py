@@ -1,13 +1,13 @@
 """The driver's fence stops an arm before it touches itself or the table; the compiled check takes microseconds.
 
-The fence predicts the posture in which the arm would come to rest if it braked now. In this posture, no pair of
-`CollisionCheck` may be closer than FENCE_M; at full speed, than FENCE_M (1 + SPREAD), because links swing while they
-brake. A stop ramps the allowed speeds down within BRAKE_S, and joints follow the ramp LAG_S late. A joint that uses a
-smaller share of its allowed speed than the fastest joint starts to brake when the ramp has fallen to this share. The
-predicted posture moves continuously with the arm, so it cannot pass through an obstacle between two cycles.
+The fence predicts the posture in which the arm would rest if it braked now. In the predicted posture, the bodies of
+each pair of `CollisionCheck` must be FENCE_M apart. At full speed, the bodies must be FENCE_M (1 + SPREAD) apart,
+because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and the joint
+speeds lag the ramp by LAG_S. A joint slower than the ramp keeps its speed until the ramp has fallen to this speed.
+The predicted posture moves continuously with the arm, so it cannot pass through an obstacle between two cycles.
 
-An arm that starts closer may move away: the allowed distance of a pair is half of the pair's largest distance so far
-in the motion, at most FENCE_M. A pair that overlaps at the start is ignored until it is apart.
+If a pair of bodies starts closer, the arm may move them apart: the required distance is half of their largest
+distance in the motion so far, at most FENCE_M. Bodies that overlap at the start are ignored until they separate.
 """
 
 from typing import NamedTuple
@@ -20,19 +20,19 @@ from r2s.physics.kinematics import POSE
 from r2s.physics.safety_filter import BRAKE_S, DQ_ALLOWED, LATENCY_S, RATE
 
 FENCE_M = 0.01  # m
-SPREAD = 3.0  # simulated stops from full speed end up to 0.02 m from the prediction
+SPREAD = 3.0  # in simulation, stops from full speed end up to 0.02 m from the predicted posture
 LAG_S = 1 / RATE + LATENCY_S  # s, lag of a joint's speed behind the ramp
 
 
 class Fence(NamedTuple):
-    """Geometry for `breached`: links from `links_of`, and the scene of a `CollisionCheck`."""
+    """Geometry for `breached`: the links that `links_of` returns, and the `scene` of a `CollisionCheck`."""
 
     links: np.ndarray
     scene: Scene
 
 
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return, per motion q, dq (E, T, n), the index (E,) of the pair at which the driver would stop it, -1: none.
+    """Return, for E motions q, dq (E, T, n), the indices (E,) of the pairs at which the driver stops; -1: none.
 
     limits: (n, COLUMNS) from `filter_limits`.
     """
@@ -52,7 +52,7 @@ def breached(fence, limits, q, dq, least):
     Args:
         fence: `Fence`. limits: (n, COLUMNS) of `filter_limits`.
         q, dq: (n,) rad, rad/s, finite.
-        least: (K,) m, smallest allowed distance of each pair, -inf before a motion's first cycle; updated.
+        least: (K,) m, smallest allowed distance of each pair, -inf before a motion begins; this function updates it.
     """
     if len(least) == 0:
         return -1

@@ -1,7 +1,7 @@
 """Joint friction: four laws, called families, with one interface; users can add their own.
 
 A family contains its law twice: in NumPy, and compiled for the physics step (mujoco_callback.py). `friction.family=`
-selects one of the four families below by name, or a user's own by a dotted path such as my_module.MY_FAMILY.
+selects one of the four families by name, or a user's own family by a dotted path such as my_module.MY_FAMILY.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,17 +29,17 @@ class Family:
         names, units: names and units of the K parameters.
         logarithmic: names of positive parameters that span decades; their search space is logarithmic.
         bounds: (low, high), search range of each parameter; `identify.bounds` overrides it.
-        optional: the last of the `names`; such a parameter is 0 and not estimated unless `identify.terms` lists it.
+        optional: the last `names`; these parameters are 0 and not estimated unless `identify.terms` lists them.
         formula: the law in one line.
         law: (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n). `sign` is
             tanh(dq / 0.01), or the bristle deflection of a family with a memory, in [-1, 1].
         native: the law of one joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
-            torque and its derivative at v. `memory` is the joint's state, 0 after a reset.
-        sharp: `native` with a true jump at rest, for stiction_model="net", which computes rest exactly. None: the law
-            has no jump.
-        start: friction (..., n) Nm at 1 rad/s -> start values (a list) of the parameters that are not optional.
-        held: phi (..., n, K) -> breakaway torque (..., n, 2) Nm, negative and positive, of a law with a memory.
-            None: the law has no stiction of its own; the dead zone of eq. (6) or stick_slip.py provides it.
+            torque and its derivative at v. `memory` is the state of the joint's friction, 0 after a reset.
+        sharp: `native` with a discontinuous torque at v = 0, for stiction_model="net"; None for a law that is
+            continuous at rest.
+        start: function that maps friction (..., n) Nm at 1 rad/s to start values (a list) of the required parameters.
+        held: for a law with a memory, function that maps phi (..., n, K) to breakaway torques (..., n, 2) Nm,
+            negative and positive; None for a law without stiction, which eq. (6) or stick_slip.py then adds.
 
     Raises:
         UserError: the parts are inconsistent.
@@ -76,7 +76,7 @@ class Family:
         return self.held is not None
 
     def at_rest(self, phi: np.ndarray) -> np.ndarray:
-        """Return the friction (..., n, 2) Nm at the onset of sliding, negative and positive; 0 if there is no jump.
+        """Return the kinetic friction (..., n, 2) Nm at zero speed, negative and positive; 0 for a continuous law.
 
         phi: (..., n, K).
         """
@@ -107,7 +107,7 @@ class Family:
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
         """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of another family.
 
-        If both laws have a viscous parameter, its value is copied.
+        If both families have a viscous parameter, the result keeps the viscous friction of `other`.
         """
         if other == self:
             return phi
@@ -283,7 +283,7 @@ _imported: dict[str, Family] = {}  # by dotted path
 
 
 def known_families() -> tuple[Family, ...]:
-    """Return the built-in families and those imported by `family`."""
+    """Return the built-in families and all families that `family` has imported."""
     return (*FAMILIES, *_imported.values())
 
 
@@ -291,7 +291,7 @@ def family(name: str) -> Family:
     """Return a built-in family by its name, or import one by its dotted path.
 
     Raises:
-        UserError: the family is unknown, or one of its parameters has another unit or scale in another family.
+        UserError: the family is unknown, or a parameter's unit or scale differs from that in another family.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:
@@ -323,7 +323,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if `family` would import `name`, which a file contains, from a module not in `trust`."""
+    """Raise UserError if the family `name` in a file would be imported from a module that is not in `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(
@@ -333,14 +333,14 @@ def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
 
 
 def family_path(one: Family) -> str:
-    """Return the string for which `family` returns this family: its name or its dotted path."""
+    """Return the string for which `family` returns the family `one`: a name or a dotted path."""
     return next((path for path, f in _imported.items() if f is one), one.name)
 
 
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
-    """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s, dt s and a distance in rad, one or (n,).
+    """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s, steps of dt s and `distance`, rad.
 
-    z replaces the sign of the velocity: dz/dt = (v - |v| z) / distance (Dahl 1968), integrated exactly from z = 0.
+    The deflection z replaces sign(v) in friction: dz/dt = (v - |v| z) / distance (Dahl 1968), integrated exactly.
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 

@@ -2,15 +2,15 @@
 
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
-Damping: with D = 2 zeta (M # K_q) and the geometric mean M # K_q = M (M^-1 K_q)^(1/2), every mode of mass matrix M
-and joint stiffness K_q = J^T K J + N^T K_n N has the damping ratio zeta. This is the double diagonalization of
-Albu-Schaeffer, Ott, Frese and Hirzinger (ICRA 2003), without eigenvectors. The null-space projector N is dynamically
-consistent (Khatib, IEEE J. Robotics and Automation 1987). Energy: every spring has a potential, even where its force
-is clipped. When a stiffness rises, an energy tank (Ferraguti, Secchi and Fantuzzi, ICRA 2013) must provide the energy
-that the springs gain; damping refills the tank. The tank ignores the work of moving targets and null space (Dietrich,
-Ott and Stramigioli, RA-L 2016). Feedforward: it cancels gravity-compensation errors and friction. Bristle friction
-follows the measured angle, other friction the reference speed dq_r. Cancelling a bristle stiffness k with a delay d
-adds damping at w < pi / d, as k - k e^(-i w d) has the imaginary part k sin w d. Excess friction drives the arm.
+With the damping D = 2 zeta (M # K_q), every mode has the damping ratio zeta. Here M is the mass matrix, K_q = J^T K J
++ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. This D is the double
+diagonalization of Albu-Schaeffer et al. (ICRA 2003), without eigenvectors. The null-space projector N is dynamically
+consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring has a potential, even where its force is
+clipped. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy that the springs
+gain; damping refills the tank. This tank ignores the work of moving targets and of the null-space spring (Dietrich et
+al., RA-L 2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured
+angle, other friction at the reference speed dq_r. Friction feedforward above the true friction would drive the arm.
+Canceling a bristle stiffness k with a delay d adds the damping k sin(w d) / w, positive for frequencies w < pi / d.
 """
 
 import numpy as np
@@ -61,7 +61,7 @@ REST_DQ, DIRECTION_DQ = 0.01, 0.003
 # SLOPE_RATE: 1/s, of the slope estimate; it settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING: m/s, below
 # it the estimate adapts slower; five times the tip's speed noise: 3e-3 rad/s (Panda) at levers of 0.5 m in 7 joints
 SLOPE_RATE, SLIDING = 10.0, 0.02
-SMALLEST = 0.01  # smaller shares of a requested stiffness rise are not applied
+SMALLEST = 0.01  # smallest applied share of a requested rise of stiffness
 MOBILITY = 1e-3  # 1/kg, 1/(kg m^2): directions with less mobility, near a singularity, are treated as blocked
 
 
@@ -86,7 +86,7 @@ def arm_pose(q, parameters, frames, jacobian, place):
 
 @njit(cache=True, error_model="numpy")
 def arm_tips(q, parameters):
-    """Return position (m, 3) m and Jacobian (m, 3, n) of the tip at q (m, n) rad; parameters: of an impedance law."""
+    """Return a tip's position (m, 3) m and Jacobian (m, 3, n) at q (m, n) rad; parameters: of an impedance law."""
     m, n = q.shape
     places, out = np.empty((m, 3)), np.empty((m, 3, n))
     frames, jacobian = np.empty((n, POSE)), np.empty((6, n))
@@ -140,10 +140,10 @@ def invert(matrix, n):
 
 @njit(cache=True, error_model="numpy")
 def geometric_mean(K, mobility, out):
-    """Write the geometric mean K # M = M (M^-1 K)^(1/2), (n, n); K, M = mobility^-1 are symmetric positive definite.
+    """Write the geometric mean K # M = M (M^-1 K)^(1/2), (n, n), of positive definite matrices; mobility: M^-1.
 
-    It uses Denman and Beavers' iteration (Higham, Functions of Matrices, 2008, eq. 6.28), multiplied by M so that
-    all iterates stay symmetric: P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2 from P = K, Q = M^-1.
+    The iteration is P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2 from P = K and Q = M^-1, that of Denman and Beavers
+    (Higham, Functions of Matrices, 2008, eq. 6.28) multiplied by M, so that all iterates stay symmetric.
     """
     n = len(K)
     scale = 0.0  # mean squared frequency
@@ -171,10 +171,10 @@ def geometric_mean(K, mobility, out):
 
 @njit(cache=True, error_model="numpy")
 def spring(s, limit):
-    """Return a spring's energy, J, and the factor on its force K e; it saturates where s = e^T K e / 2 is `limit` J.
+    """Return the energy U, J, of a saturating spring for s = e^T K e / 2, J, and the factor on its force K e.
 
-    The energy U is s up to the limit, then 2 sqrt(s limit) - limit. U depends on s alone, so the force has a
-    potential for every K. U rises with K; the force is at most sqrt(2 K limit), so limit = clip^2 / (2 K_high).
+    The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. As U depends on s alone, the spring's force has a
+    potential for every K, which rises with K. The force is at most sqrt(2 K limit), so limit = clip^2 / (2 K_high).
     """
     if s <= limit:
         return s, 1.0
@@ -191,7 +191,7 @@ def task_energy(K, error, tilt, parameters):
 
 @njit(cache=True, error_model="numpy")
 def refill(q, n, parameters, memory, at):
-    """Add the energy, J, that damping took from the arm since the last cycle to the tank; at: index of dq_r."""
+    """Fill the tank with the energy, J, that damping dissipated since the last cycle; at: index of dq_r in memory."""
     if memory[BEGUN] == 0.0:
         memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
         for j in range(n):
@@ -208,7 +208,7 @@ def refill(q, n, parameters, memory, at):
 def friction_at(v, row, load):
     """Return a joint's friction, Nm, at v rad/s, including load-dependent friction of `load` Nm.
 
-    Friction is linear in speed between the nodes FIRST_DQ 4^k of the joint's row, and is extrapolated beyond.
+    `row` contains the friction at the speeds FIRST_DQ 4^k; the function interpolates and extrapolates it linearly.
     """
     side, k = FRICTION if v >= 0.0 else FRICTION + NODES, 0
     sign = 1.0 if v >= 0.0 else -1.0
@@ -223,10 +223,10 @@ def friction_at(v, row, load):
 def friction_ahead(v, q, j, load, parameters, memory, at):
     """Return the friction feedforward, Nm, of joint j at q rad; v: reference speed of the joint, rad/s.
 
-    With bristles, the deflection z follows the measured angle, dz = (dq - |dq| z) / presliding (Dahl 1968), and the
-    level is the smaller of those at reference and measured speed. Without bristles, friction has the direction of v,
-    and is the breakaway torque at rest. While a target approaches a surface, v is only the direction in which joints
-    will creep, and the result is the friction at v. load: Nm, load-dependent friction. at: index of dq_r in memory.
+    With bristles, the feedforward is the deflection z times the friction at reference or measured speed, whichever is
+    smaller; dz/dt = (dq - |dq| z) / presliding at the measured dq (Dahl 1968). Without bristles, the feedforward has
+    the sign of v, and is the breakaway torque at rest. While the tip approaches a surface (APPROACH = 1), the
+    feedforward is the friction at v. load: Nm, load-dependent friction. at: index of dq_r in memory.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j

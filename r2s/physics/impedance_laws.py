@@ -1,4 +1,4 @@
-"""Compiled laws of `control=joint_impedance`, `cartesian_impedance` and `hybrid`; impedance.py has their parts."""
+"""Compiled laws of `control=joint_impedance`, `cartesian_impedance` and `hybrid`, with functions of impedance.py."""
 
 import numpy as np
 
@@ -63,8 +63,8 @@ from r2s.physics.newton_euler import product, rotate_about
 def joint_impedance_law(q, dq, command, parameters, memory, out):
     """Write the torque of `control=joint_impedance`: K (q_t - q) - D (dq - dq_r) + feedforward.
 
-    command: displacement q_t - q_r of the target (n) rad and stiffness (n) Nm/rad, if the action contains them; then
-    q_r, dq_r (n each), if the task has a trajectory. Without a trajectory, q_r is home and dq_r is 0.
+    The command contains the action's optional displacement q_t - q_r (n) rad and stiffness (n) Nm/rad, then q_r (n)
+    rad and dq_r (n) rad/s of the task's trajectory. Without a trajectory, q_r is home and dq_r is 0.
     """
     n, begins = len(q), memory[BEGUN] == 0.0
     K, at = memory[STIFFNESS : STIFFNESS + n], STIFFNESS + n
@@ -81,7 +81,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
             asked[j] = min(max(command[stiff + j], row[K_JOINT + 1]), row[K_JOINT + 2])
         K[j] = asked[j] if begins else K[j]
     share, pays = 1.0, False
-    while not pays:  # a rise is halved until the tank pays for it; a fall is free
+    while not pays:  # a rise is halved until the tank has its energy; a fall needs none
         raised = 0.0
         for j in range(n):
             out[j] = asked[j] if asked[j] <= K[j] else K[j] + share * (asked[j] - K[j])
@@ -113,7 +113,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
 
 @njit(cache=True, error_model="numpy")
 def task_stiffness(command, error, tilt, begins, parameters, memory):
-    """Set the stiffness (4,) in memory to the requested one, as far as the tank has energy for it."""
+    """Set the stiffness (4,) in `memory` to the requested value; a rise is limited by the energy in the tank."""
     K, asked, new = memory[STIFFNESS : STIFFNESS + SPRINGS], np.empty(SPRINGS), np.empty(SPRINGS)
     at, given = int(parameters[STIFFNESS_AT]), 4 if parameters[TASK_AXES] == 6.0 else 3
     for k in range(SPRINGS):
@@ -122,7 +122,7 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
             asked[k] = min(max(command[at + k], parameters[K_LOW + k]), parameters[K_HIGH + k])
         K[k] = asked[k] if begins else K[k]
     before, share, pays = task_energy(K, error, tilt, parameters), 1.0, False
-    while not pays:  # a rise is halved until the tank pays for it; a fall is free
+    while not pays:  # a rise is halved until the tank has its energy; a fall needs none
         for k in range(SPRINGS):
             new[k] = asked[k] if asked[k] <= K[k] else K[k] + share * (asked[k] - K[k])
         raised = task_energy(new, error, tilt, parameters) - before
@@ -137,8 +137,8 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
 def rotation_error(R, command, parameters, error):
     """Write the rotation error (3,): axis times sine of the angle to the target; return 1 - cosine of the angle.
 
-    The target is the home orientation, rotated by the sum of the rotation vectors of action and task target (error:
-    Luh, Walker and Paul, IEEE TAC 1980, eq. 22).
+    The target orientation is home, rotated by the action's rotation vector plus the task's. The rotation error is
+    that of Luh, Walker and Paul (IEEE TAC 1980, eq. 22).
     """
     x, y, z = 0.0, 0.0, 0.0
     if parameters[DISPLACED] >= 0.0:
@@ -164,7 +164,7 @@ def rotation_error(R, command, parameters, error):
 
 @njit(cache=True, error_model="numpy")
 def update(velocity, parameters, frames, jacobian, memory):
-    """Write D, N^T (n, n) for this posture, and dq_r (n,) rad/s for the target's velocity (3,) m/s, into memory."""
+    """Update D, N^T (n, n) and dq_r (n,) rad/s in `memory`; velocity: (3,) m/s, of the target."""
     n, a, at = len(frames), int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     K = memory[STIFFNESS : STIFFNESS + SPRINGS]
     D = memory[at + ROWS * n : at + ROWS * n + n * n].reshape((n, n))
@@ -211,10 +211,10 @@ def update(velocity, parameters, frames, jacobian, memory):
 
 @njit(cache=True, error_model="numpy")
 def normal_force(command, shift, parameters, memory):
-    """Return the force, N, that the tip shall exert against the normal, with the integral of the force error.
+    """Return the desired force, N, of the tip against the normal: reference plus integral of the force error.
 
-    The command contains: normal (3,), reference N, measured force N, whether it is measured. A displacement against
-    the normal adds stiffness times displacement. The integral stops while it or the force saturates (clamping).
+    The command contains the normal (3,), the reference and measured force, N, and whether a force is measured. The
+    action's displacement against the normal, times stiffness, raises the reference. Saturation stops the integral.
     """
     at = int(parameters[TARGET_AT]) + int(parameters[TARGET_SIZE])
     asked = command[at + 3]
@@ -236,9 +236,9 @@ def normal_force(command, shift, parameters, memory):
 def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
     """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's path.
 
-    The slope g is the least-squares fit of: tip's speed along the normal = g velocity, by the gradient method (Widrow
-    and Hoff, 1960). The rate at which the surface rises is added to the target's velocity (3,) m/s. The force is the
-    integral of the position error along the path, where friction acts, and to the path's side, each clamped.
+    The gradient method (Widrow and Hoff, 1960) fits the slope g: tip speed along the normal = g . target velocity.
+    The function adds the rise of the surface to `velocity` (3,) m/s. The correcting force is a clamped integral
+    of the position error along the path, where friction acts, plus a clamped integral of the error across the path.
     """
     up, rises, fast = 0.0, 0.0, SLIDING * SLIDING
     for k in range(3):
@@ -269,13 +269,13 @@ def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
 
 @njit(cache=True, error_model="numpy")
 def cartesian_impedance_law(q, dq, command, parameters, memory, out):
-    """Write the torque of a tip impedance, `control=cartesian_impedance`; with a normal force, `control=hybrid`.
+    """Write the torque of `control=cartesian_impedance` or, with a force along the normal, of `control=hybrid`.
 
-    command, from the action if it has them: displacement of the target (3) m, with six axes also a rotation (3) rad;
-    stiffness (3) N/m, with six axes also (1) Nm/rad. Then the task's target: position (3) m, optionally velocity (3)
-    m/s and rotation vector from home (3) rad. Then, for hybrid, the contact: see `normal_force`. With APPROACH the
-    force grows with the distance to a target inside the surface, up to the requested force. With SLIDES the target is
-    valid for the middle of a control period, and the command ends with a feedforward force on the tip (3) N.
+    The command begins with optional parts of the action: target displacement (3) m, with six axes also rotation (3)
+    rad; stiffness (3) N/m, with six axes also (1) Nm/rad. The task's target follows: position (3) m, optionally
+    velocity (3) m/s and rotation vector from home (3) rad. For hybrid control, `normal_force` lists the entries that
+    follow. With APPROACH > 0, stiffness times the depth of the target below the tip bounds the normal force. With
+    APPROACH = SLIDES, the target is that of mid-period, and the command ends with a feedforward force (3) N.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     frames, jacobian, place, velocity = np.empty((n, POSE)), np.empty((6, n)), np.empty(3), np.zeros(3)

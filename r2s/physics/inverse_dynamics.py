@@ -33,11 +33,11 @@ class InverseDynamics:
     def rigid(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the torque (m, n) Nm of links and rotors at q, dq, ddq (m, n) rad, rad/s, rad/s^2.
 
-        The torque is M ddq + C dq + g, minus the g of the nominal links, which the arm compensates.
+        The torque is M ddq + C dq + g, minus the nominal links' gravity torque, which the arm compensates.
         """
         own, nominal = self._links
         out = np.empty_like(q)
-        motion = np.array(q), np.array(dq), np.array(ddq)  # one type of arrays, so that numba compiles once
+        motion = np.array(q), np.array(dq), np.array(ddq)  # one array type, so that numba compiles once
         _rigid(own, nominal, self.robot.gravity, np.array(self.dynamics.armature), motion, out, False)
         return out
 
@@ -48,7 +48,7 @@ class InverseDynamics:
         return out
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
-        """Return the command (m, n) Nm, without gravity, for a motion; sliding: (m, n) rad/s, speeds for friction."""
+        """Return the command (m, n) Nm, without gravity, of a motion; friction is that at `sliding` (m, n) rad/s."""
         d = self.dynamics
         out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
         if d.drag.any():
@@ -66,7 +66,7 @@ class InverseDynamics:
 
 @njit(cache=True, error_model="numpy")
 def _rigid(links, nominal, gravity, armature, motion, out, full_gravity):
-    """Write the torque (m, n) Nm of a motion (q, dq, ddq); `full_gravity`: without gravity compensation."""
+    """Write the torque (m, n) Nm of a motion (q, dq, ddq); full_gravity: whether the arm compensates no gravity."""
     q, dq, ddq = motion
     m, n = q.shape
     mass, bias, compensated, at_rest = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

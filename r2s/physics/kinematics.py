@@ -34,8 +34,8 @@ class HandKinematics:
     def follow(self, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
         """Return postures (T, n) rad with the end effector at points (T, 3) m, and the largest position error, m.
 
-        The solver starts each posture from the previous one, the first from `start` (n,). In the null space the arm
-        moves towards home. The solver ignores position limits.
+        For each point, the solver starts at the previous posture, first at `start` (n,). In the null space of the end
+        effector, the arm moves toward home. The solver ignores position limits.
         """
         out = np.empty((len(points), len(start)))
         return out, _follow(self.links, self._tip, self._home, start, np.ascontiguousarray(points), out)
@@ -55,7 +55,7 @@ def link_frames(links, q, frames, axes):
 
 @njit(cache=True, inline="always")
 def write_pose(pose, x, y, z, R):
-    """Write a position and a rotation (9 numbers, row by row) into a row (POSE,)."""
+    """Write a position and a rotation (9 numbers, row by row) into `pose` (POSE,)."""
     pose[0], pose[1], pose[2] = x, y, z
     pose[3], pose[4], pose[5], pose[6], pose[7], pose[8] = R[0], R[1], R[2], R[3], R[4], R[5]
     pose[9], pose[10], pose[11] = R[6], R[7], R[8]
@@ -71,7 +71,7 @@ def pose_axes(pose):
 def hand_kinematics(links, tip, q, frames, place, jacobian):
     """Write the end-effector position (3,) m and its Jacobian (3, n) m/rad at q (n,) rad.
 
-    tip: (3,) m in the last link's frame. frames: (n, POSE), any content.
+    tip: (3,) m in the last link's frame. frames: (n, POSE), scratch array.
     """
     n = len(q)
     link_frames(links, q, frames, jacobian.T)
@@ -92,7 +92,7 @@ def _places(links, tip, q, out):
 
 @njit(cache=True, error_model="numpy")
 def _follow(links, tip, home, start, points, out):
-    """Write a posture for each point; return the largest position error, m."""
+    """Write the posture for each point into `out`; return the largest position error, m, of the end effector."""
     n, worst = len(start), 0.0
     q, place, jacobian, error = start.copy(), np.empty(3), np.empty((3, n)), np.empty(3)
     gram, null_step, frames = np.empty((3, 3)), np.empty(n), np.empty((n, POSE))
@@ -112,7 +112,7 @@ def _follow(links, tip, home, start, points, out):
                     gram[k, c] = DAMPING if k == c else 0.0
                     for j in range(n):
                         gram[k, c] += jacobian[k, j] * jacobian[c, j]
-            for j in range(n):  # only in the first step: the later ones correct the end effector
+            for j in range(n):  # in the first step; later steps correct the end effector
                 null_step[j] = HOMEWARD * (home[j] - q[j]) if iteration == 0 else 0.0
             for k in range(3):
                 for j in range(n):

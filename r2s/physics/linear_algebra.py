@@ -1,9 +1,9 @@
 """Cholesky factorization and solution of small symmetric positive definite systems, for compiled code.
 
-For the 7 joints of an arm these loops are faster than a LAPACK call. A root is the lower triangle L of A = L L^T with
-1 / L[i, i] on the diagonal, so `solve` multiplies instead of divides (Golub and Van Loan, Matrix Computations, 4th
-ed. 2013, section 4.2). A packed matrix holds its lower triangle row by row, (n (n + 1) / 2,), as MuJoCo stores the
-mass matrix of a serial arm.
+For 7 joints, compiled loops are faster than a LAPACK call. The root of a matrix A = L L^T is the lower triangle L
+with 1 / L[i, i] on the diagonal, so `solve` multiplies instead of divides (Golub and Van Loan, Matrix Computations,
+4th ed. 2013, section 4.2). A packed matrix contains its lower triangle row by row, (n (n + 1) / 2,), as MuJoCo stores
+the mass matrix of a serial arm.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ def unpack(packed, scale, diagonal, out):
 def factor(matrix, root, active=None):
     """Write the root of a matrix (n, n), given by its lower triangle; `root` may be `matrix` itself.
 
-    active: (n,), 0 for the rows and columns to leave out. None: all are used.
+    active: (n,), 0 for rows and columns to leave out; None leaves out no row.
     """
     for i in range(len(root)):
         if active is not None and active[i] == 0.0:
@@ -52,7 +52,7 @@ def factor(matrix, root, active=None):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def solve(root, x, active=None):
-    """Replace x (n,) by the solution y of A y = x; active: as for `factor`, and y is 0 in the left-out rows."""
+    """Replace x (n,) by the solution y of A y = x; y is 0 in rows that `active` (see `factor`) leaves out."""
     n = len(x)
     for i in range(n):
         s = 0.0

@@ -1,14 +1,14 @@
 """The compiled callback that adds friction, control law, safety filter and motors to MuJoCo's physics step.
 
-`install()` registers a native control callback that reads `jnt_user`. `mujoco.batch.Batch` can then simulate a
-different arm in each row at full speed. The callback contains the friction laws (friction.py), and with
-`Simulator.drive` also the control law (control_laws.py), the safety filter (safety_filter.py) and the delay of the
-motors (actuation.py), which need feedback every millisecond. Stiction (stick_slip.py) and contact (contact.py) depend
-on all other forces. So r2s uses the control callback, which MuJoCo calls last before it computes accelerations.
+`install()` registers a native control callback that reads its parameters in `jnt_user`, so `mujoco.batch.Batch` can
+simulate a different arm in each row at full speed. The callback computes friction (friction.py) and, after
+`Simulator.drive`, control law (control_laws.py), safety filter (safety_filter.py) and motor delay (actuation.py),
+which need feedback every millisecond. As stiction (stick_slip.py) and contact (contact.py) depend on all other
+forces, r2s uses the control callback, which MuJoCo calls last before it computes accelerations.
 
-The friction force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity, the callback adds D v -
-tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. This is exact to first order,
-and stable where an explicit force chatters (real wrist joints: slopes of 3-10 Nm s/rad on 0.004-0.012 kg m^2).
+The friction torque tau_f is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity v, the callback
+adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. The step is
+accurate to first order, and stable even for the steep friction of real wrists, 3-10 Nm s/rad on 0.004-0.012 kg m^2.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ from r2s.physics.safety_filter import COLUMNS, TAU_MAX, WORK, JointDynamics, fad
 from r2s.physics.safety_filter import STEP as TAU_STEP
 from r2s.physics.stick_slip import TINY, JointForces, any_reversal, coming_velocity
 
-# Columns of jnt_user. MARK identifies our models: the callback is global in a process and must leave others alone.
+# Columns of jnt_user. MARK identifies models of r2s: the callback is global in a process and must ignore all others.
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether masses are summed up
@@ -72,7 +72,7 @@ BRISTLES, PRESLIDING = FAMILIES.index(BRISTLE_FAMILY), BRISTLE_FAMILY.names.inde
 
 
 def number(family: Family, hold: str) -> int:
-    """Return the number of a family's law in `jnt_user`; a new law is first compiled into the callback (seconds)."""
+    """Return the number of a family's law in `jnt_user`; the callback is recompiled for a new law (seconds)."""
     law = family.native if hold == "command" or family.sharp is None else family.sharp
     if law not in _laws:
         _laws.append(law)
@@ -81,12 +81,12 @@ def number(family: Family, hold: str) -> int:
 
 
 def install() -> None:
-    """Register the callback in MuJoCo, once per process. Models without MARKER in `jnt_user` are untouched."""
+    """Register the callback, once per process; the callback ignores models without MARKER in `jnt_user`."""
     _callback(tuple(_laws), registered())
 
 
 def _either(number: int, own: Callable, others: Callable) -> Callable:
-    """Return the compiled function that calls `own` if asked for `number`, else `others`."""
+    """Return a compiled function that calls `own` if its first argument is `number`, else `others`."""
     own = own if is_jitted(own) else njit(own)
 
     @njit(inline="always")
@@ -104,7 +104,7 @@ def _no_law(asked, p, v, h, memory):
 
 
 def _in_order(laws: tuple[Callable, ...]) -> Callable:
-    """Return the compiled function that calls one of these laws by its index."""
+    """Return a compiled function that calls one of the laws, selected by its index."""
     law: Callable = _no_law
     for k in reversed(range(len(laws))):
         law = _either(k, laws[k], law)
@@ -123,7 +123,7 @@ def _as_doubles(typingctx, address):
 
 
 @intrinsic
-def _stack(typingctx, count):  # NumPy's own arrays cost a step a tenth of its time
+def _stack(typingctx, count):  # NumPy's own arrays would take a tenth of a step's time
     def codegen(context, builder, signature, args):
         return builder.alloca(ir.DoubleType(), args[0])
 
@@ -149,7 +149,7 @@ def _first_moment(mass, xpos, xmat, h):
 
 @njit(inline="always")
 def _direction(v, net, z, user):
-    """Return the direction of load-dependent friction in [-1, 1], and its slope s/rad; z: bristle deflection."""
+    """Return the factor on load-dependent friction, in [-1, 1], and its slope by v, s/rad; z: bristle deflection."""
     if user[FAMILY] == BRISTLES:  # in the coming step, without bristle damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
@@ -179,9 +179,9 @@ def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) ->
 
 
 def _force_at(at: dict[str, int]) -> Callable:
-    """Return the force to compile; `at`: byte offsets of the fields of mjModel and mjData.
+    """Return the callback function to compile; `at`: byte offsets of the fields of mjModel and mjData.
 
-    The offsets are integers in the function's closure, so numba's cache distinguishes them.
+    The offsets are integers in the function's closure, so numba caches the function separately for other offsets.
     """
     nv_at, nbody_at, nuser_at = (at[k] // 8 for k in ("nv", "nbody", "nuser_jnt"))
     user_at, damping_at = (at[k] // 8 for k in ("jnt_user", "dof_damping"))
@@ -224,8 +224,8 @@ def _friction(sizes, user, q, dq, forces, places):
     """Add friction, offsets and errors of the gravity compensation to the passive force of a step.
 
     Args:
-        sizes: numbers of joints and bodies. user: (n, WIDTH), jnt_user. forces, places: addresses of arrays.
-        forces: damping, applied, passive, bias, M, userdata. places: xpos, xmat, xanchor, xaxis.
+        sizes: numbers of joints and bodies. user: (n, WIDTH), jnt_user.
+        forces, places: addresses of (damping, applied, passive, bias, M, userdata), (xpos, xmat, xanchor, xaxis).
     """
     n, nbody = sizes
     q, dq = carray(_as_doubles(q), (n,)), carray(_as_doubles(dq), (n,))  # type: ignore[call-arg]
@@ -238,7 +238,7 @@ def _friction(sizes, user, q, dq, forces, places):
     at = int(user[0, CONTACT])
     touch = at != 0
     joint = carray(_stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
-    # mass and first moment of all links beyond a joint: errors of gravity compensation (e), nominal (l)
+    # mass and first moment of all links beyond a joint: errors of gravity compensation (e), nominal values (l)
     em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(n - 1, -1, -1):
         if user[j, MARK] != MARKER:
@@ -289,7 +289,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by the control law's; n is a variable, as a constant n compiles for a minute."""
+    """Replace the applied torques by those of the control law; a variable n avoids a minute of compilation."""
     user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
     applied, kept = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[5]), (KEPT, n))
@@ -303,7 +303,7 @@ def _control(n, user, fields):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _drive(n, user, fields, places):
-    """Replace the applied torques by those after conditioning, safety filter, delay and lag.
+    """Change the applied torques by conditioning, safety filter, delay and lag, in this order.
 
     numba compiles a constant n into the code: loops unroll, and the filter takes half the time (benchmarks/law.py).
 
@@ -343,7 +343,7 @@ def _drive(n, user, fields, places):
 
 @njit(cache=True, error_model="numpy")
 def _push(limit, arm, body, places, last, bounds, sent):
-    """Limit the push of the command `sent` (n,) Nm; see push_limit.py. places: xpos, xmat, xanchor, xaxis."""
+    """Limit the push of the command `sent` (n,) Nm; places: addresses of xpos, xmat, xanchor, xaxis."""
     n = len(sent)
     xpos, xmat = carray(_as_doubles(places[0]), (body + 1, 3)), carray(_as_doubles(places[1]), (body + 1, 9))  # type: ignore[call-arg]
     anchor, axis = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))  # type: ignore[call-arg]
@@ -353,12 +353,12 @@ def _push(limit, arm, body, places, last, bounds, sent):
 
 @njit(cache=True, error_model="numpy")
 def _hold(forces, dq, user, joint, work, touch, touches):
-    """Change the passive force of a step so that the step ends with the velocities of stick_slip.py or contact.py.
+    """Change the passive force so that the step ends with the velocities that stick_slip.py or contact.py computes.
 
     Args:
         forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), output of
-            `_friction`. work: (2 n + 6, n), any content.
-        touch: contact and Jacobian of `near`. touches: the value that `near` returned.
+            `_friction`. work: (2 n + 6, n), scratch array.
+        touch: arrays `contact` and `jacobian` after `near`. touches: whether the tip may touch, result of `near`.
     """
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]

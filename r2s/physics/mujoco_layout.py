@@ -16,10 +16,10 @@ DATA_FIELDS = (  # in the order of mujoco_callback.py
 def struct_offsets(width: int, kept: int) -> dict[str, int]:
     """Return the byte offsets of MODEL_FIELDS in mjModel and DATA_FIELDS in mjData, found in a live model.
 
-    Pointers are found by the address of their NumPy view, sizes by their index in mjModel's introspection.
+    The address of a field's NumPy view identifies its pointer; a size has an index in MuJoCo's introspection.
 
     Args:
-        width: columns of `jnt_user` in the probed model. kept: rows of `userdata` (kept, n).
+        width: number of columns of `jnt_user` in the live model. kept: number of rows of its `userdata` (kept, n).
     """
     joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
     spec = mujoco.MjSpec.from_string(
@@ -34,7 +34,7 @@ def struct_offsets(width: int, kept: int) -> dict[str, int]:
         word = ctypes.cast(struct._address, ctypes.POINTER(ctypes.c_int64))
         missing = {getattr(struct, name).ctypes.data: name for name in names}
         k = 0
-        while missing:  # it ends: the struct contains every array's address
+        while missing:  # the loop ends, as the struct contains every array's address
             if name := missing.pop(word[k], None):
                 offsets[name] = 8 * k
             k += 1

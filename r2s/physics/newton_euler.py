@@ -1,8 +1,8 @@
 """Equations of motion of a serial arm, compiled: mass matrix and bias torque in about a microsecond.
 
 The bias torque comes from the recursive Newton-Euler algorithm with zero joint accelerations, the mass matrix from
-the composite-rigid-body algorithm (Featherstone 2008, ch. 5 and 6), both with moments about the base's origin. The
-code is independent of MuJoCo and DART, and tests compare the three.
+the composite-rigid-body algorithm (Featherstone 2008, ch. 5 and 6), both with moments about the base's origin.
+This code is independent of MuJoCo and DART, and tests compare its results with theirs.
 """
 
 from dataclasses import replace
@@ -14,14 +14,14 @@ from r2s.physics.description import chain
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 
-# Columns of `links`: position and rotation in the parent link at angle zero, axis, mass, centre of mass, tensor about
-# this centre in link axes.
+# Columns of `links`: position and rotation in the parent link at angle zero, axis, mass, center of mass, tensor about
+# this center in link axes.
 PLACE, FRAME, AXIS, MASS, COM, TENSOR, LINK = 0, 3, 12, 15, 16, 19, 28
 WORK = 22  # columns of the work array of `equations`
 
 
 def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return `links` (n, LINK) from masses (n,) kg, centres of mass (n, 3) m, tensors about them (n, 3, 3) kg m^2."""
+    """Return `links` (n, LINK) from masses (n,) kg, centers of mass (n, 3) m, tensors about them (n, 3, 3) kg m^2."""
     own = replace(Dynamics.of(robot, np.zeros((robot.n, 3))), mass=mass, com=com, inertia=inertia)
     rows = [
         [*link.origin[:3, 3], *link.origin[:3, :3].flat, *link.axis, link.mass, *link.com, *link.inertia.flat]
@@ -37,7 +37,7 @@ def equations(links, gravity, q, dq, mass, bias, work):
     Args:
         links: output of `links_of`. gravity: (3,) m/s^2 in the base frame.
         q, dq: (n,) rad, rad/s.
-        mass, bias: outputs. work: (n, WORK), any content.
+        mass, bias: outputs. work: (n, WORK), scratch array.
     """
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     px, py, pz = 0.0, 0.0, 0.0
@@ -81,7 +81,7 @@ def equations(links, gravity, q, dq, mass, bias, work):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _project(mass, bias, work):
-    """Sum forces and inertias of the links behind each joint, and project them onto the joint axes."""
+    """Sum the forces and inertias of the links that each joint carries, and project them onto the joint axes."""
     for j in range(len(bias) - 1, -1, -1):
         s = work[j]
         bias[j] = s[16] * s[3] + s[17] * s[4] + s[18] * s[5] + s[19] * s[0] + s[20] * s[1] + s[21] * s[2]
@@ -117,7 +117,7 @@ def joint_frame(R, link, angle):
         R: axes of the parent link (9 numbers, row by row). link: row of `links_of`. angle: rad.
 
     Returns:
-        offset from the parent link, m, the joint's axis, and the link's axes, all in base axes.
+        The link's offset from its parent link, m, its joint axis and its rotation matrix, all in base axes.
     """
     offset = rotate(R, link[PLACE], link[PLACE + 1], link[PLACE + 2])
     R = product(R, link, FRAME)

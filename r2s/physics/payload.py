@@ -1,7 +1,7 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A payload changes mass, centre of mass and inertia tensor of the last link, which is exact in every engine. An
-external force could not represent it, because the force would depend on the acceleration that it causes. The
+A payload changes mass, center of mass and inertia tensor of the last link, which is exact in every simulator. An
+external force could not represent a payload, because the force would depend on the acceleration that it causes. The
 payload's frame is that of `robot.ee_site`; on a Panda this is the flange, the frame of libfranka's setLoad.
 """
 
@@ -21,18 +21,18 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
 
-Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centres (..., n, 3) m, tensors (..., n, 3, 3)
+Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centers (..., n, 3) m, tensors (..., n, 3, 3)
 USUAL = 0.5  # usual payload mass and distance, as a share of the largest ones
 WATER = 1000.0  # kg/m^3
 
 
 @dataclass(frozen=True)
 class Payload:
-    """A payload; mass, centre of mass and inertia may have any leading batch shape.
+    """A payload; mass, center of mass and inertia may have any leading batch shape.
 
     Attributes:
         mass: (...) kg. centre: (..., 3) m, in the end-effector frame.
-        inertia: (..., 3, 3) kg m^2 about the centre, axes of the end-effector frame.
+        inertia: (..., 3, 3) kg m^2 about `centre`, axes of the end-effector frame.
         on_s, off_s: (...) s, times of attachment and removal on the clock of a motion.
     """
 
@@ -50,12 +50,12 @@ class Payload:
 def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload") -> Payload | None:
     """Return the payload that a setting describes as a number of kg, a mapping or a file; None for 0 kg.
 
-    A number is a point mass at the end effector. A mapping has `mass`, and optionally `centre` (3,) m, `inertia` (3
-    principal moments, or xx, yy, zz, xy, xz, yz, in kg m^2 about the centre; default: a sphere of water), `on_s`,
-    `off_s`. A file is the payload.yaml of an identification, or its run folder.
+    A number describes a point mass at the end effector. A mapping contains `mass`, and optionally `centre` (3,) m,
+    `inertia` (3 principal moments, or xx, yy, zz, xy, xz, yz, kg m^2 about `centre`; default: a sphere of water),
+    `on_s` and `off_s`. A string is the path of an identification's payload.yaml or run folder.
 
     Args:
-        value: the setting. name: its name, for errors. most: kg and m, as `Robot.payload_max`.
+        value: the setting. name: the setting's name, for error messages. most: kg and m, `Robot.payload_max`.
 
     Raises:
         UserError: mass, centre, tensor or times out of range, or no such file; the message begins with `name`.
@@ -116,7 +116,7 @@ def _of_file(name: str, path: Path) -> Any:
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
     """Return the tensor (3, 3) kg m^2 from 3 moments or 6 elements; None: the tensor of a sphere of water.
 
-    The largest allowed moment is that of the largest payload mass at twice the largest distance.
+    A principal moment may be at most m (2 d)^2, with the largest allowed mass m and distance d in `most`.
     """
     if value is None:
         return sphere_inertia(np.array(mass))
@@ -159,7 +159,7 @@ def ee_pose(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_payload(robot: Robot, payload: Payload | None, links: Links) -> Links:
-    """Return the links with the payload added to the last one; any leading batch shape."""
+    """Return the links with the payload added to the last link; all arrays may have any leading batch shape."""
     if payload is None:
         return links
     place, axes = ee_pose(robot)
@@ -183,7 +183,7 @@ def with_payload(robot: Robot, payload: Payload | None, links: Links) -> Links:
 def dynamics_with_payload(
     robot: Robot, dynamics: Dynamics, payload: Payload | None, declared: Payload | None = None
 ) -> Dynamics:
-    """Return the dynamics of an arm with this payload attached; on_s and off_s are ignored.
+    """Return the dynamics of an arm with a payload attached, regardless of the payload's on_s and off_s.
 
     declared: the payload declared to the arm's gravity compensation (libfranka's setLoad), right or wrong.
     """
@@ -192,7 +192,7 @@ def dynamics_with_payload(
 
 
 def mass_and_moment(robot: Robot, payload: Payload | None) -> np.ndarray:
-    """Return (..., 4): the payload's mass, kg, and its first moment in the last link's frame, kg m."""
+    """Return the payload's mass, kg, and first moment in the last link's frame, kg m, (..., 4)."""
     if payload is None:
         return np.zeros(4)
     place, axes = ee_pose(robot)
@@ -211,7 +211,7 @@ class LoadTorque:
         return mujoco.MjData(self._robot.model(gravity=False))
 
     def __call__(self, q: np.ndarray, load: np.ndarray, gravity: np.ndarray | None = None) -> np.ndarray:
-        """Return (n,) Nm at q (n,) rad.
+        """Return the joint torque (n,) Nm at q (n,) rad.
 
         Args:
             load: (4,) kg, kg m, from `mass_and_moment`. gravity: (3,) m/s^2 in the base frame; None: the robot's.

@@ -1,29 +1,29 @@
-"""Push limit: bounds the force with which a tool's tip presses on a surface, and its closing speed at contact.
+"""Push limit: it bounds the force with which a tool's tip presses on a surface, and the closing speed at contact.
 
-A push is a force along the inward normal, and J is the tip's Jacobian along it. With the tip's speed v and effective
-mass m = 1 / (J M^-1 J^T) in this direction (Khatib, IEEE J. Robotics and Automation 3(1), 1987),
+A push is a force along the surface's inward normal. With the tip's Jacobian J, speed v and effective mass
+m = 1 / (J M^-1 J^T) in this direction (Khatib, IEEE J. Robotics and Automation 3(1), 1987),
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
-P: push of the command; F >= 0: contact force; P_f: push of joint friction, |P_f| <= `hidden` =
-m |J M^-1| friction. Every millisecond the limit enforces
+Here P is the push of the command, F >= 0 the contact force, and P_f the push of joint friction, with |P_f| <=
+`hidden` = m |J M^-1| friction. Every millisecond, the push limit enforces two rules:
 
-1. P + hidden <= force_max,
-2. m dv/dt <= m RATE (v_max - v), with an estimate R of the force that resists the push: P <= R + m RATE (v_max - v).
-   v_max is `speed_near` at the surface and grows with the distance from it.
+- Force: P + hidden <= force_max.
+- Speed: dv/dt <= RATE (v_max - v), or P <= R + m RATE (v_max - v) with an estimate R of the force that resists the
+  push. The allowed speed v_max is `speed_near` at the surface and grows with the distance from the surface.
 
-R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. A tip in the air
-has R = 0 and cannot accelerate beyond v_max; a tip that presses has R = P, so its force can rise. If a tip is faster
-than v_max or leaves the surface, nothing resists it any more, and R is reset to 0.
+The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. In
+the air, R is 0, so the speed rule keeps the tip below v_max. In contact at rest, R is P, so the speed rule lets P
+rise. If the tip is faster than v_max or leaves the surface, nothing resists, and the limit resets R to 0.
 
-So the force is at most force_max + speed_near sqrt(k m) on a frictionless surface of stiffness k: when the force
-exceeds force_max, the tip's speed is at most speed_near, and from then on P + P_f - F brakes it. The friction mu F
-can push a sliding tip inwards with up to mu c F, c = m |T J M^-1 J^T n|, where T projects across the normal n. Then
-(1 - mu c) F replaces F: see `PushLimit.bound`.
+On a frictionless surface of stiffness k, the contact force is at most force_max + speed_near sqrt(k m): when it
+exceeds force_max, the tip's speed is at most speed_near, and from then on P + P_f - F < 0 brakes the tip. Surface
+friction mu F pushes a sliding tip inward with up to mu c F, where c = m |T J M^-1 J^T n| with the full Jacobian J and
+the projection T across the normal n. In the bound for a surface with friction, (1 - mu c) F replaces F.
 
-Both rules limit torques to half-spaces with the same normal J M^-1. The nearest torque within them, by Gauss'
-principle, is the target minus J^T f with a force f. The acceleration bounds of the joints (safety_filter.py) hold as
-well: regula falsi finds the f for which the torque within these bounds also satisfies the push limit.
+Force and speed rule limit the torque to half-spaces with the same normal J M^-1. Of all torques in both half-spaces,
+the nearest by Gauss' principle is the target minus J^T f with a force f. As the torque must also satisfy the joints'
+acceleration bounds (safety_filter.py), regula falsi finds the f whose bounded torque satisfies the push limit.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ from r2s.physics.safety_filter import WORK as FILTER_WORK
 from r2s.physics.tip import Tip, nominal_plane
 
 # Columns of a limit: settings, its state (R in N, the last speed in m/s, whether it has begun), and a stop's state
-# (contact_stop.py): phase, force N at its beginning, height m at which the tip released the surface, outward pull N
+# (contact_stop.py): phase, contact force N at its start, height m at which the tip left the surface, outward pull N
 FORCE_MAX, SPEED_NEAR, SLOPE, MARGIN, POINT, NORMAL, TIP, RADIUS, RESISTED, SPEED, BEGUN = (
     *(0, 1, 2, 3, 4, 7, 10, 13, 14, 15, 16),
 )
@@ -51,21 +51,21 @@ HOLD, RELEASE, RETREAT = 1, 2, 3  # values of STOP
 STOPS = {"hold": HOLD, "release": RELEASE, "retreat": RETREAT}
 LEAVE = 0.05  # m/s, outward tip speed in a stop: 20 N on 2e3 N/m are released in half of LEAVES_S
 WORK = 3  # rows of `work` in addition to n
-ROUNDS = 16  # largest number of trials of f
+ROUNDS = 16  # largest number of trial values of f
 CLOSE = 1e-2  # m/s^2, tolerance: inward acceleration may stay below its bound by up to this
-OVERSHOOT = 1.5  # largest closing speed over v_max: the tip brakes only as fast as the latency allows
+OVERSHOOT = 1.5  # largest ratio of closing speed to v_max: latency limits how fast the tip brakes
 STIFF = 1e5  # N/m, stiffest surface of conf/dr/contact.yaml
 NEAR_M = 0.3  # m, distance from the surface beyond which the limit does nothing
 
 
 @dataclass(frozen=True)
 class PushLimit:
-    """Settings of the push limit at a plane that is known roughly; the module's docstring defines them.
+    """Settings of the push limit (see the module) at a plane that is known approximately.
 
     Attributes:
         force_max: N. speed_near: m/s. point, normal: (3,) m and (3,), nominal plane in the base frame.
         place, tilt: m and rad, largest deviations of the true plane from the nominal plane.
-        stop: how a stop treats a contact force, a key of STOPS.
+        stop: kind of stop in contact, a key of STOPS (contact_stop.py).
     """
 
     force_max: float
@@ -77,7 +77,7 @@ class PushLimit:
     stop: str = "release"
 
     def columns(self, robot: Robot) -> np.ndarray:
-        """Return the columns (COLUMNS,) of the limit for the robot's tool, before the first cycle."""
+        """Return the `limit` (COLUMNS,) of `push_bound` for the robot's tool, before the first cycle."""
         Tip(robot)  # raises without a tool
         site, axes = ee_pose(robot)
         out = np.zeros(COLUMNS)
@@ -88,16 +88,16 @@ class PushLimit:
         return out
 
     def at(self, robot: Robot, friction: np.ndarray, q: np.ndarray) -> tuple[float, float]:
-        """Return effective mass, kg, and `hidden`, N, at q (n,) rad for joint friction (n,) Nm."""
+        """Return the effective mass, kg, at q (n,) rad, and the largest push, N, of joint friction (n,) Nm."""
         row = -self.normal @ Tip(robot)(q)[1]
         lever = InverseInertia(robot)(q[None])[0] @ row
         mass = 1.0 / float(row @ lever)
         return mass, mass * float(np.abs(lever) @ friction)
 
     def bound(self, robot: Robot, q: np.ndarray, stiffness: float, friction: float = 0.0) -> float:
-        """Return the largest force, N, on a surface of `stiffness`, N/m, and Coulomb `friction` at q (n,) rad.
+        """Return the largest contact force, N, at q (n,) rad for `stiffness`, N/m, and `friction` of a surface.
 
-        The bound is infinite where the surface's friction can push a sliding tip inwards without limit.
+        This force is infinite where surface friction can push a sliding tip inward without limit.
         """
         jacobian = Tip(robot)(q)[1]
         moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, by a force on the tip
@@ -115,17 +115,17 @@ def push_limit(
     asked: float = 0.0,
     stop: str | None = None,
 ) -> PushLimit | None:
-    """Return the push limit of the settings `safety.force_max` and `safety.speed_near`; None if both are null.
+    """Return the push limit for the settings `safety.force_max` and `safety.speed_near`; None if both are null.
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max: N. speed_near: m/s; None: the speed at which a surface of 1e5 N/m adds force_max.
+        force_max: N. speed_near: m/s; None: the speed that limits the force on 1e5 N/m to 2 force_max.
         plane: point and normal; None: a table below the tip at home. asked: N, largest force of the task.
-        stop: a key of STOPS; None: release (contact_stop.py).
+        stop: a key of STOPS (contact_stop.py); None: "release".
 
     Raises:
-        UserError: a value out of range, the robot has no tool, or force_max is below the task's force plus
-            twice the force that joint friction may hide.
+        UserError: a value is out of range, the robot has no tool, or force_max is less than the task's force plus
+            twice `hidden`, the largest push of joint friction.
     """
     if stop is not None and stop not in STOPS:
         raise UserError(f"task.stop: {stop!r}; {instead_of(stop, STOPS)}")
@@ -149,9 +149,9 @@ def push_limit(
 
 @njit(cache=True, error_model="numpy")
 def tip_motion(limit, kinematics, dq, row):
-    """Write the Jacobian J (n,) m/rad into `row`; return the tip's height m, two speeds m/s, and dJ/dt dq m/s^2.
+    """Write the Jacobian J (n,) m/rad into `row`; return the tip's height, m, two speeds, m/s, and dJ/dt dq, m/s^2.
 
-    Height: above the highest possible place of the true plane. Speeds: inwards, and along the plane.
+    The height is above the highest possible true plane; the speeds are inward and along the nominal plane.
     """
     position, R, anchor, axis = kinematics
     a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
@@ -190,15 +190,15 @@ def tip_motion(limit, kinematics, dq, row):
 
 @njit(cache=True, error_model="numpy")
 def push_bound(limit, arm, kinematics, last, friction, work):
-    """Return the bound, m/s^2, on the inward acceleration J M^-1 tau of a torque; infinite far from the surface.
+    """Return the upper bound, m/s^2, on J M^-1 tau, the tip's inward acceleration by a torque; inf far away.
 
     Args:
-        limit: (COLUMNS,) of `PushLimit.columns`, updated.
+        limit: (COLUMNS,) from `PushLimit.columns`; this function updates R and the last speed.
         arm: `JointDynamics`, finite. kinematics: position (3,) m and rotation (9,) of the last link, and anchors and
             axes (n, 3) of the joints, in the base frame.
         last: (n,) Nm, the torque that the arm applied last.
         friction: (n,) Nm, level of each joint's friction.
-        work: (n + WORK, n), any content; row n becomes J, and row n + 1 J M^-1.
+        work: (n + WORK, n), scratch array; afterward, row n contains J and row n + 1 contains J M^-1.
     """
     n = len(last)
     root, row, lever, none = work[:n], work[n], work[n + 1], work[n + 2]
@@ -231,9 +231,9 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit the push of torques `out` (n,) Nm, and joint accelerations with the contact force as a load.
+    """Limit the push of the torques `out` (n,) Nm, and the joint accelerations under the estimated contact force.
 
-    The arguments are those of `push_bound`; share, limits: see `filter_torque`. Return whether `out` changed.
+    Return whether `out` changed. See `push_bound` for the arguments, and `filter_torque` for share and limits.
     """
     n = len(out)
     own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()
@@ -251,7 +251,7 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     for j in range(n):
         mobility += row[j] * lever[j]
     # low, high: N, bracket of f; before, after: excess there. If no joint is at its bound, the first trial hits the
-    # middle of CLOSE: at its border, round-off would decide, and equivalent code would send another torque
+    # middle of the tolerance CLOSE: at its edge, round-off would decide, and equivalent code could differ
     low, high, after, force = 0.0, np.inf, 0.0, (before + 0.5 * CLOSE) / mobility
     for _ in range(ROUNDS):
         for j in range(n):
@@ -274,7 +274,7 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
 
 @njit(cache=True, error_model="numpy")
 def _excess(lever, bound, tau):
-    """Return by how much, m/s^2, the inward acceleration of torques tau (n,) Nm exceeds `bound`."""
+    """Return the excess, m/s^2, of the inward acceleration J M^-1 tau over `bound`; lever: J M^-1. tau: (n,) Nm."""
     out = -bound
     for j in range(len(tau)):
         out += lever[j] * tau[j]

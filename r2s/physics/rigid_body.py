@@ -1,8 +1,8 @@
 """Rigid-body functions of the nominal arm: regressor, inverse dynamics, mass matrix and end-effector kinematics.
 
-The regressor form is torque = regressor @ standard inertial parameters. These are ten numbers per link in the link's
-own frame, about the link's origin (Khalil and Dombre 2002, ch. 9): mass m, first moments h = m c, and the tensor's
-xx, yy, zz, xy, xz, yz.
+The regressor form is torque = regressor @ standard inertial parameters. A link's standard parameters are ten numbers
+in the link's own frame, about its origin (Khalil and Dombre 2002, ch. 9): mass m, first moments h = m c, and the
+tensor's xx, yy, zz, xy, xz, yz.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class LinkInertia:
 
     Attributes:
         mass: (..., n) kg. com: (..., n, 3) m, link frame.
-        inertia: (..., n, 3, 3) kg m^2 about the centre of mass, link axes.
+        inertia: (..., n, 3, 3) kg m^2 about the center of mass, link axes.
     """
 
     mass: np.ndarray
@@ -30,11 +30,11 @@ class LinkInertia:
     inertia: np.ndarray
 
     def standard(self) -> np.ndarray:
-        """Return (..., n, 10): m, h, and the tensor about the link's origin (parallel axes)."""
+        """Return each link's standard parameters (..., n, 10): mass, first moments, and tensor about the origin."""
         m, c = self.mass[..., None], self.com
         square = (c**2).sum(-1)[..., None, None] * np.eye(3) - c[..., :, None] * c[..., None, :]
         tensor = tensor_elements(self.inertia + m[..., None] * square)
-        lead = tensor.shape[:-1]  # each field may have its own batch
+        lead = tensor.shape[:-1]  # each field may have its own batch shape
         return np.concatenate([np.broadcast_to(m, (*lead, 1)), np.broadcast_to(m * c, (*lead, 3)), tensor], -1)
 
 
@@ -47,7 +47,7 @@ def tensor_elements(tensor: np.ndarray) -> np.ndarray:
 def regressor(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the regressor (T, n, n, 10): derivatives of each joint's torque by each link's standard parameters.
+    """Return the regressor (T, n, n, 10): the derivative of each joint torque by each link's standard parameters.
 
     Args:
         robot: the arm's kinematics.
@@ -62,7 +62,7 @@ def regressor(
     a = np.zeros((samples, 3)) - (0.0 if gravity is None else np.asarray(gravity))  # gravity as a base acceleration
 
     def at(a, omega, alpha, arm):
-        """Return the linear acceleration at the end of `arm`."""
+        """Return the acceleration, m/s^2, at `arm` from the point whose acceleration is `a`."""
         return a + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
 
     basis = np.zeros((6, 3, 3))
@@ -112,7 +112,7 @@ def rigid_body(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (rest (T, n) Nm, regressor (T, n, n, 10)): torque = rest + regressor @ standard parameters.
 
-    `rest` is the torque due to the file's armature and welded bodies. For the arguments see `regressor`.
+    The torque `rest` is due to the file's armature and welded bodies. See `regressor` for the arguments.
     """
     total = nominal_torque(robot, q, dq, ddq, False if gravity is None else gravity)
     y = regressor(robot, q, dq, ddq, gravity)
@@ -122,7 +122,7 @@ def rigid_body(
 def nominal_torque(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool | np.ndarray = True
 ) -> np.ndarray:
-    """Return the torque (T, n) Nm of the nominal links and rotors, without the soft springs of joint limits.
+    """Return the torque (T, n) Nm of the nominal links and rotors, without MuJoCo's forces at joint limits.
 
     q, dq, ddq: (T, n) rad, rad/s, rad/s^2. gravity: True (the robot's), False (none), or (3,) m/s^2.
     """
@@ -167,7 +167,7 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def set_links(
     model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
 ) -> None:
-    """Set a model's link masses (n,) kg, centres (n, 3) m, tensors about these (n, 3, 3), rotors (n,) kg m^2."""
+    """Set a model's link masses (n,) kg, centers of mass (n, 3) m, tensors (n, 3, 3) and rotors (n,) kg m^2."""
     at = model.jnt_bodyid
     model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com
@@ -192,7 +192,7 @@ class Kinematics:
 
 
 class InverseInertia:
-    """Inverse mass matrix of m nominal arms; 1 / diagonal is the inertia of a joint while the others are free."""
+    """Inverse mass matrix of m nominal arms; 1 / diagonal is a joint's inertia while the other joints are free."""
 
     def __init__(self, robot: Robot, m: int = 1):
         model = robot.model(gravity=False)

@@ -2,8 +2,8 @@
 
 r2s commands joint torques, so its model contains the file's joints and links, but no actuators, sensors, keyframes,
 free objects, gravity compensation or contacts. The file's damping and frictionloss are nominal values of the friction
-law (dynamics.py), so `Robot.model` sets both to 0, except nonlinear damping. The file's armature is the nominal rotor
-inertia. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
+law (dynamics.py), so `Robot.model` sets both to 0, but keeps nonlinear damping. The file's armature is the nominal
+rotor inertia. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of this size
 # Default payload limits, from a Panda's ratios (3 kg, 0.15 m, 87 Nm): payload weight times reach over the largest
-# torque limit, and distance of the payload's centre over reach.
+# torque limit, and distance of the payload's center over reach.
 PAYLOAD_SHARE, PAYLOAD_FAR = 0.33, 0.15
 OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot that tasks use, not `load_robot`
 
@@ -48,14 +48,14 @@ class Robot:
         ee_site: the site of `model` that is the end effector.
         gravity: (3,) m/s^2 in the base frame.
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
-        inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
+        inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its center of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
         damping: (n,) Nm s/rad and frictionloss: (n,) Nm from the file; 0 where the file has none.
-        velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit sqrt(2
-            deceleration distance + offset^2) - offset; distance: to the position limit. None: no limit of this kind.
+        velocity_envelope: None, or deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit
+            sqrt(2 deceleration distance + offset^2) - offset at a distance from the position limit.
         tool: the spherical tip that touches surfaces; None: no tool.
         lock: {joint: rad or m}, welded joints and their positions.
-        payload_max: (2,) largest payload mass, kg, and largest distance, m, from end effector to payload centre.
+        payload_max: (2,) largest payload mass, kg, and largest distance, m, from end effector to payload center.
     """
 
     name: str
@@ -134,7 +134,7 @@ class Robot:
 
 
 def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
-    """Return (n,) floats from a value per joint or one for all; joints: "the 7 joints of panda", for errors.
+    """Return (n,) floats from one value per joint or one for all; joints: their description in error messages.
 
     Raises:
         UserError: a wrong number of values, or values that are no numbers.
@@ -172,7 +172,7 @@ def load_robot(
     """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
 
     The file has position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
-    its motor) and q_home, as a keyframe named home; a URDF also has velocity limits. Neither format has limits of
+    its motor) and q_home, as a keyframe named home; a URDF also has velocity limits. MJCF and URDF have no limits of
     acceleration or torque rate. `gravcomp`, disabled gravity and objects on free joints are ignored.
 
     Args:
@@ -183,7 +183,7 @@ def load_robot(
         armature: kg m^2, rotor inertia at the joints; None: the file's.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
         lock: {joint: rad or m}, joints to weld at these positions, such as a gripper's; None: none.
-        payload_max, payload_far: kg, m, values of `Robot.payload_max`; None: from the torque limits and the reach.
+        payload_max, payload_far: kg, m, values of `Robot.payload_max`; None: estimates from torque limits and reach.
 
     Raises:
         UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
@@ -224,7 +224,7 @@ def load_robot(
 
 
 def _read(path: Path, lock: Mapping[str, float] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel, np.ndarray]:
-    """Return the file's spec, its checked model, and its velocity limits, nan where it has none."""
+    """Return the file's MjSpec, its checked model, and its velocity limits, rad/s, nan where the file has none."""
     if not path.is_file():
         raise UserError(f"robot.mjcf: no such file: {path}{nearest_file(path, '*.*')}")
     spec, fastest = read_spec(path, lock)
@@ -246,7 +246,7 @@ def _limits(
     q_home: list[float] | None,
     tau_max: list[float] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return q_min, q_max, q_home (n,) rad and tau_max (n,) Nm, checked; `each` replaces None by the file's value."""
+    """Return checked q_min, q_max, q_home (n,) rad and tau_max (n,) Nm; the file's values replace None."""
     limited = model.jnt_limited.astype(bool)
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
     high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
@@ -262,7 +262,7 @@ def _limits(
 def _payload_max(
     model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
 ) -> tuple[float, float]:
-    """Return `Robot.payload_max`: the given values, or estimates from torque limits and the reach beyond joint 2."""
+    """Return `Robot.payload_max`; estimates from torque limits and the reach beyond joint 2 replace None."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     sites = [model.site(i).name for i in range(model.nsite)]
@@ -277,7 +277,7 @@ def _payload_max(
 
 
 def _tensors(model: mujoco.MjModel) -> np.ndarray:
-    """Return the inertia tensors (n, 3, 3) kg m^2 of the moving links about their centres of mass, link axes."""
+    """Return the inertia tensors (n, 3, 3) kg m^2 of the moving links about their centers of mass, link axes."""
     rotation = np.zeros((model.njnt, 3, 3))
     for i, body in enumerate(model.jnt_bodyid):
         mujoco.mju_quat2Mat(rotation[i].reshape(9), model.body_iquat[body])
@@ -286,7 +286,7 @@ def _tensors(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _end_effector(model: mujoco.MjModel, name: str | None, path: Path) -> str:
-    """Return the name of the end effector's site, or of the body whose frame becomes one."""
+    """Return the name of the end effector, a site or a body of the model."""
     sites = [model.site(i).name for i in range(model.nsite)]
     bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name]
     if name is None:

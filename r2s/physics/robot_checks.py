@@ -13,7 +13,7 @@ DEGREES_FROM = 30.0  # limits between 30 rad and 360 rad are taken for degrees
 VIRTUAL = 0.01  # m: a link with joints closer than this is part of a universal joint and needs no mass
 WEIGHT = 2.0  # over tau_max: largest plausible gravity torque in the worst posture
 POSTURES = 200  # number of random postures in which gravity torque is computed
-WIDEST = 2.0  # arm lengths: no part of a link lies farther from its centre of mass
+WIDEST = 2.0  # arm lengths: no part of a link lies farther from its center of mass
 DENSEST = 2e4  # kg/m^3, tungsten: no link has smaller moments than a tungsten ball of its mass
 
 
@@ -78,7 +78,7 @@ def _check_couplings(model: mujoco.MjModel, name: str) -> None:
 
 
 def gravity_of(model: mujoco.MjModel, path: Path) -> np.ndarray:
-    """Return the file's gravity (3,) m/s^2, even if a flag of the simulation disables it.
+    """Return the file's gravity (3,) m/s^2, even if a flag in the file disables gravity.
 
     Raises:
         UserError: the file's gravity is zero.
@@ -103,8 +103,8 @@ def check_limits(
     """Raise UserError unless position and torque limits are complete and q_home lies within them.
 
     Args:
-        model, path: the arm and its file. low, high: (n,) rad, limits. home: (n,) rad. torque: (n,) Nm, limits.
-        unset: joints whose limits in the file are 0 to 0.
+        model, path: the arm and its file. low, high, home: (n,) rad, limits and home. torque: (n,) Nm, limits.
+        unset: names of joints with a range of 0 to 0 in the file.
     """
     if unset:
         raise UserError(
@@ -141,7 +141,7 @@ def check_limits(
 def check_masses(
     model: mujoco.MjModel, path: Path, gravity: np.ndarray, home: np.ndarray, torque: np.ndarray
 ) -> None:
-    """Raise UserError for implausible masses or moments of links; gravity: (3,) m/s^2, torque: (n,) Nm limits."""
+    """Raise UserError if a link's mass or tensor is implausible; gravity: (3,) m/s^2. torque: (n,) Nm, limits."""
     each = np.bincount(model.body_weldid, model.body_mass, model.nbody)[model.jnt_bodyid]
     names = [model.body(k).name or f"link {i + 1}" for i, k in enumerate(model.jnt_bodyid)]
     data = mujoco.MjData(model)

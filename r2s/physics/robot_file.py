@@ -1,6 +1,6 @@
 """Reader for the arm in an MJCF or URDF file: it drops elements of the simulation and welds locked joints.
 
-Objects on free joints, as in the file of a scene, are dropped. A gripper's fingers are welded at the positions in
+The reader drops objects on free joints, which scene files contain. A gripper's fingers are welded at the positions in
 `robot.lock` and become part of the link that carries them.
 """
 
@@ -20,7 +20,7 @@ FREE_OR_BALL = (JOINT.mjJNT_FREE, JOINT.mjJNT_BALL)
 
 
 def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
-    """Return the spec of an MJCF or URDF file and the velocity limits, (n,) or one, rad/s; nan: no limit.
+    """Return an MJCF or URDF file's MjSpec, and its velocity limits, rad/s, (n,) or a scalar; nan: no limit.
 
     Args:
         path: the file.
@@ -50,7 +50,7 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
 def strip(spec: mujoco.MjSpec) -> None:
     """Remove elements that describe the simulation, not the arm: motors, sensors, keyframes, physics switches.
 
-    A motor's damping is added to its joint; `rotors` reads the rotor inertia. The file must have passed `check_arm`.
+    Each joint receives its motor's damping; `rotors` returns the rotor inertia. `check_arm` comes first.
     """
     for actuator in spec.actuators:
         joint = spec.joint(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
@@ -81,7 +81,7 @@ def _is_loose(body: mujoco.MjsBody) -> bool:
 
 
 def _remove(spec: mujoco.MjSpec, loose: list[mujoco.MjsBody]) -> None:
-    """Delete bodies with every element that refers to them."""
+    """Delete loose bodies, and every element that refers to them."""
     spec.compile()  # so that keyframes lose the bodies' part of qpos, too
     bodies = [below for body in loose for below in (body, *body.find_all("body"))]
     gone = {x.name for body in bodies for x in (body, *body.joints, *body.sites, *body.geoms) if x.name}
@@ -91,7 +91,7 @@ def _remove(spec: mujoco.MjSpec, loose: list[mujoco.MjsBody]) -> None:
 
 
 def _forget(spec: mujoco.MjSpec, names: set[str]) -> None:
-    """Delete all sensors, and the equalities, tendons and actuators that refer to one of `names`."""
+    """Delete all sensors, and each equality, tendon and actuator that refers to an element in `names`."""
     for sensor in spec.sensors:
         spec.delete(sensor)
     for tendon in spec.tendons:

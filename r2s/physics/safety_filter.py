@@ -1,19 +1,19 @@
-"""Safety filter: the last stage before the arm. It limits accelerations near the speed and position limits.
+"""Safety filter: it limits joint accelerations near the speed and position limits, as the last stage before the arm.
 
-The same compiled function runs in training and on every arm. Its input is the effort, the target torque after the
-low-pass (r2s/physics/actuation.py); M is the arm's mass matrix. It applies three rules:
+The same compiled filter runs in training and on every arm. The filter's input is the effort, the target torque after
+the low-pass (r2s/physics/actuation.py). The safety filter consists of three limits:
 
-1. The policy's torque fades out as a joint approaches its velocity limit or a position limit.
-2. The acceleration a = M^-1 (tau - Coriolis torque) of each joint satisfies -RATE (v + dq) <= a <= RATE (v - dq),
-   where v is the speed allowed at q. Of all torques that satisfy this, the filter sends the one nearest to the effort
-   by Gauss' principle of least constraint: it adds the torques that stops at the joints would exert. Friction only
-   widens the bounds, so an overestimated friction never accelerates a joint.
-3. The torque is clipped to its range, and its rate is limited by one common factor for all joints: the command moves
-   on the straight line from the last command to the new torque. The torques that satisfy rule 2 are a convex set, so
-   rule 2 holds on that line. A rate limit per joint would violate rule 2 if two joint axes are almost parallel.
+- Fading: the policy's torque fades out as a joint approaches its velocity limit or a position limit.
+- Acceleration limit: each joint's acceleration a = M^-1 (tau - Coriolis torque) satisfies -RATE (v + dq) <= a <= RATE
+  (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within this limit, the filter selects
+  the nearest to the effort by Gauss' principle of least constraint: it adds the torques that mechanical stops would
+  exert. Joint friction only widens the limit, so an overestimated friction never accelerates a joint.
+- Rate limit: the torque is clipped to its range, and one common factor for all joints limits its rate. The command
+  thus moves on the straight line from the last command to the new torque, within the convex set of the acceleration
+  limit. With one rate limit per joint, the command could leave this set if two joint axes are almost parallel.
 
-Rule 2 is a control barrier function per joint (Ames et al., European Control Conference 2019). It is continuous in
-state and target, so it causes no chattering, and RATE tolerates the latency of an arm.
+The acceleration limit is a control barrier function (Ames et al., European Control Conference 2019). The filter is
+continuous in state and target, so it causes no chattering, and RATE tolerates the latency of an arm.
 """
 
 import math
@@ -29,11 +29,11 @@ from r2s.physics.robot import Robot
 
 # Latency budget, s: delays up to 8 ms and lags up to 3 ms on real arms, and one cycle.
 LATENCY_S = 0.012
-# 1/s, rate of rule 2. A first-order loop with delay d does not overshoot for rate * d <= 1/e: at equality
-# s + rate exp(-s d) = 0 has a double real root.
+# 1/s, rate of the acceleration limit. A first-order loop with delay d does not overshoot for rate * d <= 1/e: at
+# equality, s + rate exp(-s d) = 0 has a double real root.
 RATE = round(1 / (math.e * LATENCY_S))
 APPROACH = 0.25 * RATE  # 1/s, allowed speed per distance from a position limit: critical damping of the loop
-ALLOWED = 0.66  # share of dq_max that the filter allows; unmodelled friction adds to it (docs/explanation/safety.md)
+ALLOWED = 0.66  # share of dq_max that the filter allows; unmodeled friction adds to it (docs/explanation/safety.md)
 FADED = 0.82  # share of dq_max at which the policy's torque has faded out; it fades from ALLOWED on
 # Distance from a position limit at which the allowed speed towards it is 0: rad, but at most a tenth of the range.
 # From there on the policy's torque fades out over the share Q_FADE_SHARE of that distance.
@@ -68,8 +68,8 @@ class JointDynamics(NamedTuple):
 def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return the limits (n, COLUMNS) of `filter_torque`.
 
-    Light joints get added inertia (column ADDED), just enough that a full action of this joint or of a coupled one
-    passes the filter at rest. Added inertia makes the joint's loop faster than RATE; DELAY_PHASE bounds the inertia.
+    In the filter, light joints have added inertia (column ADDED), just enough that the largest target torque of this
+    or a coupled joint passes at rest. Added inertia makes a joint's loop faster than RATE; DELAY_PHASE bounds it.
 
     Args:
         robot: position, velocity, torque and rate limits, and the mass matrix at home.
@@ -94,7 +94,7 @@ class SafetyFilter:
     """The safety filter of one arm, with the mass matrix of a MuJoCo model.
 
     Attributes:
-        changed: number of cycles in which rule 1 or 2 changed the effort.
+        changed: number of cycles in which fading or acceleration limit changed the effort.
 
     Args:
         model: one arm without gravity. robot, torque: see `filter_limits`. friction: (n,) Nm, see `filter_torque`.
@@ -119,14 +119,14 @@ class SafetyFilter:
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def filter_torque(arm, effort, last, share, friction, limits, work, out):
-    """Write the command (n,) Nm of a cycle into `out`; return whether rule 1 or 2 changed the effort.
+    """Write a cycle's command (n,) Nm into `out`; return whether fading or acceleration limit changed the effort.
 
     Args:
         arm: `JointDynamics`, finite.
         effort: (n,) Nm, input. last: (n,) Nm, the command that the arm applied last.
-        share: factor on the allowed speeds, 1 except while braking.
+        share: factor on the allowed joint speeds, 1 or, while the arm brakes, less.
         friction: (n,) Nm, estimated friction, at least 0.
-        limits: (n, COLUMNS) of `filter_limits`. work: (2 n + WORK, n), any content.
+        limits: (n, COLUMNS) of `filter_limits`. work: (2 n + WORK, n), scratch array.
     """
     fades = fade(arm.q, arm.dq, effort, limits, out)
     changed = limit_acceleration(arm, share, friction, limits, work, out)
@@ -136,7 +136,7 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def fade(q, dq, effort, limits, out):
-    """Write the effort (n,) Nm, faded by rule 1, into `out`; return whether rule 1 reduced it."""
+    """Write the effort (n,) Nm, faded out near velocity and position limits, into `out`; return whether it fades."""
     kept = _torque_share(q, dq, limits)
     for j in range(len(q)):
         out[j] = kept * effort[j]
@@ -145,14 +145,14 @@ def fade(q, dq, effort, limits, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def limit_acceleration(arm, share, friction, limits, work, out):
-    """Apply rule 2 to the torques `out` (n,) Nm; return whether they violated it. Args: see `filter_torque`."""
+    """Apply the acceleration limit of `filter_torque` to the torques `out` (n,) Nm; return whether `out` changed."""
     joint_bounds(arm, share, limits, work)
     return bounded(arm, friction, limits, work, work[: len(out)], out)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def joint_bounds(arm, share, limits, work):
-    """Write the mass matrix's Cholesky root and the bounds of rule 2 into `work`, for all torques of a cycle."""
+    """Write the Cholesky root of the mass matrix and the acceleration bounds of a cycle into `work`."""
     q, dq, n = arm.q, arm.dq, len(arm.q)
     low, high, root = work[2 * n + _LOW], work[2 * n + _HIGH], work[:n]
     unpack(arm.mass, 1.0, limits[:, ADDED], root)
@@ -166,9 +166,9 @@ def joint_bounds(arm, share, limits, work):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def bounded(arm, friction, limits, work, desk, out):
-    """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether they exceeded them.
+    """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether `out` exceeded a bound.
 
-    desk: (n, n), overwritten; if it is `work[:n]`, the bounds can be used only once.
+    desk: (n, n), overwritten. With desk = `work[:n]`, the function destroys the Cholesky root in `work`.
     """
     n, dq = len(out), arm.dq
     ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]
@@ -192,7 +192,7 @@ def bounded(arm, friction, limits, work, desk, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def limit_rate(last, limits, out):
-    """Apply rule 3 to the torques `out` (n,) Nm; last: (n,) Nm, the previous command."""
+    """Limit range and rate of the torques `out` (n,) Nm; last: (n,) Nm, the previous command."""
     n, scale = len(out), 1.0
     for j in range(n):
         out[j] = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX]) - last[j]
@@ -204,7 +204,7 @@ def limit_rate(last, limits, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _torque_share(q, dq, limits):
-    """Return the factor on the policy's torque near a limit, from 1 to 0 (rule 1)."""
+    """Return the factor on the policy's torque, which falls from 1 to 0 near a velocity or position limit."""
     near = 0.0
     for j in range(len(q)):
         near = max(near, (abs(dq[j]) / limits[j, DQ_MAX] - ALLOWED) / (FADED - ALLOWED))
@@ -223,7 +223,7 @@ def _speed_limit(distance, share, limits):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _widen(dq, out, friction, limits, work):
-    """Write M^-1 and the bounds, widened by the acceleration that joint friction can cancel, into `work`."""
+    """Write M^-1 and the acceleration bounds, widened by what joint friction can cancel, into `work`."""
     n = len(out)
     root, mobility, slack = work[:n], work[n : 2 * n], work[2 * n + _SLACK]
     for j in range(n):
@@ -246,11 +246,11 @@ def _widen(dq, out, friction, limits, work):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _stop_torque(ddq, low, high, work, root):
-    """Write the torque (n,) Nm that stops at the joints exert into row _STOP of `work`, which contains M^-1.
+    """Write the torque (n,) Nm of fictitious joint stops into row _STOP of `work`, which contains M^-1.
 
-    It solves the linear complementarity problem low <= ddq + M^-1 stop <= high, in which a stop pushes inwards and
-    only at a bound, by block principal pivoting (Judice and Pires, Computers & Operations Research 21(5), 1994).
-    root: (n, n), overwritten.
+    The torque `stop` solves the linear complementarity problem low <= ddq + M^-1 stop <= high: a stop pushes inward,
+    and only at a bound. The solver is block principal pivoting (Judice and Pires, Computers & Operations Research
+    21(5), 1994). root: (n, n), overwritten.
     """
     n = len(ddq)
     mobility = work[n : 2 * n]

@@ -1,8 +1,8 @@
 """Simulator of many arms at once: `mujoco.batch.Batch` with friction, control law and safety filter in each step.
 
-The convention is libfranka's: a commanded torque excludes gravity, because the arm adds its own compensation. So the
-simulator has no gravity. The arm's compensation uses the nominal masses and centres of mass; its error acts as an
-additional torque (r2s/physics/mujoco_callback.py).
+The simulation has no gravity, and commanded torques exclude gravity (libfranka's convention), because the arm adds
+its own gravity compensation. The compensation uses the nominal masses and centers of mass; the torque of its error
+acts in addition (r2s/physics/mujoco_callback.py).
 """
 
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ from r2s.physics.robot import SIM_DT, Robot
 class Simulator:
     """Batch of `nsim` simulated arms, each with its own `Dynamics`, on `nthread` threads (0: all).
 
-    Results are bit-identical at any thread count.
+    The motion is bit-identical for any number of threads.
 
     Args:
         robot: the arm; with `robot.tool`, each simulated arm may have a surface (`Dynamics.surface`).
@@ -122,9 +122,9 @@ class Simulator:
         soft_start_s: float = 0.0,
         push_limit: PushLimit | None = None,
     ) -> None:
-        """Insert control law, low-pass and limits, safety filter, delay and lag between `rollout` and the joints.
+        """Enable control law, low-pass and limits, safety filter, delay and lag in all following steps.
 
-        Without a control law the torques of `rollout` are efforts: they enter the safety filter directly.
+        Without a control law, the torques passed to `rollout` are efforts, the input of the safety filter.
 
         Args:
             limits: (n, COLUMNS), see `r2s.physics.safety_filter.filter_limits`.
@@ -143,7 +143,7 @@ class Simulator:
             self._push[:] = self._push_limit = push_limit.columns(self.robot)
 
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
-        """Set the commands (nsim, c) of the control law until the next call.
+        """Set the control law's commands (nsim, c), which apply until the next call of `command`.
 
         speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: no noise.
         """
@@ -153,7 +153,7 @@ class Simulator:
             self._memory[:, native.NOISE * n : (native.NOISE + 1) * n] = speed_noise
 
     def push(self, tau: np.ndarray) -> None:
-        """Apply external joint torques tau (nsim, n) Nm until the next call, in addition to the arms' offsets."""
+        """Apply external joint torques tau (nsim, n) Nm until the next `push`, in addition to the arms' offsets."""
         self._user[:, :, native.OFFSET] = self._offset + tau
 
     def reset(
@@ -195,7 +195,7 @@ class Simulator:
         return {name: getattr(self, name) for name in (*names, "_offset", "_surfaces")}
 
     def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
-        """Apply torques tau (m, nstep, n) Nm, one per step; return {"qpos": (m, nstep, n), ...} after each step."""
+        """Simulate nstep steps with torques tau (m, nstep, n) Nm; return {"qpos": (m, nstep, n), ...}."""
         spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
         return self.batch.rollout(tau.shape[1], tau, control_spec=spec, record=record, ids=ids)
 
@@ -227,12 +227,12 @@ class Simulator:
 
     @property
     def box(self) -> np.ndarray:
-        """(nsim, 6), pose of the box that the tool pushes: centre, m, and first axis; requires a tool."""
+        """(nsim, 6), pose of the box that the tool pushes: center, m, and first axis; requires a tool."""
         return box_pose(self._contact)
 
     @property
     def depth(self) -> np.ndarray:
-        """(nsim,) m, penetration of the tool at the beginning of the last step; negative: distance to the surface."""
+        """(nsim,) m, penetration of the tool at the start of the last step, negative outside the surface."""
         return self._contact[:, DEPTH]
 
     def contact_torque(self) -> np.ndarray:

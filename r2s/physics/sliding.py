@@ -1,20 +1,20 @@
 """Dynamics of a box that a tip pushes on a table: three more velocities in the implicit contact of contact.py.
 
-Table friction: the limit surface is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
-Tanie, IROS 1992). With the velocity v of the centre, the spin w, the normal force N and u = (v, r w), the generalized
-friction on u is -mu N u / |u|. The ratio r of moment to force is the base points' mean distance from the centre
-(uniform pressure). Friction of a resting box is elastic up to the same limit: the deflection z follows dz/dt = u -
-|u| z / `RIGID`, with backward Euler, and the force is -mu N z / RIGID. In sliding both laws agree.
+The limit surface of table friction is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
+Tanie, IROS 1992). Table friction is -mu N u / |u| for the normal force N and the generalized velocity u = (v, r w) of
+a box with center velocity v and spin w. The ratio r of friction moment to force is the mean distance of the base's
+points from its center (uniform pressure). At rest, table friction is the elastic force -mu N z / `RIGID`: the
+deflection z follows dz/dt = u - |u| z / RIGID, in backward Euler. In sliding, z / RIGID equals u / |u|.
 
-The box is not a body of MuJoCo. So training, twins and engines share one compiled law, one solution contains joint
-friction and box, and simulations without a box do not change. The box stays on its base: it neither tilts nor lifts
-(`check_size` in box.py). The vertical force of the tip only changes the load on the base, and the tip does not touch
-the table.
+The box is not a body of the MuJoCo model. Training, twins and engines can therefore share one compiled law, which
+solves joint friction and the box together, and the box changes no simulation without a box. The box neither tilts nor
+lifts (`check_size` in box.py). The tip's vertical force only changes the load on the base; the tip does not touch the
+table.
 
-In a step the force F on the tip is linear in the velocities of tip and box: F = F0 - K d, where d is the change of
-the tip's velocity relative to the box. The box's velocity after the step is linear in F, with the mobility h W at the
-contact. So the box is eliminated: F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is the change of the tip's
-velocity and d_0 that of the box's velocity without F. The joint equations contain this softer contact.
+In a step, the contact force F on the tip is F = F0 - K d, where d is the change of the tip's velocity relative to the
+box. The box's velocity after the step is linear in the force F, with the mobility h W at the contact. Elimination of
+the box's velocity yields F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is the change of the tip's velocity,
+and d_0 the change of the box's velocity for F = 0. The joint equations contain this softer contact force.
 """
 
 import numpy as np
@@ -46,7 +46,7 @@ from r2s.physics.contact_layout import (
 )
 
 RIGID = 1e-6  # m, largest elastic deflection of a box on its table
-STILL = 1e-6  # m/s, an untouched slower box is at rest: table friction stops a box from 4e-3 m/s within 1 ms
+STILL = 1e-6  # m/s, a slower box without contact is at rest: table friction stops a box from 4e-3 m/s within 1 ms
 ROUNDS = 30  # largest number of guesses of the box's speed
 CLOSE = 1e-4  # relative error of the speed at which the guesses end
 
@@ -60,7 +60,7 @@ def _cross(a, b, out):
 
 @njit(cache=True, error_model="numpy")
 def load_box(contact, x, y, z):
-    """Write the lever arm of a contact at x, y, z m, and the largest table friction under the last step's force."""
+    """Write the lever arm of a contact at x, y, z, m, and the largest table friction for the last contact force."""
     a, b, c = contact[POINT], contact[POINT + 1], contact[POINT + 2]
     contact[ARM], contact[ARM + 1], contact[ARM + 2] = x - a, y - b, z - c
     down = 0.0
@@ -71,7 +71,7 @@ def load_box(contact, x, y, z):
 
 @njit(cache=True, error_model="numpy")
 def contact_point_velocity(contact, motion, out):
-    """Write the velocity (3,) m/s of the box at the contact; motion: velocity of the centre (3,) and spin."""
+    """Write the velocity (3,) m/s of the box at the contact; motion: velocity of the center (3,) and spin."""
     _cross(contact[UP : UP + 3], contact[ARM : ARM + 3], out)
     for k in range(3):
         out[k] = motion[k] + motion[3] * out[k]
@@ -79,14 +79,14 @@ def contact_point_velocity(contact, motion, out):
 
 @njit(cache=True, error_model="numpy")
 def _grip(contact, speed, h):
-    """Return spring, N/m, and damper, N s/m, of table friction -(spring z + damper u'); u': u after the step."""
+    """Return spring, N/m, and damper, N s/m, of table friction -(spring z + damper u) with u after the step."""
     stiff = contact[LOAD] / RIGID / (1.0 + h * speed / RIGID)
     return stiff, h * stiff
 
 
 @njit(cache=True, error_model="numpy")
 def _free_change(contact, speed, h, out):
-    """Write the change of the box's motion (4,) without tip force; return h times mobilities, s/kg, s/(kg m^2)."""
+    """Write the box's velocity change (4,) without tip force; return h times its mobilities, s/kg, s/(kg m^2)."""
     spring, damper = _grip(contact, speed, h)
     reach, strain = contact[REACH], contact[STRAIN : STRAIN + 4]
     along = h / (contact[MASS] + h * damper)
@@ -99,7 +99,7 @@ def _free_change(contact, speed, h, out):
 
 @njit(cache=True, error_model="numpy")
 def _pushed(contact, force, change, along, about, out):
-    """Write the box's motion (4,) after a step with the contact `force` (3,) N on the tip and -force on the box."""
+    """Write the velocity and spin (4,) of the box after a step with `force` (3,) N on the tip, -force on the box."""
     up, lever = contact[UP : UP + 3], np.empty(3)
     _cross(up, contact[ARM : ARM + 3], lever)
     upwards, moment = 0.0, 0.0
@@ -119,22 +119,22 @@ def _speed(contact, motion):
 
 @njit(cache=True, error_model="numpy")
 def _next_speed(contact, old, found, h):
-    """Return the next guess. In straight motion found = free old / (old + h load / mass), free: frictionless."""
+    """Return the next guess of the box's speed after the guess `old` resulted in the speed `found`, m/s."""
     if old <= 0.0:
         return found
-    slowing = h * contact[LOAD] / contact[MASS]
+    slowing = h * contact[LOAD] / contact[MASS]  # straight motion: found = frictionless speed * old / (old + slowing)
     return min(max(found + slowing * (found - old) / old, 0.25 * found), 4.0 * found)
 
 
 @njit(cache=True, error_model="numpy")
 def start_box(contact, guess):
-    """Write the first guess: the speed of the box does not change."""
+    """Write the first guess of the box's speed after the step: its present speed."""
     guess[BOX_SPEED] = _speed(contact, contact[VELOCITY : VELOCITY + 4])
 
 
 @njit(cache=True, error_model="numpy")
 def yielding(contact, force, h, guess):
-    """Write FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m of the contact with a box that yields.
+    """Write the columns FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m for the contact with a box that can move.
 
     force: (3,) N, force on the tip for an unchanged velocity of the tip relative to the box.
     """
@@ -183,7 +183,7 @@ def _divide(a, vector, matrix):
 def yielded(contact, tip, h, guess, point):
     """Write the box's velocity at the contact to `point`; return the relative error of table friction.
 
-    tip: (3,) m/s, tip velocity; both velocities are those after the step. The guessed box speed causes the error.
+    Both velocities, `point` and `tip` (3,) m/s, are those after the step. The guessed box speed causes the error.
     """
     force, change = np.empty(3), np.empty(4)
     for i in range(3):
@@ -201,7 +201,7 @@ def yielded(contact, tip, h, guess, point):
 
 @njit(cache=True, error_model="numpy")
 def move_box(contact, motion, h):
-    """Move the box for h s with `motion` (4,), its motion after the step; store motion and elastic deflection."""
+    """Move the box for h s with its velocity and spin `motion` (4,); store both and the elastic deflection."""
     share, length = 1.0 / (1.0 + h * _speed(contact, motion) / RIGID), 0.0
     for k in range(4):
         rate = motion[k] if k < 3 else contact[REACH] * motion[3]

@@ -1,13 +1,13 @@
 """Stick and slip of coupled joints within one step: which joints stick, break away, stop or reverse, and when.
 
 A joint at rest sticks while the net torque on it lies within its breakaway edges; the net torque includes the
-coupling to other joints, but not the joint's own friction. Beyond an edge the joint slides, against the friction of
-that direction. Torques are constant during a step, so accelerations are constant between events, and each event is
-located exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996).
-Time stepping would apply the friction at the end of a step to the whole step: at each reversal, an error of up to h
-times that friction.
+coupling to other joints, but not the joint's own friction. If the net torque exceeds a breakaway edge, the joint
+slides against the friction of that direction. Torques are constant during a step, so accelerations are constant
+between events, and each event is located exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynamics
+with Unilateral Contacts, 1996). Time stepping would apply the friction at the end of a step to the whole step, so the
+impulse of each reversal would have an error of up to h times the friction.
 
-MuJoCo simulates the joint limits; their force is added to the result of this module.
+MuJoCo adds the force of the joints' position limits to the stick-slip forces.
 """
 
 from typing import NamedTuple
@@ -38,9 +38,9 @@ class JointForces(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def any_reversal(mass, damping, h, dq, net, work):
-    """Return whether a joint reverses if all joints keep sliding under the net torque (n,) Nm, friction included.
+    """Return whether a joint would reverse if all joints kept sliding under `net` (n,) Nm, friction included.
 
-    The other arguments are those of `coming_velocity`.
+    See `coming_velocity` for all arguments except `net`.
     """
     n = len(dq)
     root, change = work[:n], work[n]
@@ -59,13 +59,13 @@ def any_reversal(mass, damping, h, dq, net, work):
 def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
     """Write the velocities (n,) at the end of a step into `coming`; return whether stiction had an effect.
 
-    Without stiction they solve (mass + h damping) (coming - dq) = h (drive - friction).
+    Without stiction, the velocities solve (mass + h damping) (coming - dq) = h (drive - friction).
 
     Args:
-        mass: packed mass matrix, kg m^2. damping: (n,) Nm s/rad, implicit. h: s.
+        mass: packed mass matrix, kg m^2. damping: (n,) Nm s/rad, implicit. h: s, duration of the step.
         forces: `JointForces`.
-        dq_min: rad/s, a slower joint stops if its net torque is within its edges.
-        work: (n + 4, n), any content. coming: (n,) rad/s.
+        dq_min: rad/s, speed below which a joint stops if the net torque on it lies within its breakaway edges.
+        work: (n + 4, n), scratch array. coming: (n,) rad/s.
     """
     n = len(forces.dq)
     root, side, friction, acceleration, impulse = work[:n], work[n], work[n + 1], work[n + 2], work[n + 3]
@@ -84,7 +84,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
             if j < 0 or events > 4 * n:  # after so many stops no joint breaks away in this step
                 break
             side[j] = direction if coming[j] == 0.0 else np.sign(coming[j])
-            on = side[j] * forces.dq[j] > 0.0  # it slides in its old direction
+            on = side[j] * forces.dq[j] > 0.0  # the joint keeps its direction
             friction[j] = forces.friction[j] if on else forces.rest[int(side[j] > 0.0), j]
             took_part |= not on
         if slow:  # an impulse stops the slow sticking joints; the coupling transmits it to the others
@@ -113,7 +113,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
 
 @njit(cache=True, error_model="numpy")
 def _initial_sides(forces, dq_min, side, friction, coming):
-    """Write side, friction and velocity of each joint; return whether a sticking joint moves and whether all rest."""
+    """Write each joint's side, friction and velocity; return whether a sticking joint moves, and whether all rest."""
     dq, drive, edges, n = forces.dq, forces.drive, forces.edges, len(forces.dq)
     slow, held, inside = False, 0, True
     for j in range(n):

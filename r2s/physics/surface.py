@@ -1,8 +1,8 @@
 """A tool's tip and the surface that it touches: contact parameters, for simulation and identification.
 
-Normal force (Hunt and Crossley, ASME J. Appl. Mech. 1975): F = K d^e (1 + c d') >= 0, with the penetration depth d
-of the tip. K = k / (1 mm)^(e - 1), so that k d is the undamped force at d = 1 mm for every exponent. Tangential
-force: mu F in sliding, against the velocity.
+The normal force at the tip's penetration depth d is F = K d^e (1 + c d') >= 0 (Hunt and Crossley, ASME Journal of
+Applied Mechanics 1975). With K = k / (1 mm)^(e - 1), k d is the undamped force at d = 1 mm for every exponent e. The
+tangential force in sliding is mu F, against the velocity.
 """
 
 import json
@@ -25,8 +25,8 @@ class Tool:
     """A spherical tip at the end effector.
 
     Attributes:
-        tip: (3,) m, centre of the sphere in the frame of the end effector's site.
-        radius: m. mass: kg, at the centre; r2s simulates it only if it is also a payload (r2s/physics/payload.py).
+        tip: (3,) m, center of the sphere in the frame of the end effector's site.
+        radius: m. mass: kg, at the center; r2s simulates it only if it is also a payload (r2s/physics/payload.py).
     """
 
     tip: np.ndarray
@@ -39,13 +39,13 @@ class Surface:
     """A compliant plane or box in the base frame; fields may have batch axes, for many arms at once.
 
     Attributes:
-        point: (3,) m, on the plane, or the centre of the box.
+        point: (3,) m, on the plane, or the center of the box.
         normal: (3,) unit vector, out of the material; for a box, its third axis.
         stiffness: N/m, k, force per depth at 1 mm. exponent: e, 1 (linear) to 1.5 (Hertz).
-        damping: s/m, c. friction: mu. bristle: m, tangential deflection at which friction reaches mu F; 0: rigid.
+        damping: s/m, c. friction: mu. bristle: m, tangential deflection at which friction is mu F; 0: no deflection.
         half: (3,) m, half edges of a box; None: a plane. axes: (3, 3), its axes in columns.
         mass: kg, mass of a box that slides on a table if pushed (sliding.py); None: the surface is fixed.
-        table: friction coefficient between that box and its table.
+        table: friction coefficient between a sliding box and its table.
     """
 
     point: np.ndarray
@@ -62,7 +62,7 @@ class Surface:
 
     @property
     def reach(self) -> np.ndarray:
-        """Mean distance, m, of the points of a box's base from the base's centre."""
+        """Mean distance, m, of the points of a box's base from the base's center."""
         a, b = np.moveaxis(np.asarray(self.half), -1, 0)[:2]
         return np.hypot(a, b) / 3 + a**2 / (6 * b) * np.arcsinh(b / a) + b**2 / (6 * a) * np.arcsinh(a / b)
 
@@ -72,7 +72,7 @@ class Surface:
         return self.stiffness / UNIT_DEPTH ** (self.exponent - 1.0)
 
     def depth(self, centre: np.ndarray, radius: float) -> np.ndarray:
-        """Return the penetration (...,) m of a sphere at centre (..., 3) m; negative: distance to the surface."""
+        """Return the penetration (...,) m of a sphere at `centre` (..., 3) m, negative outside the surface."""
         if self.half is None:
             return radius - ((centre - self.point) * self.normal).sum(-1)
         beyond = np.abs(((centre - self.point)[..., None] * self.axes).sum(-2)) - self.half
@@ -114,7 +114,7 @@ class Surface:
 
 @njit(cache=True, error_model="numpy")
 def normal_force(K, exponent, damping, depth, rate):
-    """Return the normal force, N, at a penetration (m) and its rate (m/s); see the module."""
+    """Return the normal force, N, of Hunt and Crossley's law at a penetration `depth`, m, and its `rate`, m/s."""
     if depth <= 0.0:
         return 0.0
     return max(K * depth**exponent * (1.0 + damping * rate), 0.0)

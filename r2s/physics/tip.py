@@ -14,7 +14,7 @@ ROUNDS = 60
 
 
 class Tip:
-    """Kinematics of the centre of a robot's tip in the nominal geometry.
+    """Kinematics of the center of a robot's tip in the nominal geometry.
 
     Raises:
         UserError: the robot has no tool.
@@ -51,7 +51,7 @@ class Tip:
 
 
 def tilted(normal: np.ndarray, about: np.ndarray | float, tilt: np.ndarray | float) -> np.ndarray:
-    """Return a normal (3,) tilted by `tilt` rad in the direction `about` rad; for angles (m, 1): (m, 3)."""
+    """Return a normal (3,), or (m, 3) for angles (m, 1), tilted by `tilt` rad in the direction `about` rad."""
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     across /= np.linalg.norm(across)
     aside = np.cos(about) * across + np.sin(about) * np.cross(normal, across)
@@ -68,7 +68,7 @@ def default_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nominal_plane(robot: Robot, point: object = None, normal: object = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return point (3,) m and unit normal (3,) of a plane; `default_plane` replaces None."""
+    """Return point (3,) m and unit normal (3,) of a plane; those of `default_plane` replace None."""
     default = default_plane(robot)
     values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), default, strict=True)]
     for name, value in zip(("point", "normal"), values, strict=True):

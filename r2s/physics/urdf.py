@@ -1,7 +1,7 @@
 """URDF reader: links, joints, limits, rotor inertia and primitive shapes.
 
-Meshes, materials and elements for simulators are ignored. The base and links fixed to it do not move, so their
-inertia is ignored, too. A link that is fixed to a moving link becomes part of the moving link.
+The reader ignores meshes, materials, elements for simulators, and the inertia of the base and of links fixed to the
+base, which do not move. A link that is fixed to a moving link becomes part of the moving link.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,7 +19,7 @@ ROUNDED = 1e-9  # tolerated round-off of a tensor in the file, as a share of its
 DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements; URDF itself has none
 ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
 ET.register_namespace("drake", DRAKE)
-NO_RANGE = "limits 0 to 0"  # marks such a joint in `info`
+NO_RANGE = "limits 0 to 0"  # value of `info` that marks a joint with these limits
 COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers in an attribute; 1 in all others
 
 
@@ -98,7 +98,7 @@ class _Reader:
         return UserError(f"robot.mjcf: {self.path.name}: {message}")
 
     def _named(self, root: ET.Element, tag: str) -> dict[str, ET.Element]:
-        """Return the elements with a tag, by name."""
+        """Return {name: element} of all elements with a tag."""
         out: dict[str, ET.Element] = {}
         for element in root.findall(tag):
             name = element.get("name")
@@ -108,7 +108,7 @@ class _Reader:
         return out
 
     def _lock(self, at: dict[str, float]) -> None:
-        """Fix joints, and joints that mimic them, at positions, rad or m."""
+        """Fix the joints in `at` ({name: rad or m}), and joints that mimic them, at these positions."""
         for name in at:
             if name not in self.joints:
                 joints = choices(self.joints)
@@ -177,7 +177,7 @@ class _Reader:
         return name
 
     def _tree(self, link: str, *, fixed: bool = False) -> Iterator[tuple[ET.Element, str]]:
-        """Yield each joint beyond a link and its child link, parents first; fixed: follow only fixed joints."""
+        """Yield each joint beyond `link` with its child link, parents first; fixed: only through fixed joints."""
         for joint in self.children[link]:
             if not fixed or joint.get("type") == FIXED:
                 child = self._end(joint, "child")

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; centre (3,), m; tensor (3, 3) about it, kg m^2
+Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; center (3,), m; tensor (3, 3) about it, kg m^2
 
 
 def combined(parts: list[Inertia]) -> Inertia:
@@ -18,7 +18,7 @@ def combined(parts: list[Inertia]) -> Inertia:
 
 
 class Bodies:
-    """Masses, centres of mass and tensors of all bodies, and the poses of welded bodies in moving ones."""
+    """Masses, centers of mass and tensors of all bodies, and the poses of welded bodies in moving bodies."""
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model
@@ -37,7 +37,7 @@ class Bodies:
         return body, pose
 
     def lumped(self, body: int) -> Inertia:
-        """Return mass, centre of mass and tensor about it for `body` together with all bodies welded to it."""
+        """Return mass, center of mass and tensor about it for `body` together with all bodies welded to `body`."""
         parts = [(self.mass[body], self.com[body], self.inertia[body])]
         for other in range(1, self.model.nbody):
             anchor, pose = self.moving_parent(other)

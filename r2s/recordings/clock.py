@@ -12,7 +12,7 @@ ALIKE = 0.05  # if the joints' speed factors spread less than this (relative), t
 
 
 def speed_factors(recording: Recording) -> np.ndarray:
-    """Return each joint's ratio (n,) of the change of q to the integral of dq; nan if motion does not determine it.
+    """Return each joint's speed factor (n,), the change of q over the integral of dq; nan without enough motion.
 
     A linear trend is removed from q and from the integral in each trajectory, so that a bias of dq has no effect.
     """
@@ -34,10 +34,10 @@ def speed_factors(recording: Recording) -> np.ndarray:
 
 
 def check_clock(recording: Recording) -> np.ndarray:
-    """Return `speed_factors` (n,) after a check that each of them is near 1 or nan.
+    """Check that each joint's speed factor is near 1 or nan, and return the speed factors (n,).
 
     Raises:
-        UserError: t is too fast or too slow for the velocities, or a joint's dq has another scale than its q.
+        UserError: t runs too fast or too slowly for the velocities, or the scales of a joint's q and dq differ.
     """
     factor = speed_factors(recording)
     seen = np.flatnonzero(np.isfinite(factor))

@@ -57,7 +57,7 @@ def find_columns(
     constant: np.ndarray | None = None,
     robot_joints: Sequence[str] | None = None,
 ) -> list[str]:
-    """Return the names of a field's columns; [] if the field is optional and the file lacks it.
+    """Return the names of a field's columns; [] for an optional field without columns in the file.
 
     Columns that are named after joints are returned in the order of `robot_joints`, the names of the robot's joints.
     """
@@ -115,7 +115,7 @@ def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
 
 
 def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -> list[str]:
-    """Return a column per joint, named after the joint and the same one of `words`; [] if a joint has no column."""
+    """Return one column per joint, named by the joint and one word of `words`; [] if a joint has no such column."""
     found: dict[str, dict[int, str]] = {}
     for column in table:
         joint, rest = _joint_of(column, robot_joints)
@@ -148,7 +148,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
         user: the user's joint names, data.joints. robot_joints, n: names and number of the robot's joints.
 
     Raises:
-        UserError: the user names joints, but the file does not, or a joint is missing.
+        UserError: `user` names joints but the file names none, or the file lacks a joint.
     """
     key = next((k for k in NAMES if k in table and table[k].ndim == 1 and table[k].dtype.kind in "USO"), None)
     if key is None:
@@ -167,7 +167,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return the columns named `pattern` with {} = first, first + 1, ... (first None: 0 if present, else 1)."""
+    """Return the columns named `pattern` with {} = first, first + 1, ...; first=None: from 0 if it exists, else 1."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)
@@ -181,7 +181,7 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Return the error for a missing column; a column with another kind of torque is not suggested as a typo."""
+    """Return the error for a missing column, with a hint: a similar name, or another kind of torque in the file."""
     if field == "tau" and _match(table, "q", "ddq"):
         return UserError(
             "no torque, but ddq: this is a planned motion; let the arm follow it, and give the arm's own log"

@@ -23,7 +23,7 @@ EXAMPLE = "t,q1,q2,...,dq1,dq2,...,tau1,tau2,..."
 def read_csv(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a CSV file by name, (T,) each.
 
-    The header is the line above the first line of numbers; it may begin with `#` or `%`. Lines above it are skipped.
+    The header is the line above the first numeric line; it may begin with `#` or `%`. Earlier lines are skipped.
 
     Raises:
         UserError: no header, or rows of another length than the header.
@@ -37,7 +37,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
         raise UserError("cannot be read as csv: No columns to parse from file")
     plain = [k for k in filled if lines[k].lstrip()[0] not in MARKS]
     first: int | None = next((k for k in plain if _is_numeric(lines[k])), None)
-    if first is None:  # no line is numeric, as a column is text: the header is the first line
+    if first is None:  # a text column makes no line numeric: the header is the first line
         title = plain[0] if plain and plain[0] == filled[0] else filled[0]
         first = next((k for k in filled if k > title), title + 1)
     above = [k for k in filled if k < first]
@@ -65,7 +65,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbers(column: pd.Series) -> pd.Series:
-    """Return a column of text as numbers if only its last number is cut off, such as "-" or "1.2e"."""
+    """Convert a text column to numbers if only its last cell is cut off, such as "-" or "1.2e"."""
     text = column.dtype.kind not in "iufb" and len(column) > 1
     if not text or not re.fullmatch(r"[+-]?[\d.]*(e[+-]?)?", str(column.iloc[-1])):
         return column
@@ -88,7 +88,7 @@ def bare_name(name: str) -> tuple[str, float]:
     found = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name)
     unit = found[2].strip().lower() if found else ""
     if not found or unit not in UNITS or (unit in ("a", "ma") and not found[1].lower().startswith(("i", "current"))):
-        return name, 1.0  # `tau1 [A]` is no torque
+        return name, 1.0  # `tau1 [A]` is a current
     return found[1], UNITS[unit]
 
 
@@ -103,7 +103,7 @@ def _encoding(head: bytes) -> str:
 
 
 def _separator(line: str) -> str:
-    """Return the separator of a line, "" for spaces; in a line with a semicolon or tab, commas are decimal commas."""
+    """Return a line's separator, "" for spaces; if a line has semicolons or tabs, its commas are decimal commas."""
     return next((mark for mark in ";\t," if mark in line), "")
 
 

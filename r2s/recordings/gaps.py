@@ -1,10 +1,10 @@
-"""Find pauses in a log: `longest_step` is the longest time step that is not a pause."""
+"""Find pauses in a log: a pause is a time step longer than `longest_step`."""
 
 import numpy as np
 
 from r2s.errors import UserError
 
-LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; a pause is longer than both, a shorter gap only lacks frames
+LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; a pause exceeds both; in a shorter gap, frames are lost
 SLOWEST_S = 0.2  # s; a longer median step means that t is not in seconds; below 5 Hz unit_checks.py checks nothing
 SLACK = 1e-6  # relative tolerance for round-off: steps of a 20 Hz clock are not exactly 0.05 s
 

@@ -12,16 +12,16 @@ COMPARED_S = 60.0  # s, total length of the parts of a recording in which dq is 
 EDGE = 100  # ms that are ignored at both ends of a trajectory, where the filter has transients
 BLOCK = 500  # ms, length of blocks whose errors are treated as independent
 LATE_S, SURE = 5e-4, 3.0  # s (half a step) and standard deviations; lateness below either is not corrected
-OFF = 0.05  # share of the RMS speed; if the error of corrected dq is larger, dq is another signal
+OFF = 0.05  # share of the RMS speed; if the error of corrected dq is larger, dq is not the derivative of q
 
 
 @dataclass(frozen=True)
 class Lateness:
-    """Lateness of dq against the derivative of q.
+    """Delay of the logged dq relative to the derivative of q.
 
     Attributes:
-        s: (n,) lateness in s; nan: dq is not the derivative of q, or the joint does not move. sigma: (n,) s, standard
-        deviation of `s`. filtered: whether `s` is the time constant of a first-order filter of dq, or else a delay.
+        s: (n,) s, lateness; nan if dq is not the derivative of q or the joint does not move. sigma: (n,) s, standard
+            deviation of `s`. filtered: whether `s` is the time constant of a first-order filter; if not, a delay.
     """
 
     s: np.ndarray
@@ -30,13 +30,13 @@ class Lateness:
 
     @property
     def sure(self) -> np.ndarray:
-        """Lateness to correct, (n,) s: 0 where `s` is too small or too uncertain, nan where `s` is nan."""
+        """Lateness (n,) s for the correction: `s`, with 0 in place of values that are too small or too uncertain."""
         seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
         return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
 
     @property
     def as_logged(self) -> "Lateness":
-        """Lateness of 0, so that dq is not corrected; where `s` is nan, the derivative of q still replaces dq."""
+        """Lateness without correction: finite values of `s` become 0, and nan remains."""
         return replace(self, s=0.0 * self.s)
 
     def corrected(self, smooth: Recording) -> np.ndarray:
@@ -45,15 +45,15 @@ class Lateness:
 
 
 def from_q(joints: int) -> Lateness:
-    """Return a lateness of nan for all joints, so that the derivative of q replaces dq."""
+    """Return a lateness of nan for all joints: the derivative of q then replaces the logged dq."""
     return Lateness(np.full(joints, np.nan), np.zeros(joints))
 
 
 def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
     """Estimate the lateness of dq by least squares on motion below `cutoff_hz`, where a filter acts like a delay.
 
-    dq is often smoother than the derivative of q, so correcting dq is better than differentiating q. The correction
-    inverts a first-order filter or a delay, whichever fits better.
+    Correcting dq is better than differentiating q, because the logged dq is often smoother. The correction inverts a
+    first-order filter or a delay, depending on which of these models fits the data better.
     """
     smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
     slope, ddq, n = smooth.derivative(smooth.q), smooth.derivative(smooth.dq), recording.n_joints
@@ -80,7 +80,7 @@ def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
 
 
 def _corrected(smooth: Recording, late: np.ndarray, filtered: bool) -> np.ndarray:
-    """Return dq (T, n) rad/s without a filter or delay of `late` (n,) s, or the derivative of q if `late` is nan."""
+    """Return dq (T, n) rad/s with the lateness `late` (n,) s removed, or the derivative of q where `late` is nan."""
     if filtered:
         out = smooth.dq + np.nan_to_num(late) * smooth.derivative(smooth.dq)
     else:

@@ -1,7 +1,7 @@
 """Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet files and meta/info.json.
 
-`write_dataset` stores commanded torque as `action`, other torque as `observation.effort`. In other datasets torque is
-rare; `lerobot_table` finds angles, velocities and torques by words in the names of features and their elements.
+`write_dataset` stores commanded torque as `action`, other torque as `observation.effort`. In other datasets,
+`lerobot_table` finds angles, velocities and torques by words in the names of features and of their elements.
 """
 
 import json
@@ -51,8 +51,9 @@ def dataset_files(folder: Path) -> list[Path]:
 def lerobot_table(folder: Path) -> Table:
     """Return t (T,) s, trajectory (T,), joint_names (m,) and, if stored, q, dq, tau, tau_J_d, current (T, m).
 
-    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. Torque in an action
-    becomes tau_J_d. Features of a gripper, hand or pose are ignored. `reader_note` names the clock and features used.
+    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. Torque in `action`
+    becomes tau_J_d. Features of a gripper, hand or pose are ignored. `reader_note` states which clock and features
+    were used.
 
     Raises:
         UserError: no torque in the dataset, another version, or a damaged file.
@@ -111,7 +112,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, int, float]]]:
-    """Return (field, joint, (feature, element index, factor to SI units)) for each element of an arm joint."""
+    """Return (field, joint, (feature, element index, factor to SI units)) per feature element of an arm joint."""
     out = []
     for feature, spec in features.items():
         shape = spec["shape"]
@@ -132,7 +133,7 @@ def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, in
 
 
 def _elements(names: Any, size: int) -> list[str]:
-    """Return the element names of a feature from `names`, a list or {key: list}; without names: joint1, joint2 ..."""
+    """Return the names of a feature's elements: `names` (a list or {key: list}), or else joint1, joint2, ..."""
     if isinstance(names, Mapping):
         names = next((x for x in names.values() if isinstance(x, list)), None)
     if isinstance(names, list) and len(names) == size:
@@ -180,12 +181,11 @@ def write_dataset(
 ) -> list[str]:
     """Write a recording as a new folder for `lerobot`: one episode per trajectory, in float32, with statistics.
 
-    The dataset's clock is frame_index / fps. A recording with another clock is resampled, and a line in the returned
-    list states this.
+    A recording with a clock other than frame_index / fps is resampled, and the returned list reports the resampling.
 
     Args:
-        joints: names of the n joints. robot: name of the arm. more: {feature: (T, k)}, further features; they are
-            never resampled. task: text that describes the task of every episode.
+        joints: names of the n joints. robot: name of the arm. task: text that describes the task of all episodes.
+        more: {feature: (T, k)}, further features, which are never resampled.
 
     Raises:
         UserError: the folder exists, or `more` is given and the recording must be resampled.

@@ -15,21 +15,21 @@ LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of 
 
 
 def give_back(recording: Recording) -> None:
-    """Return freed memory to the system after work on a long recording; glibc would keep blocks of up to 32 MB."""
+    """Release freed memory to the operating system after a long recording: glibc retains blocks of up to 32 MB."""
     if recording.duration > LONG_S:
         _trim()
 
 
 def _trim() -> None:
-    """Return freed memory to the system; later blocks above MAPPED bytes return as soon as they are freed."""
+    """Release freed memory to the operating system, and from now on every block above MAPPED when it is freed."""
     libc: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
-    if hasattr(libc, "malloc_trim"):  # musl has none
+    if hasattr(libc, "malloc_trim"):  # musl has no malloc_trim
         libc.mallopt(M_MMAP_THRESHOLD, MAPPED)
         libc.malloc_trim(0)
 
 
 def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return {name: that array of all parts, joined}; the parts lose these arrays, so that no second copy remains."""
+    """Return {name: that array of all parts, joined}; delete the arrays of the parts to save memory."""
     out = {}
     for name in names:
         out[name] = np.concatenate([vars(part).pop(name) for part in parts])
@@ -39,9 +39,9 @@ def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np
 
 
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:
-    """Yield pieces of about `seconds` s in the order of the log; in a trajectory, they overlap by `overlap_s` s.
+    """Yield pieces of about `seconds` s in the order of the log; in a trajectory, pieces overlap by `overlap_s` s.
 
-    A remainder is appended to the last piece, because it may be too short to be filtered alone.
+    The last piece includes the remainder of the log, which alone may be too short for a filter.
     """
     if recording.duration <= 1.5 * seconds:
         yield recording

@@ -1,7 +1,7 @@
 """Find repeated motion in recordings, so that training and validation share no motion.
 
-Two pieces of motion are compared at every lag at once (correlation by FFT). Their squared distance is |a|^2 + |b|^2 -
-2 a b, summed over the rows that both contain.
+A correlation by FFT compares two pieces of motion, a and b, at all lags at once. Their squared distance, |a|^2 +
+|b|^2 - 2 a b, is summed over the rows that both contain.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import numpy as np
 
 STEP = 0.02  # s, grid of the comparison
 TOLERANCE = 0.01  # rad RMS, tracking difference between two repetitions of one motion
-MIN_MOTION = 3.0  # TOLERANCEs; least standard deviation of a joint's motion, about ten peak to peak
+MIN_MOTION = 3.0  # least standard deviation of a joint's motion, as a multiple of TOLERANCE; peak to peak about 10
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
 MAX_COMPARED = 60  # limit on the tracks compared with one track and on the pieces in `overlap`, for speed
@@ -42,7 +42,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return a track per stretch if `each`, else per run of the clock t (T,) s; omit tracks below OVERLAP_S."""
+    """Return a track for each stretch if `each`, else for each part of t (T,) s between clock restarts."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -55,10 +55,10 @@ def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
 
 
 def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
-    """Return the period of the motion, s, and the shift (K,) s that aligns the clock of each of K tracks.
+    """Return the period of the motion, s, and the time shifts (K,) s that align the clocks of K tracks.
 
-    With these shifts, equal motion has the same phase in all tracks. The period is None if no motion repeats. If
-    motion repeats only between tracks, the period spans all aligned tracks, so no phase occurs twice in a track.
+    After the shifts, equal motion has the same phase in all tracks. The period is None if no motion repeats. If a
+    motion repeats only in another track, the period is the time from the first to the last row of all aligned tracks.
     """
     shift, found, period = np.zeros(len(tracks)), False, None
     for k, b in enumerate(tracks):
@@ -76,10 +76,10 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 
 
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
-    """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
+    """Return the share (0 to 1) of the motion in `other` that occurs in `training`, in all joints at the same time.
 
-    A piece of motion occurs in `training` if each joint's RMS distance is below the joint's tolerance. The tolerance
-    is TRACKING, clipped to the range SIMILAR times the joint's standard deviation in `other`.
+    A piece of motion occurs in `training` if each joint's RMS distance is below the joint's tolerance. A joint's
+    tolerance is TRACKING, limited to the range SIMILAR in units of the joint's standard deviation in `other`.
     """
     deviation = np.nanstd(np.concatenate([track.q for track in other]), axis=0) if other else np.zeros(1)
     tolerance = np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -96,7 +96,7 @@ def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
 
 
 def _pieces(q: np.ndarray, motion: float) -> list[np.ndarray]:
-    """Cut q (S, n) rad, NaN in gaps, into gap-free pieces that last PIECE_S or more and move by over `motion` rad."""
+    """Cut q (S, n) rad at NaN into pieces of at least PIECE_S s in which a joint moves by more than `motion` rad."""
     pieces, start, shortest = [], 0, round(PIECE_S / STEP)
     low = high = q[0]
     for k, x in enumerate(q):
@@ -112,10 +112,10 @@ def _pieces(q: np.ndarray, motion: float) -> list[np.ndarray]:
 
 
 def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compare a (A, n) with b (B, n) rad, NaN in gaps, at the L lags -(B - 1) to A - 1.
+    """Compare angles a (A, n) and b (B, n) rad, NaN in gaps, at all L lags from -(B - 1) to A - 1.
 
-    Returns mean squares of a[k + lag] - b[k] (L, n), variances of b[k] over the common rows (L, n), and the number
-    of common rows (L,).
+    Returns for each lag the mean square of a[k + lag] - b[k] (L, n), the variance of b[k] over the rows that a and b
+    have in common (L, n), and the number of these rows (L,).
     """
     size = 1 << int(len(a) + len(b) - 1).bit_length()
     middle = np.nanmean(a, axis=0)  # centring reduces the round-off of the differences
@@ -138,9 +138,9 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return at every lag the RMS distance over rows and joints (L,) rad, and the number of common rows (L,).
+    """Return, for each of L lags, the RMS distance over rows and joints (L,) rad and the number of common rows (L,).
 
-    The distance is inf where the common part is shorter than OVERLAP_S or no joint moves by MIN_MOTION.
+    The distance is inf at lags where the common rows last less than OVERLAP_S or no joint moves by MIN_MOTION.
     """
     square, variance, count = _distances(a, b)
     counts = (count >= OVERLAP_S / STEP) & (variance.max(1) > (MIN_MOTION * TOLERANCE) ** 2)
@@ -160,7 +160,7 @@ def _own_lag(track: Track) -> int | None:
 
 
 def _lag(a: Track, b: Track) -> int | None:
-    """Return the lag, in rows, at which b repeats a, or None; of several lags, that with the most common rows."""
+    """Return the lag, in rows, at which track b repeats track a, or None; prefer the lag with most common rows."""
     error, count = _errors(a.q, b.q)
     runs = _runs(error < TOLERANCE)
     if not runs:
@@ -170,6 +170,6 @@ def _lag(a: Track, b: Track) -> int | None:
 
 
 def _runs(mask: np.ndarray) -> list[slice]:
-    """Return a slice for each uninterrupted run of True in a mask (L,)."""
+    """Return a slice for each uninterrupted sequence of True in a mask (L,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -142,7 +142,7 @@ def _from_columns(
 
 
 def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
-    """Return one value per row (T,), from `values` per row or per ramp; `ramp` (T,) is the ramp index of each row."""
+    """Convert `values`, given per ramp or per row, to one per row (T,); `ramp` (T,) is the ramp index of each row."""
     count = ramp[-1] + 1 if len(ramp) else 0
     if values.dtype.kind not in "iuf":
         raise UserError(f"column '{field}': expected numbers, got type {values.dtype}")
@@ -152,7 +152,7 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError unless the ramped joint's command changes mainly in direction `sign`, or none changes."""
+    """Raise UserError if commands change, but that of the ramped joint does not rise or fall as `sign` requires."""
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY

@@ -28,7 +28,7 @@ RESTART_S = 0.1  # s; a clock has restarted if it jumps back to within this time
 
 @dataclass(frozen=True)
 class Options:
-    """How to interpret the columns of a file; see `read`."""
+    """Arguments of `read` that define how a file's columns are interpreted."""
 
     torque: str | None
     columns: Mapping[str, Spec]
@@ -63,24 +63,24 @@ def read(
     Args:
         path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
             LeRobotDataset.
-        torque: "measured", "commanded" or "motor", see `Recording`; None only if the file declares it.
+        torque: kind of torque, see `Recording`: "measured", "commanded" or "motor"; None if the file declares it.
         columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
-            DEFAULT_COLUMNS; for tau, the column in TAU is tried first. A name for q, dq or tau denotes a (T, n)
-            array, or numbered columns q1 q2 ..., q_1 q_2 ... or q[1] q[2] ..., from 1 or 0. In a name, `{j}` (from
-            1) or `{i}` (from 0) stands for the joint number. A list has one name per joint. In HDF5 a name is a
-            path: robot/q.
+            DEFAULT_COLUMNS; for tau, the name in TAU has priority. For q, dq and tau, a name stands for one array
+            (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... In a name, `{j}`
+            (from 1) or `{i}` (from 0) stands for the joint number. A list contains one column name per joint. In
+            HDF5 a column name is a path such as robot/q.
         n_joints: expected number of joints.
         max_gap_s: s; a longer time step begins a new trajectory; None: see `longest_step`; inf: no splitting.
         period: s, see `Recording`.
         name: name of the recording; None: the file name without its suffix.
         topic: topic of a bag, see `bag_table`.
-        joints, model_joints: the robot's joint names in the file and in the robot description; they select and
-            order the file's joints, see `by_names` and `choose_joints`.
+        joints, model_joints: the robot's joint names in the file, and in the robot description. `by_names` and
+            `choose_joints` use these names to select and sort the file's joints.
         torque_constant: Nm/A at the joint, gear ratio included, (n,) or one for all; tau is then a motor current.
         limits: lowest and highest q of the robot, (n,) rad each; angles outside are shifted inside by revolutions.
 
-    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. Without a
-    column trajectory, a clock that jumps back to its start also begins a new one (not in a bag). Faults with only one
+    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. If a file
+    other than a bag has no column `trajectory`, a clock restart also begins a new trajectory. Faults with only one
     remedy are repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file that
     `Recording.save` wrote is restored unchanged.
 
@@ -102,7 +102,7 @@ def read(
 
 
 def from_table(table: Table, how: Options) -> Recording:
-    """Return a recording from the columns of a file; error messages do not name the file."""
+    """Build a recording from the columns of a file; error messages do not contain the file name."""
     notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars of `Recording.save` or of a reader
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(how.torque, notes.get("torque"))
@@ -160,9 +160,9 @@ def _without_holds(recording: Recording) -> Recording:
 
 
 def restart_index(t: np.ndarray) -> np.ndarray | None:
-    """Return the trajectory index (T,) of each row if the clock t (T,) s restarts, else None.
+    """Return each row's trajectory index (T,) if the clock t (T,) s restarts, else None.
 
-    At a restart, the clock jumps back to about its first value. `Recording` reports any other step back as an error.
+    At a restart, the clock jumps back to about its first value. `Recording` rejects all other jumps back in time.
     """
     if t.ndim != 1 or not len(back := np.flatnonzero(np.diff(t) < 0) + 1):
         return None
@@ -243,7 +243,7 @@ def files_of(path: str | os.PathLike) -> list[Path]:
 
 
 def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
-    """Return all columns of the file `path`; errors name the file. `bag` is {argument of `bag_table`: value}."""
+    """Return all columns of the file `path`; errors name the file. `bag`: the keyword arguments of `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")

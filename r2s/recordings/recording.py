@@ -31,13 +31,13 @@ class Recording:
     Methods return new recordings. A difference, filter or window never includes rows of two trajectories.
 
     Attributes:
-        t: (T,) s, logged time. It increases within a trajectory, perhaps unevenly, and may restart in the next one.
+        t: (T,) s, logged time. Within a trajectory, t increases, perhaps in uneven steps. A trajectory may restart t.
         q, dq, tau: (T, n) joint angles in rad, velocities in rad/s and torques in Nm.
         torque: kind of `tau`: "measured" (by a link-side sensor, with gravity), "commanded" (without gravity) or
             "motor" (motor torque times gear ratio; it contains gravity, all friction and rotor inertia).
         signals: {name from `SIGNALS`: (T,) or (T, k)}, further values that the arm reported; None becomes {}.
-        trajectory: (T,) index of each row's trajectory, an uninterrupted part of the log; None: one trajectory.
-        period: s, time after which the motion repeats on the clock `t` (see `split`); None: no repetition is known.
+        trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses; None: all 0.
+        period: s, time on the clock `t` after which the motion repeats (see `split`); None: no known repetition.
         notes: one line per repair or other remark of the file reader.
         command_period: s, time for which the arm applies each command; None: until the next row.
     """
@@ -122,7 +122,7 @@ class Recording:
 
     @property
     def stretches(self) -> list[slice]:
-        """Slices of rows, one per trajectory, in the order of the log."""
+        """One slice of rows for each trajectory, in the order of the log."""
         edges = [0, *(np.flatnonzero(np.diff(self.trajectory)) + 1).tolist(), len(self.t)]
         return [slice(start, stop) for start, stop in pairwise(edges)]
 
@@ -143,7 +143,7 @@ class Recording:
         return np.diff(self.t)[np.diff(self.trajectory) == 0]
 
     def select(self, mask: np.ndarray) -> "Recording":
-        """Select the rows where `mask` (T,) is True; each uninterrupted run of these rows becomes a trajectory."""
+        """Select the rows where `mask` (T,) is True; each sequence of adjacent rows becomes a trajectory."""
         mask = np.asarray(mask)
         if mask.dtype != bool or mask.shape != self.t.shape:
             raise UserError(f"expected a mask of shape {self.t.shape} bool, got {mask.shape} {mask.dtype}")
@@ -166,10 +166,10 @@ class Recording:
     def resample(self, dt: float) -> "Recording":
         """Interpolate each trajectory linearly onto a uniform grid of `dt` s from its first logged time.
 
-        Commanded torque is averaged over each grid step instead, because each command acts until the next one.
-        There is no anti-aliasing filter: to lower the rate, resample at the logged rate, `smooth`, then resample
-        again. Each of the `signals` takes its last logged value, because flags and poses cannot be interpolated.
-        Trajectories shorter than `dt` are dropped.
+        Commanded torque is averaged over each step of `dt`, because a command acts until the next one. There is no
+        anti-aliasing filter: to lower the rate, resample at the logged rate, `smooth`, then resample again. Each
+        of the `signals` has its last logged value, because flags and poses cannot be interpolated. Trajectories
+        shorter than `dt` are dropped.
         """
         _positive("dt", dt, "s")
         columns: dict[str, list[np.ndarray]] = {field: [] for field in FIELDS}
@@ -193,9 +193,9 @@ class Recording:
         return replace(self, signals=signals, **{f: np.concatenate(parts) for f, parts in columns.items()})  # type: ignore[arg-type]
 
     def _held(self, s: slice, grid: np.ndarray, dt: float) -> np.ndarray:
-        """Return the commands (G, n) Nm of the rows `s`, averaged over steps from `grid` to `grid + dt`.
+        """Return the commands (G, n) Nm of the rows `s`, averaged over the intervals from `grid` to `grid + dt`.
 
-        Each command acts until the next one. Where the log skips command periods, commands are interpolated.
+        Each command acts until the next one. Commands that the log does not contain are interpolated.
         """
         t, tau, period = self.t[s], self.tau[s], self.command_period or 1.0 / self.rate_hz
         if len(grid) == len(t) and np.abs(grid - t).max() < 1e-6 * dt and period > 0.9 * dt:
@@ -241,19 +241,19 @@ class Recording:
         return out
 
     def acceleration(self) -> np.ndarray:
-        """Return the acceleration (T, n) rad/s^2, the `derivative` of dq. Raw data need `resample` and `smooth`."""
+        """Return the acceleration (T, n) rad/s^2, the `derivative` of dq; `resample` and `smooth` raw data first."""
         return self.derivative(self.dq)
 
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        The motion repeats if at least 0.5 s of it recur after some lag, with an RMS difference below 0.01 rad over
-        the joints, while a joint moves by about 0.1 rad. `in_phase` also aligns repetitions after a clock restart.
+        A repetition lasts at least 0.5 s, its RMS difference over the joints is below 0.01 rad, and a joint moves by
+        at least about 0.1 rad. `in_phase` also aligns repetitions after a clock restart.
         """
         return self._period_and_clock()[0]
 
     def in_phase(self) -> "Recording":
-        """Return the recording with `period` set, and `t` shifted so that equal motion has equal phase.
+        """Return the recording with `period` set and `t` shifted so that repetitions of a motion have equal phase.
 
         If the motion does not repeat, the recording is returned unchanged.
         """
@@ -278,21 +278,21 @@ class Recording:
     def overlap(self, training: "Recording") -> float:
         """Return the share (0 to 1) of this motion that also occurs in `training`; see `periodicity.overlap`.
 
-        Pieces with too little motion are ignored. The times at which the motion occurs do not matter.
+        Pieces with too little motion are ignored. The same motion may occur at different times in the recordings.
         """
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
-        """Return (train, validation), which share no motion; validation has about `validation_fraction` of the rows.
+        """Split into (train, validation) without common motion; `validation_fraction` is validation's share of rows.
 
-        1. With a period (argument or attribute), validation is the end of every repetition: the rows with the largest
-           phase, `t` modulo period. A chronological split would put repeated motion on both sides: the recording
-           gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
-        2. With several trajectories, validation consists of the last trajectories.
-        3. Otherwise validation is the end of the recording.
+        1. If the motion has a period (argument or attribute), validation is the end of each repetition: the rows with
+           the largest phase, `t` modulo period. A chronological split would put the same motion in both parts: the
+           recording gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
+        2. If there are several trajectories, validation consists of the last trajectories.
+        3. In all other cases, validation is the end of the recording.
 
-        In cases 1 and 3, rows within 0.1 s of validation rows are dropped from training. Trajectories of a single
-        row are dropped from both sides.
+        In cases 1 and 3, training has no rows within 0.1 s of a validation row. Trajectories of a single row are
+        dropped from training and validation.
         """
         if not 0 < validation_fraction < 1:
             raise UserError(f"validation_fraction: expected a number in (0, 1), got {validation_fraction}")
@@ -334,7 +334,7 @@ class Recording:
     def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
         """Return a recording of the rows with indices `rows` (K,) and the new trajectory indices `trajectory` (K,).
 
-        drop_lone: whether to drop trajectories of a single row. Consecutive rows become views, to save memory.
+        drop_lone: whether to drop trajectories of a single row. If all rows are consecutive, the arrays are views.
         """
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1
@@ -359,7 +359,7 @@ def save_npz(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def declared_torque(torque: str | None) -> str:
-    """Return `torque` if it is one of `TORQUES`; otherwise raise a UserError that explains them."""
+    """Return `torque` if it is one of `TORQUES`; otherwise raise a UserError that explains the kinds of torque."""
     if torque in TORQUES:
         return str(torque)
     meaning = (

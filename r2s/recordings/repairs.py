@@ -1,4 +1,4 @@
-"""Repair log faults that have only one remedy: swapped or repeated rows, zero stamps, wrapped angles, held values.
+"""Repair log faults with only one remedy: swapped or repeated rows, zero stamps, wrapped angles, repeated values.
 
 Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired;
 `Recording` or the checks of an identification report it.
@@ -65,7 +65,7 @@ def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _order(arrays: Arrays) -> np.ndarray | None:
-    """Return row indices (T,) that sort each trajectory by time; None if sorted or if a row is too far off."""
+    """Return row indices (T,) that sort each trajectory by time; None if sorted or if a row is far out of place."""
     t, index = arrays["t"], arrays.get("trajectory", np.zeros(len(arrays["t"])))
     run = np.concatenate([[0], np.cumsum(np.diff(index) != 0)])
     if not np.any((np.diff(t) < 0) & (np.diff(run) == 0)):
@@ -77,7 +77,7 @@ def _order(arrays: Arrays) -> np.ndarray | None:
 def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Arrays, list[str]]:
     """Remove jumps of q by a revolution within a trajectory; return the arrays and a line per repair.
 
-    limits: (low, high), (n,) rad each. Angles beyond them are shifted by revolutions, if this brings them inside.
+    limits: (low, high), (n,) rad each; angles outside are shifted by revolutions, if the shifted angles are inside.
     """
     q, index = arrays["q"], arrays.get("trajectory")
     if q.ndim != 2 or q.dtype.kind not in "iuf" or len(q) != len(arrays["t"]):
@@ -121,9 +121,9 @@ def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -
 
 
 def held(t: np.ndarray, q: np.ndarray, dq: np.ndarray, stretches: list[slice]) -> np.ndarray | None:
-    """Return a mask (T,) of the rows with new values if the log repeats each value over several rows, else None.
+    """Return a mask (T,) of the rows with new values, or None if the log does not repeat each value in several rows.
 
-    A log at 1 kHz may repeat values that arrive at 30 Hz; while the arm moves, all values fill equally many rows.
+    A log at 1 kHz may repeat values that arrive at 30 Hz. While the arm moves, each value fills equally many rows.
     """
     new = np.ones(len(t), dtype=bool)
     lengths, moved = [], 0.0

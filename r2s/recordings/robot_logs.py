@@ -19,15 +19,15 @@ MAX_LATENESS_NS = 10**9  # ns, largest delay of a network message; a larger step
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether `path` is a bag: by its suffix, or a folder with metadata.yaml (ROS 2)."""
+    """Return whether `path` is a bag: a file with a bag's suffix, or a folder with metadata.yaml (ROS 2)."""
     return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in BAGS
 
 
 def libfranka_table(table: Table) -> Table:
     """Add t (T,) s and q, dq, tau_J, tau_J_d (T, 7) to a log of `franka::logToCSV`; return other tables unchanged.
 
-    In such a log (libfranka, src/log.cpp) `time` is in whole ms, and `state.tau_J` is measured torque. Each row has
-    the state of cycle k + 1, but the command `cmd.tau_J_d` of cycle k; `shift_command` corrects this.
+    In such a log (libfranka, src/log.cpp), `time` is in whole ms, and `state.tau_J` is measured torque. A row has the
+    state of cycle k + 1 and the command `cmd.tau_J_d` of cycle k; `shift_command` corrects this offset of one cycle.
     """
     if not {"time", "success_rate", "state.q[0]"} <= table.keys():
         return table
@@ -47,7 +47,7 @@ def libfranka_table(table: Table) -> Table:
 def rostopic_table(table: Table) -> Table:
     """Add t, q, dq, tau and joint_names to a JointState log of `rostopic echo -p`; return other tables unchanged.
 
-    The log's stamps are in ns. The columns `field.name0` ... contain the joint names, which some drivers sort.
+    The log's stamps are in ns. The columns `field.name0` ... contain the joint names, in an order set by the driver.
     """
     fields = {"q": "field.position", "dq": "field.velocity", "tau": "field.effort"}
     stamp = table.get("field.header.stamp")
@@ -69,11 +69,11 @@ def _last_number(name: str) -> int:
 
 
 def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-    """Return the command (T, n) Nm that was sent in response to the state of each row, from the logged tau_J_d.
+    """Shift the logged tau_J_d (T, n) Nm by one cycle, so that each state has the command that answered it.
 
     A Franka state at t (T,) s contains the command of the previous cycle. A `Recording` (`r2s.arm.recorder`) pairs a
-    state with the command that follows it. So the result is tau_J_d one cycle later, interpolated if the log is
-    slower than the arm. The command of the last row is not shifted, because no later one is known.
+    state with the command that follows it. If the log's rate is below the arm's, the shifted command is interpolated.
+    The command of the last row is not shifted, because no later command is known.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
 
@@ -97,13 +97,13 @@ def bag_table(
 ) -> Table:
     """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) from one topic of a bag.
 
-    t is 0 at the first message. It comes from the header stamps, or from bag time if all stamps are 0. Messages that
-    lack joints of the robot (as from a gripper) are ignored, late messages are sorted, repeated ones are dropped.
-    `reader_note` states how many messages were left out because of stamp 0, or of missing values at the start.
+    t is 0 at the first message; its source is the header stamps, or bag time if all stamps are 0. Messages without
+    all joints of the robot, such as a gripper's, are ignored. Messages are sorted by time, and repetitions dropped.
+    `reader_note` states how many messages are left out, because the stamp is 0 or the first values are missing.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap, or the folder of a ROS 2 bag.
-        topic: of type sensor_msgs/JointState, franka_msgs/FrankaState or FrankaRobotState; None: the bag's only one.
+        topic: topic with sensor_msgs/JointState or franka_msgs/FrankaState, FrankaRobotState; None: the only one.
         joints, model_joints, n_joints: see `choose_joints`.
 
     Raises:
@@ -140,14 +140,14 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    The order in a log may differ, because some ROS 2 drivers sort the names. The first applicable rule decides: (1)
-    `joints` as given; (2) `model_joints`, if each occurs once (perhaps with a prefix: panda_joint1); (3) n names that
-    differ in one number, sorted by this number; (4) the first n names, if n is 1 or there are no `model_joints`.
+    A log's order may differ from the robot's, because some ROS 2 drivers sort joints by name. These names have
+    priority, in this order: (1) `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix such as in
+    panda_joint1; (3) n names that differ only in a number; (4) if n is 1 or `model_joints` is empty, the first n.
 
     Args:
-        logged: names in the messages.
-        joints: the user's names, in the robot's order.
-        model_joints: names in the robot description.
+        logged: joint names in the log.
+        joints: joint names set by the user, in the robot's order.
+        model_joints: joint names in the robot description.
         n: number of joints of the robot.
     """
     names = choices(logged)
@@ -205,7 +205,7 @@ def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
 
 
 def _pick_topic(connections: Sequence[Any], topic: str | None) -> tuple[str, list[Any]]:
-    """Return the topic to read (None: the only readable one), and its connections."""
+    """Return the topic to read, with its connections; if `topic` is None, choose the only readable topic."""
     types = {c.topic: c.msgtype.replace("/msg/", "/") for c in connections}
     readable = [t for t, kind in types.items() if kind.rsplit("/")[-1] in TYPES]
     listed = choices(f"{t} ({kind})" for t, kind in types.items()) or "none"
@@ -272,7 +272,7 @@ def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _pick_joints(topic: str, samples: list[Sample], joints, model_joints, n_joints) -> tuple[list[Sample], Layouts]:
-    """Return the messages that have all joints of the robot, and {names in a message: indices of these joints}."""
+    """Return the messages with all joints of the robot, and {joint names in a message: indices of these joints}."""
     layouts = dict.fromkeys(s.names for s in samples)
     logged = list(dict.fromkeys(name for names in layouts for name in names))
     if not logged:
@@ -307,7 +307,7 @@ def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.n
 
 
 def _in_order(stamp: np.ndarray, table: Table) -> tuple[np.ndarray, Table]:
-    """Sort late messages and drop repeated ones; do neither after a clock restart, which `Recording` reports."""
+    """Sort messages by stamp and drop repeated messages; if the clock restarts, return the messages unchanged."""
     if len(stamp) < 2 or np.diff(stamp).min() < -MAX_LATENESS_NS:
         return stamp, table
     order = np.argsort(stamp, kind="stable")

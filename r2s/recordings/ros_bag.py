@@ -32,7 +32,7 @@ Message = tuple[int, str, Any]  # ns, topic, message
 
 
 def stamps(recording: Recording) -> np.ndarray:
-    """Return the stamps (T,) ns of the rows on one clock, with a pause between successive trajectories."""
+    """Return stamps (T,) ns of the rows on one common clock, with a pause between successive trajectories."""
     out, begin = np.empty(len(recording.t), dtype=np.int64), START_NS
     for s in recording.stretches:
         t = recording.t[s]
@@ -54,8 +54,8 @@ def write_mcap(
     given; /tf, the link poses at 50 Hz or less; /robot_description, the URDF, latched.
 
     Args:
-        robot, dynamics: the model for the URDF. recording: motion of this robot. reference: planned motion that
-            begins together with the recording: t (T,) s and q, dq, ddq (T, n).
+        robot, dynamics: model that the URDF describes. recording: motion of this robot.
+        reference: planned motion, which starts at the recording's start: t (T,) s and q, dq, ddq (T, n).
 
     Raises:
         UserError: rosbags is not installed, or robot and recording differ in their number of joints.

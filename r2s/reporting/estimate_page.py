@@ -20,7 +20,7 @@ LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and limits 
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
-    """Draw payload and friction over time. rows: `offline_estimation.table`. changes: payload change times, s."""
+    """Draw payload and friction over time from `rows` (`offline_estimation.table`); mark the times `changes`, s."""
     t, colour = rows["t"].to_numpy(), colours(["estimate"])["estimate"]
 
     def band(axis, name: str, title: str, label: str, scale: float = 1.0) -> None:

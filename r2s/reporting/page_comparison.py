@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Return the page without the rows of its tables: a table that is not made again then has only its head."""
+    """Remove the rows of all tables from a page, so that tables that are not computed again have only a head."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -38,11 +38,11 @@ def without_rows(page: str) -> str:
 
 
 def compare_pages(before: str, now: str) -> pd.DataFrame:
-    """Return a table with a line per cell of either page: section, row, column, committed, now, verdict, change.
+    """Compare all cells of two pages; return a row per cell: section, row, column, committed, now, verdict, change.
 
-    verdict is one of VERDICTS. "last digit": each number differs by at most one unit of its last digit. "beyond
+    `verdict` is one of VERDICTS. "last digit": numbers differ by at most one unit of their last digits. "beyond
     intervals": at least one interval in the cell does not overlap with its new version.
-    change is the largest relative change of a number in the cell; NaN if the numbers cannot be paired.
+    `change` is the largest relative change of a number in the cell; NaN if a number has no counterpart.
     """
     old, new = table_cells(before), table_cells(now)
     rows = []
@@ -54,7 +54,7 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
 
 
 def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
-    """Return `compare_pages` for all {page: text} in one table; with several pages, sections begin with the page."""
+    """Apply `compare_pages` to all {page: text}; return one table, which states the page if there are several."""
     parts = []
     for page, text in before.items():
         cells = compare_pages(text, now[page])

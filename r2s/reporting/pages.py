@@ -47,7 +47,7 @@ def transfer(
     """Save all episodes and the last second before each stop; draw four episodes; write the report.
 
     Args:
-        run, robot: run and arm. episodes: {simulator or arm: its episodes}. rows: {simulator or arm: its measures}.
+        run, robot: the run and its arm. episodes: {simulator or arm: episodes}. rows: {simulator or arm: measures}.
         torque: (n,) Nm, the policy's torque limits. timing: latencies of the arm's cycles; None without an arm.
         stops: stops of the arm, with their reasons. halted: why the arm did not run all episodes, or None.
     """
@@ -104,7 +104,7 @@ def pipeline(
 
     Args:
         run, robot: run and arm of the pipeline. identified: run folder of the identification.
-        trained, transferred: {label: run folder}. rows: {label: measures} for all transfers.
+        trained, transferred: {label: run folder} of trainings and transfers. rows: {label: measures} of transfers.
     """
     measures = measures_of(next(iter(transferred.values())))
     write_measures(run.folder, measures)

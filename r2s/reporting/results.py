@@ -21,7 +21,7 @@ def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.Da
     """Print the cells that differ; write differences.csv, report.md and the report of all pages; return the summary.
 
     Args:
-        run: receives the files. page: page name. commit: commit that made the page. cells: from `compare_pages`.
+        run: run folder to write to. page: page name. commit: commit of the new page. cells: from `compare_pages`.
     """
     counts = {verdict: int((cells["verdict"] == verdict).sum()) for verdict in VERDICTS}
     cells.to_csv(run.folder / "differences.csv", index=False)
@@ -38,7 +38,7 @@ def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.Da
 
 
 def all_pages(folder: Path, last: dict[str, Any]) -> None:
-    """Write folder/report.md with a row per page, from the finished runs below `folder` and from `last`, this run."""
+    """Write report.md in `folder` with a row per page, from `last` and the summaries of the runs in `folder`."""
     done = {last["page"]: last}
     for path in sorted(folder.glob("*/summary.json")):
         other = json.loads(path.read_text())
@@ -53,7 +53,7 @@ def all_pages(folder: Path, last: dict[str, Any]) -> None:
 
 
 def _shown(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the cells as strings, by verdict (beyond intervals, without interval, others), largest change first."""
+    """Sort cells by verdict (beyond intervals, without interval, others), then by change; return them as strings."""
     order = cells.assign(rank=cells["verdict"].map({"beyond intervals": 0, "without interval": 1}).fillna(2))
     order = order.sort_values(["rank", "change"], ascending=[True, False])
     change = order["change"].map(lambda x: "" if pd.isna(x) else f"{100 * x:.0f} %")

@@ -24,7 +24,7 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
     """Return a row of strings per run folder below `root`, the newest last.
 
     Args:
-        root: parent of <stage>/<name>. stage: only list this stage. failed: only list failed or killed runs.
+        root: folder of all runs. stage: list only runs of this stage. failed: list only failed and killed runs.
     """
     found = []
     for path in Path(root).glob(f"{stage or '*'}/*/meta.json"):

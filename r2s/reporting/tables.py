@@ -24,7 +24,7 @@ def measure_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.Data
 
 
 def diagnostic_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return a second table of `rows`: gap to the prediction, motion, safety filter; empty columns are omitted."""
+    """Return `rows` as a table of diagnostic measures: gap to the prediction, motion, safety filter, if present."""
     present = [measures[key] for key in measures.diagnostics if any(key in row for row in rows.values())]
     return _table(present, rows, "", decimals=0)
 
@@ -39,7 +39,7 @@ def _table(columns: Sequence[Measure], rows: Mapping[str, Mapping], corner: str,
 
 
 def _counted(label: str, row: Mapping) -> str:
-    """Return the label, with the number of completed goals if the arm stopped early."""
+    """Return the row's label; if the arm stopped early, append the number of completed goals."""
     done, asked = row.get("episodes"), row.get("asked")
     return label if done == asked else f"{label}, {done} of {asked} goals done"
 
@@ -63,7 +63,7 @@ def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, 
 def print_table(
     console: Console, frame: pd.DataFrame, title: str, caption: str | None = None, sentences: bool = False
 ) -> None:
-    """Print a table of strings: either sentences, or numbers; uncertain numbers are dimmed."""
+    """Print a table of strings; dim poorly identifiable numbers, unless the strings are `sentences`."""
     how = {"title_justify": "left", "caption_justify": "left", "padding": (0, 1, 0, 0)}
     table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **how)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))

@@ -1,4 +1,4 @@
-"""Report stage=tune: its trials, and its best value so far compared with a grid search at equal compute."""
+"""Report stage=tune: its trials, and a comparison of its best value with a grid search at equal compute."""
 
 from collections.abc import Sequence
 from glob import glob
@@ -14,7 +14,7 @@ from r2s.reporting.document import Item, report_markdown
 from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
-ORDERS = 2000  # random orders of a grid: the mean over them then varies by 1 / 45 of their spread
+ORDERS = 2000  # random orders of a grid: the standard error of their mean is then 1 / 45 of their spread
 SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # of the search's compute
 
 
@@ -32,9 +32,9 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) that successive trials have reached after `at` (K,) s of compute.
+    """Return the best value (K,) of all trials that end within `at` (K,) s of compute, run one after another.
 
-    A value is known when its trial ends; nan (pruned, failed) only uses time. sign: 1 if larger is better, else -1.
+    A pruned or failed trial (nan) uses compute, but has no value. sign: 1 if larger is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))
@@ -46,7 +46,7 @@ def read_grid(against: str, measure: str) -> list[Trained]:
     """Return the finished trainings that match the glob `against` and have the measure `measure`.
 
     Raises:
-        UserError: there is no such training.
+        UserError: no finished training matches.
     """
     found, others = trainings_among(sorted(glob(against)))
     grid = [r for r in found if r.learned and measure in r.curve]
@@ -58,13 +58,13 @@ def read_grid(against: str, measure: str) -> list[Trained]:
 
 
 def against_table(trials: pd.DataFrame, measure: str, against: str | None, larger: bool) -> pd.DataFrame | None:
-    """Return the best values that search and grid reach within `SHARES` of the search's compute; None without a grid.
+    """Return the best values of search and grid at the `SHARES` of the search's compute; None without a grid.
 
-    The grid's value is the mean over `ORDERS` random orders of its jobs, because its order is arbitrary.
+    Since the order of a grid's jobs is arbitrary, the grid's value is a mean over `ORDERS` random orders.
 
     Args:
-        trials: output of `trials_table`. measure: key in evaluations. against: glob of trainings, or None.
-        larger: whether larger is better.
+        trials: output of `trials_table`. measure: column in evaluations.csv. against: glob of the grid's run folders.
+        larger: whether a larger value of the measure is better.
     """
     if not against:
         return None

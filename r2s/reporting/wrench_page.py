@@ -31,7 +31,7 @@ def force_of(wrench: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
 def franka_force(recording: Recording) -> np.ndarray | None:
     """Return Franka's estimate of the force (T, 3) N on the arm, or None if the recording has no estimate.
 
-    The sign is reversed: O_F_ext_hat_K is the force that the arm exerts.
+    The result is -O_F_ext_hat_K, because O_F_ext_hat_K is the force that the arm exerts on its environment.
     """
     own = recording.signals.get("O_F_ext_hat_K")
     return None if own is None or not own.any() else -own[:, :3]
@@ -84,9 +84,9 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 
 
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
-    """Return lines of the 95 % cone of the force's direction: its edge, and four lines from the tip to the edge.
+    """Return lines of the 95 % cone of the force's direction: the cone's edge, and four lines from the tip to it.
 
-    The edge is the ellipsoid with half axes `half`, projected along the force.
+    The edge is the ellipsoid with half axes `half`, projected onto the plane normal to the force.
     """
     size = max(float(np.linalg.norm(force)), 1e-9)
     across = np.linalg.svd(force[None] / size)[2][1:]

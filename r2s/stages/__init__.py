@@ -1,1 +1,1 @@
-"""One file per stage. Stages and the command line are the only code that sees a config."""
+"""Stages, one file each; only the stages and the command line read the config."""

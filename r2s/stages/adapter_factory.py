@@ -15,7 +15,7 @@ BESIDE = ("calibration",)  # keys of conf/adapt that the adapter's class does no
 
 
 def calibrated(calibration, robot, trust=()):
-    """Return identified dynamics, (space, posterior draws), and recordings without payload; a missing one is None."""
+    """Return identified dynamics, (space, posterior draws) and unloaded recordings; the last two may be None."""
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
 
@@ -29,9 +29,9 @@ def calibrated(calibration, robot, trust=()):
 
 
 def free_recordings(calibration):
-    """Return the recordings without contact from which the arm was identified, if they still exist.
+    """Return the recordings without contact from which the arm was identified, if their files still exist.
 
-    Read them as stage=identify does. If they do not suffice for a contact threshold, print why and return [].
+    If the recordings do not suffice to compute a contact threshold, print the reason and return [].
     """
     from r2s.adaptation.wrench import unfit_for_threshold
     from r2s.recordings.readers import read
@@ -52,7 +52,7 @@ def free_recordings(calibration):
 
 
 def _given_recordings(folder):
-    """Return the user's recordings of a run of stage=identify that have commanded torque and no payload.
+    """Return the user's recordings with commanded torque and without payload in a run of stage=identify.
 
     Raises:
         UserError: a file cannot be read with the settings of the run's config.
@@ -87,7 +87,7 @@ def with_declared_payload(cfg, robot, dynamics):
 def make_adapter(cfg, robot, source):
     """Return the adapter of conf/adapt for the policy of the run folder `source`, or None for adapt=none.
 
-    The adapter's model comes from adapt.calibration=, or else from the calibration of the policy's training.
+    The adapter uses the identified model in adapt.calibration=, or else in the calibration of the policy's training.
 
     Raises:
         UserError: there is no arm or no identified model, or the model was not identified from commanded torque.
@@ -113,7 +113,7 @@ def make_adapter(cfg, robot, source):
 def calibration_of(cfg, source):
     """Return the run folder with the adapter's model: adapt.calibration, or the calibration of the policy's training.
 
-    For a training, prefer the folder of the identification, which has recordings, to the training's own folder.
+    If a training has copied the model, use the folder of the identification if possible, because it has recordings.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)
@@ -132,5 +132,5 @@ def calibration_of(cfg, source):
 
 
 def run_folder(path):
-    """Return the run folder for its path or the path of a file in it."""
+    """Return the run folder, given its path or the path of a file in the folder."""
     return Path(path) if Path(path).is_dir() else Path(path).parent

@@ -57,7 +57,7 @@ def make_robot(cfg):
 def make_dynamics(cfg, robot):
     """Return the dynamics of `base_dynamics` for the task of conf/task.
 
-    Under a task that touches a surface, joints at rest hold contact forces, see `Dynamics.holding_contact`.
+    If the task touches a surface, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`.
     """
     dynamics = base_dynamics(cfg, robot)
     return dynamics.holding_contact() if getattr(target(cfg.task, "task"), "touches", False) else dynamics
@@ -93,7 +93,7 @@ def dynamics_of(robot, friction, inertia):
 def make_task(cfg, robot, dynamics, safety=None):
     """Return the task of conf/task with the arm's model, the controller of conf/control and the safety limits.
 
-    safety: safety settings of a transfer, which replace those in the training's config `cfg`; None: use `cfg` only.
+    safety: safety settings of a transfer, which replace the settings in the training's config `cfg`; None: no change.
     """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
@@ -126,7 +126,7 @@ def _arm_target(cfg) -> Callable[..., Any]:
 
 
 def _arm_settings(cfg, robot, task=None):
-    """Return the settings of conf/arm; unset reflex thresholds get the values that the task's contacts need."""
+    """Return the settings of conf/arm, with unset reflex thresholds set to what the task's contact forces require."""
     settings = plain(cfg.arm)
     if "collision_force" in settings and None in (settings["collision_torque"], settings["collision_force"]):
         from r2s.arm.clients.collision_thresholds import thresholds_of
@@ -141,11 +141,11 @@ def _arm_settings(cfg, robot, task=None):
 def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
     """Yield the arm of conf/arm; close it afterwards if it is a context manager.
 
-    Unless the arm is a twin, a signal such as Ctrl-C ends its motion.
+    A signal such as Ctrl-C stops the motion of an arm that is not a twin.
 
     Args:
-        noise: number of a twin's sensor-noise stream. task, adapter: what the policy runs with; None for recordings.
-        more: further arguments of the arm's class.
+        noise: number of a twin's sensor-noise stream. task, adapter: the policy's; None for a recording.
+        more: additional arguments for the arm's class.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.stop_request import handled_signals, pipeline
@@ -168,9 +168,9 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
 
 @contextmanager
 def ends_sweep(cfg):
-    """End the whole sweep, not only the job, if the block raises an error and the arm is no twin.
+    """End the whole sweep, not only this job, if the `with` block raises an error and the arm is not a twin.
 
-    The next job would move the arm again before the operator knows why this job failed.
+    In a sweep that continues, the next job could move the arm before the operator knows the cause of the error.
     """
     try:
         yield
@@ -187,13 +187,13 @@ def is_simulated(cfg):
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is a twin without operator, in this process; such twins can run in parallel."""
+    """Return whether conf/arm is a twin in this process, without an operator; such twins can run in parallel."""
     return is_simulated(cfg) and "operator" not in cfg.arm
 
 
 @contextmanager
 def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
-    """Yield a `PolicyRunner` for the arm of conf/arm, or with arm.live a `RealtimeRunner`; stop the arm afterwards.
+    """Yield a `PolicyRunner` for the arm of conf/arm, or a `RealtimeRunner` if arm.live; stop the arm afterwards.
 
     Args:
         dynamics: center of the training's randomization. noise: see `opened_arm`. adapter: an adapter, or None.
@@ -228,7 +228,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
 def opened_source(cfg, robot, noise):
     """Yield the arm to record: the arm of conf/arm, or with data=simulated a simulated arm with known parameters.
 
-    noise: 0, 1, 2, ... for the recordings of one run, so that their sensor noise differs.
+    noise: number of the random stream of the sensor noise: 0, 1, 2, ... for successive recordings of one run.
     """
     if cfg.data.kind != "simulated":
         with opened_arm(cfg, robot, noise) as arm:
@@ -256,10 +256,10 @@ def check_source(cfg, robot):
 
 
 def make_truth(cfg, robot):
-    """Return the true dynamics of a simulated arm: data.truth names a file in conf/friction and one in conf/inertia.
+    """Return the true dynamics of a simulated arm from the files <data.truth>.yaml in conf/friction and conf/inertia.
 
     Raises:
-        UserError: one of the files is missing.
+        UserError: conf/friction or conf/inertia has no such file.
     """
     from omegaconf import OmegaConf
 
@@ -281,7 +281,7 @@ def is_learner(cfg):
 
 
 def training_keys():
-    """Return the keys of conf/algo that only trainings use; an experiment may set them for a controller as well."""
+    """Return the keys of conf/algo that only trainings use; a controller ignores them if an experiment sets them."""
     from r2s.learning.train import Loop
 
     return ("n_envs", "demonstrations", "hidden", *(f.name for f in fields(Loop)))
@@ -295,7 +295,7 @@ def make_controller(cfg, robot, task, dynamics):
 def open_run(cfg, overrides, inputs=(), parents=()):
     """Return the open run folder of this job, with its trackers started; a resumed run keeps its tracker group.
 
-    inputs: files that the job reads. parents: run folders that it uses. Both list only what the config does not name.
+    inputs, parents: files that the job reads, and run folders that it uses, in addition to those in the config.
     """
     from omegaconf import OmegaConf
 

@@ -1,4 +1,4 @@
-"""`r2s check data=...`: judge recordings before an identification. stage=identify begins with the same verdict."""
+"""`r2s check data=...`: judge recordings before an identification. stage=identify makes the same checks first."""
 
 from pathlib import Path
 
@@ -10,12 +10,12 @@ from r2s.stages.recordings import labels_of, of_one_reader, recording_files
 
 
 def check_data(cfg, to):
-    """Print the verdict on each recording of `cfg`, and write it to a JSON file.
+    """Print the verdict on each recording of `cfg`, and write the verdict to a JSON file.
 
-    to: file for the verdict on a single recording. None, or several recordings: ROOT/check/NAME.json for each.
+    to: JSON file for a single recording; None: ROOT/check/NAME.json for each recording.
 
     Raises:
-        UserError: a file cannot be read, or the verdict on a recording is fail.
+        UserError: a file cannot be read, or a recording has the verdict fail.
     """
     if cfg.data.kind != "recording":
         raise UserError("check: expected data=recording data.path=FILE, or data=kinova_gen3")
@@ -56,7 +56,7 @@ def judged(cfg, robot, file, validation):
 
 
 def write_verdict(robot, verdict, recording, path, to):
-    """Print the tables of a verdict, and write it to the JSON file `to`."""
+    """Print the tables of a verdict, and write the verdict to the JSON file `to`."""
     from r2s.reporting.identification.verdict import print_verdict
     from r2s.runs import write_json
 

@@ -12,7 +12,7 @@ def reads(cfg):
 
 
 def compare(cfg, overrides):
-    """Compare the trainings in the folders `runs=`; if there are only transfers, compare the adapters of these."""
+    """Compare the trainings in the folders of `runs=`; without trainings, compare the adapters of the transfers."""
     from glob import glob
 
     from r2s.errors import UserError

@@ -25,10 +25,10 @@ class ContactData:
 def contact_data(cfg, robot, file):
     """Return the `ContactData` from data.contact and data.contact_validation; None without data.contact.
 
-    file: `FileData` of the config, which has the names of the columns.
+    file: `FileData` of the config, with the column names.
 
     Raises:
-        UserError: tool or commanded torque is missing, a validation has no data.contact, or a file is wrong.
+        UserError: the robot has no tool, data.torque is not commanded, data.contact is missing, or a file is invalid.
     """
     from r2s.identification.checks import check_recording
 
@@ -48,10 +48,10 @@ def contact_data(cfg, robot, file):
 
 
 def press_parts(cfg, robot, arm):
-    """Check the settings of data.presses and return the `PressPlan`; no run folder is needed yet.
+    """Check the settings of data.presses before a run folder exists; return the `PressPlan`.
 
     Raises:
-        UserError: there is no tool, a simulated arm has no surface, or a setting is wrong.
+        UserError: the robot has no tool, the simulated arm has no surface, or a setting is invalid.
     """
     from r2s.arm.presses import press_plan
     from r2s.stages.build import check_source, is_simulated
@@ -69,10 +69,10 @@ def press_parts(cfg, robot, arm):
 
 
 def pressed_surface(cfg, run, arm, plan):
-    """Let the arm press on the surface, and return the `ContactData`; a resumed run reads an existing recording.
+    """Let the arm press on the surface, and return the `ContactData`; a resumed run reads its existing recording.
 
     Raises:
-        Stopped: the arm stopped; contact_until_stop.npz has the motion until then.
+        Stopped: the arm stopped; contact_until_stop.npz contains the motion up to the stop.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.presses import record_presses
@@ -103,7 +103,7 @@ def pressed_surface(cfg, run, arm, plan):
 
 
 def calibrated_arm(cfg, robot):
-    """Return the identified arm of `calibration=`, with its posterior, as an `Arm`."""
+    """Return the identified arm that `calibration=` names, with its posterior, as an `Arm`."""
     from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.stages.run_config import modules
@@ -141,7 +141,7 @@ def identify_surface(cfg, run, arm, data):
 
 
 def keep_calibration(cfg, run):
-    """Copy the arm's model of `calibration=` into the run folder, so that a later calibration= can name it."""
+    """Copy the model of `calibration=` into the run folder, so that a later calibration= can name this folder."""
     folder = Path(cfg.calibration)
     folder = folder if folder.is_dir() else folder.parent
     for name in ARM:

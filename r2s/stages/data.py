@@ -10,9 +10,9 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
-SLOW_MS = 1.5  # ms; if rows of commands are farther apart, r2s prints how long it assumes that a command is held
+SLOW_MS = 1.5  # ms; if rows of commands are farther apart, r2s prints its assumption on the hold of a command
 LEAST_PRESSES = 4
-MAX_OVERLAP = 0.2  # largest share of a validation motion that may repeat training motion, such as the approach
+MAX_OVERLAP = 0.2  # largest share of a validation motion that may repeat training motion, for example in the approach
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,12 @@ class ArmData:
 
     Attributes:
         torque: kind of the recorded torque, "commanded" or "measured".
-        seconds: duration of each of the two motions, s.
+        seconds: duration of the training motion and of the validation motion, s.
         excitation_seed: seed of the training motion; the validation motion has the next seed.
-        excitation: file of the training motion; None: it is optimized.
+        excitation: file of the training motion; None: r2s optimizes this motion.
         ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
-        presses: number of paths on a surface to record instead; 0: none. press_point (3,) m, press_normal (3,):
-            approximate plane of the surface; None: a table below the tip in the home posture.
+        presses: number of paths on a surface that replace these motions, or 0. press_point, press_normal: (3,) m and
+            (3,), approximate plane of the surface; None: a table below the tip in the home posture.
 
     Raises:
         UserError: a value is outside its range.
@@ -81,7 +81,7 @@ class SimulatedData(ArmData):
 
 @dataclass(frozen=True)
 class FileData:
-    """Settings of data=recording, recordings from files; conf/data/recording.yaml explains each setting.
+    """Settings of data=recording, which reads files; conf/data/recording.yaml explains each setting.
 
     Raises:
         UserError: a number is outside its range.
@@ -114,7 +114,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with the command period; without data.command_hz, print the hold that r2s assumes."""
+        """Return the recording with its command period; without data.command_hz, print the assumed command hold."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -150,9 +150,9 @@ def file_data(cfg, path=None):
 
 
 def read_file(robot, file, path, torque=None):
-    """Read the recording at `path` with the settings of a `FileData`, and return it; `torque` replaces data.torque.
+    """Return the recording in `path`, read with the settings of a `FileData`; `torque` replaces data.torque.
 
-    Print what the reader repaired. If only data.path is a bag, ignore topic and joints, which describe that bag.
+    Print the reader's repairs. If data.path is a bag and `path` is not, ignore the bag's settings topic and joints.
     """
     from r2s.recordings.readers import is_bag, read
 
@@ -197,7 +197,7 @@ def read_episodes(path):
 
 
 def read_reference(path, n):
-    """Return the reference motion {t, q, dq, ddq} for a recording of stage=identify; None if it was not saved."""
+    """Return the reference motion {t, q, dq, ddq} for a recording of stage=identify; None if no motion was saved."""
     import numpy as np
 
     from r2s.recordings.csv_table import read_csv
@@ -240,7 +240,7 @@ def check_cutoff(cutoff_hz, recordings):
 
 
 def read_user_ramps(robot, file):
-    """Return the ramps of a `FileData`, or None; the ramps have the same column names as the recording."""
+    """Return the ramps that a `FileData` names, or None; recording and ramps have the same column names."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
 
@@ -248,7 +248,7 @@ def read_user_ramps(robot, file):
         return None
     columns = dict(file.columns)
     if file.torque != "commanded":
-        columns["tau"] = None  # this column has another kind of torque; ramps need commanded torque
+        columns["tau"] = None  # the column of the recording has another kind of torque; ramps need commanded torque
     ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
     check_ramps(robot, ramps)
     return replace(ramps, recording=file.held(ramps.recording))
@@ -260,7 +260,7 @@ def check_data(cfg):
 
 
 def ramp_poses(cfg, robot):
-    """Return the postures (k, n) rad of the ramps; raise UserError if no safe path leads to one of them."""
+    """Return the postures (k, n) rad of the ramps; raise UserError if no safe path leads to a posture."""
     from r2s.arm.ramp import check_paths, poses_about
 
     poses = poses_about(robot, cfg.data.ramp_poses if cfg.data.torque == "commanded" else 0)
@@ -270,9 +270,9 @@ def ramp_poses(cfg, robot):
 
 
 def record_motion(cfg, robot, motion, k, label, timing):
-    """Record motion number k on the arm; return the motion and the recording. `motion` None: optimize one.
+    """Record motion number k on the arm; return the motion and the recording. If `motion` is None, optimize one.
 
-    timing: object that stores the durations of the cycles.
+    timing: object that stores the durations of the control cycles.
     """
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
@@ -290,9 +290,9 @@ def record_motion(cfg, robot, motion, k, label, timing):
 
 
 def record_ramps(cfg, robot, timing):
-    """Record breakaway ramps in postures about home; return them, or None if there are no ramp postures.
+    """Record breakaway ramps in postures about home; return the ramps, or None without ramp postures.
 
-    timing: object that stores the durations of the cycles.
+    timing: object that stores the durations of the control cycles.
     """
     from r2s.arm.ramp import ramp
     from r2s.progress import Progress
@@ -308,15 +308,15 @@ def record_ramps(cfg, robot, timing):
 
 
 def record_arm(cfg, robot, run, motion):
-    """Record training motion, validation motion and ramps on an arm, and return them.
+    """Record and return training motion, validation motion and ramps of an arm.
 
-    A resumed run reads existing files instead. timing.csv lists the cycle durations, also after a stop.
+    A resumed run reads its existing recordings. timing.csv lists the cycle durations, even if the arm stopped.
 
     Args:
         run: open run folder for the files. motion: the training motion; None: r2s optimizes one.
 
     Raises:
-        Stopped: the arm stopped; <name>_until_stop.npz has the motion until then.
+        Stopped: the arm stopped; <name>_until_stop.npz contains the motion up to the stop.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.realtime import Timing

@@ -123,7 +123,7 @@ def wrench_observer(cfg, robot, dynamics, surface):
 
 
 def format_contacts(touched):
-    """Return one line that describes the contacts."""
+    """Return one line of text: the number of contacts, the largest force, and the first contact times."""
     if not touched:
         return "no contact"
     most = max(c["force_max_N"] for c in touched)
@@ -151,10 +151,10 @@ def given_recording(cfg, robot):
 
 
 def record_arm(cfg, robot):
-    """Record an arm along data.excitation or for data.seconds; return the recording and why the arm stopped, or None.
+    """Record data.excitation, or a motion of data.seconds; return the recording and the reason of a stop, or None.
 
     Raises:
-        Stopped: a signal stopped the arm, or it stopped before anything was recorded.
+        Stopped: a signal stopped the arm, or the arm stopped before the recording began.
     """
     from r2s.arm.interface import ArmStopped, StopRequested
     from r2s.arm.recorder import record

@@ -63,7 +63,7 @@ class Excite:
 
 
 def make_design(cfg, robot, how):
-    """Return the `PlannedWidths`: the design minimizes the interval widths that they predict."""
+    """Return the `PlannedWidths`, which predict the interval widths that the design minimizes."""
     from r2s.identification.planned_width import PlannedWidths
     from r2s.stages.prior import make_settings
 
@@ -77,7 +77,7 @@ def make_design(cfg, robot, how):
 
 
 def excite(cfg, overrides):
-    """Design an excitation; write excitation.csv, trajectory.yaml, a table of expected widths and a picture."""
+    """Design an excitation; write excitation.csv, trajectory.yaml, expected interval widths and a figure."""
     import numpy as np
 
     from r2s.excitation.design import designed, trajectory_yaml

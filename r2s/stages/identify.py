@@ -39,7 +39,7 @@ def reads(cfg):
 class Parts:
     """Inputs of an identification, checked before a run folder is made.
 
-    With data=arm, `groups` and `ramps` are recorded later. motion: from data.excitation. earlier: from identify.from.
+    With data=arm, r2s records `groups` and `ramps` later. `motion`: data.excitation. `earlier`: identify.from.
     """
 
     robot: Any
@@ -96,10 +96,10 @@ def make_parts(cfg):
 
 
 def with_known_arm(cfg):
-    """Return the option of `data` (presses, contact, loaded) that needs the known arm of `calibration=`, or None.
+    """Return the option of `data` (presses, contact, loaded) that needs an arm from `calibration=`, or None.
 
     Raises:
-        UserError: the option needs a known arm, but neither `calibration=` nor data.path= is given.
+        UserError: the option needs an identified arm, but `calibration=` and data.path= are missing.
     """
     from omegaconf import OmegaConf
 
@@ -117,7 +117,7 @@ def with_known_arm(cfg):
 
 
 def identify_with_known_arm(cfg, overrides, key):
-    """Identify a surface (contact.yaml) or a payload (payload.yaml) with the known arm of `calibration=`."""
+    """Identify a surface (contact.yaml) or a payload (payload.yaml) with the arm that `calibration=` names."""
     robot = make_robot(cfg)
     if key == "presses":
         arm = calibrated_arm(cfg, robot)
@@ -264,9 +264,9 @@ def fit_group(cfg, run, made, group, earlier, folder):
 
 
 def compared(made, group, found, settings, known_from):
-    """Return tables and summary.json entries: contribution of each recording, and drift since identify.from.
+    """Return tables and summary.json entries on the contribution of each recording and the drift since identify.from.
 
-    known_from: text that names the run or recording from which `settings.known` comes.
+    known_from: text that names the earlier identifications, whose results are `settings.known`.
     """
     from r2s.identification.contributions import contradictions, contributions, validated
     from r2s.identification.known import FAR, block_of, disagreement, drift_table

@@ -14,8 +14,8 @@ def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
     Args:
         node: config node; its keys are arguments of the target.
         group: path of the node in the config, for error messages.
-        given: positional arguments in addition to those from the config.
-        beside: keys of the node that are not arguments of the target.
+        given: positional arguments of the target, in addition to those in the config.
+        beside: keys of the node that the target does not receive.
 
     Raises:
         UserError: the target does not exist or refuses these arguments.
@@ -44,10 +44,10 @@ def target(node: Any, group: str) -> Callable[..., Any]:
 
 
 def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *given: Any) -> Any:
-    """Return make(*given, **settings); errors name the settings as the user types them.
+    """Return the result of make(*given, **settings); errors name settings as the user types them.
 
     Raises:
-        UserError: an argument is unknown or missing or has a wrong type, or `make` raises an error.
+        UserError: an argument is unknown, missing or of a wrong type, or `make` raises UserError.
     """
     check_types(make, group, settings)
     known, name = arguments(make), getattr(make, "__name__", make)
@@ -62,7 +62,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
         return make(*given, **settings)
     except UserError as error:
         first = str(error).split(":")[0].split(".")[0]
-        if first in settings and first != group:  # add the group to the message, because the target does not know it
+        if first in settings and first != group:  # the target cannot name its group in the message
             raise UserError(f"{group}.{error}") from None
         raise
 
@@ -70,7 +70,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
 def arguments(make: Callable[..., Any]) -> dict[str, Any]:
     """Return {argument: type hint} of a function or class.
 
-    For **kwargs of an __init__, add the arguments of the next class in the MRO. **kwargs of a function become "**".
+    If an __init__ has **kwargs, add the arguments of the next class in the MRO. For a function, add the key "**".
     """
     found: dict[str, Any] = {}
     for owner in make.__mro__[:-1] if inspect.isclass(make) else (make,):
@@ -109,7 +109,7 @@ def _kinds(hint: Any) -> Iterator[Any]:
 
 
 def plain(node):
-    """Return a config node as plain dicts, lists and values; other objects are returned unchanged."""
+    """Return a config node as plain dicts, lists and values; return other objects unchanged."""
     from omegaconf import OmegaConf
 
     if not OmegaConf.is_config(node):

@@ -23,10 +23,10 @@ def loaded_data(cfg, robot, file, torque=None):
     """Return the `LoadedData` of data.loaded, or None without data.loaded.
 
     Args:
-        file: `FileData` of the config, with the column names. torque: kind of the torque; None: data.torque.
+        file: `FileData` of the config, with the column names. torque: replaces data.torque unless None.
 
     Raises:
-        UserError: data.declared_payload or data.contact contradicts data.loaded, or the file is wrong.
+        UserError: data.declared_payload or data.contact contradicts data.loaded, or the file is invalid.
     """
     from r2s.identification.checks import check_motion
     from r2s.physics.payload import payload_of
@@ -53,10 +53,10 @@ def loaded_data(cfg, robot, file, torque=None):
 def torque_of_calibration(cfg, given):
     """Return the kind of torque from which `calibration=` was identified; loaded recordings need the same kind.
 
-    given: value of data.torque, or None.
+    given: value of data.torque; None: not set.
 
     Raises:
-        UserError: data.torque is another kind.
+        UserError: data.torque is another kind of torque.
     """
     from r2s.stages.adapter_factory import PARAMETERS, TORQUE
     from r2s.stages.run_config import loaded
@@ -73,7 +73,7 @@ def torque_of_calibration(cfg, given):
 def identify_load(cfg, run, arm, data, label=""):
     """Identify a payload; write payload.yaml and figure, print the tables, return the entry for summary.json.
 
-    label: label of the recording if there are several; payload.yaml is then written to the folder payload_LABEL.
+    label: label of one of several recordings; payload.yaml is then in the folder payload_LABEL.
     """
     from r2s.identification.payload.estimate import identify_payload
     from r2s.identification.payload.payload_file import save_payload

@@ -1,6 +1,6 @@
 """stage=pipeline: identify, train and transfer on one computer; each command of a step has its own run folder.
 
-For a task on a surface, the arm presses on the surface before the trainings, and the surface is identified as well.
+For a task on a surface, the arm presses on the surface before the trainings, and r2s identifies the surface.
 """
 
 import os
@@ -46,19 +46,19 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the config keys that the steps read, except keys that the pipeline sets for them."""
+    """Return the config keys that the steps read, except the keys that the pipeline itself sets."""
     keys = {"pipeline", *identify.reads(cfg), *train.reads(cfg), *transfer.reads(cfg)} - {"calibration", "policy"}
     return keys if cfg.pipeline.train_minutes is None else keys - {"budget"}
 
 
 def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
-    """Return the typed overrides that a step reads. step: config of the step."""
+    """Return the user's overrides that a step reads. step: config of the step."""
     own = ("stage=", "name=", "root=", "threads=", "pipeline.")
     return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
 
 
 def run_step(words: dict[str, list[str]]) -> None:
-    """Run the commands {label: words} in parallel; print progress line by line, and tables when a command ends.
+    """Run the commands {label: words} in parallel; print each command's progress, and its tables at the end.
 
     Raises:
         UserError: a command failed; the remaining commands are terminated.
@@ -107,12 +107,12 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Return groups of commands to run in parallel: one group per step, or with `moves` one per command."""
+    """Return groups of commands that run in parallel: the whole step, or single commands if an arm `moves`."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
 def command_prefix() -> list[str]:
-    """Return the words that start r2s like this process, from a checkout or as a package, with its --config-dir."""
+    """Return the command line that starts r2s as in this process: from checkout or package, with its --config-dir."""
     from hydra.core.hydra_config import HydraConfig
 
     program = [str(PACKAGE.parent / "run.py")] if CONF.parent != PACKAGE else ["-m", "r2s"]
@@ -144,7 +144,7 @@ def touches(cfg: Any) -> bool:
 
 
 def moves_box(cfg: Any) -> bool:
-    """Return whether the task pushes a box; its mass and friction are not identified."""
+    """Return whether the task pushes a box; r2s does not identify the box's mass and friction."""
     return bool(getattr(target(cfg.task, "task"), "moves_box", False))
 
 
@@ -166,10 +166,10 @@ def check_free(root: Path, name: str, cfg: Any) -> None:
 
 
 def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
-    """Return {label: words of a command} per step: identify, press on the surface if there is one, train, transfer.
+    """Return {label: words of a command} for each step: identify, press on a surface of the task, train, transfer.
 
-    Both trainings have the same settings, time and computer, so the policies differ only in the model. With an
-    adapter, identification uses the unchanged arm: payload, friction and delay change for transfers only.
+    The trainings on the identified and the nominal model have the same settings, time and computer. With an adapter,
+    the arm's payload, friction and delay change (CHANGES) after the identification, for the transfers only.
 
     Args:
         cfg: config of the pipeline. name: name of the pipeline's run folder; all other folder names begin with it.
@@ -237,7 +237,7 @@ def surface_words(cfg: Any) -> list[str]:
 
 
 def tool_words(cfg: Any) -> list[str]:
-    """Return overrides that set the tool and the plane of the presses to those of the task."""
+    """Return overrides that set the task's tool and plane for the presses."""
     tool = [f"robot.tool={cfg.task.tool}"] if cfg.robot.get("tool") is None else []
     given = {k: cfg.task[k] for k in ("point", "normal") if cfg.task[k] is not None}
     return tool + [f"data.press_{k}={list(v)}" for k, v in given.items()]
@@ -254,14 +254,14 @@ def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrid
 
 
 def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
-    """Raise UserError if identification or training would refuse an override, before anything moves."""
+    """Raise UserError, before the arm moves, if identification or training would refuse an override."""
     first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
     identify.make_parts(compose_step(first["identify"], "stage=identify"))
     train.make_parts(compose_step(trained["nominal"], "stage=train"))  # other trainings need the identified model
 
 
 def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
-    """Return overrides that select the nominal model, from which the identification starts, for a training."""
+    """Return overrides for a training on the nominal model from which the identification starts."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices
@@ -270,7 +270,7 @@ def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
 
 
 def pipeline(cfg, overrides):
-    """Run every command in a separate process; write one table, one recording and one report on all commands."""
+    """Run every command in a separate process; write a table, a recording and a report that cover all commands."""
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures
     from r2s.runs import read_summary

@@ -14,7 +14,7 @@ from r2s.stages.run_config import loaded
 class Earlier:
     """An earlier identification: folder, kind of torque, parameter space, values x (P,) and posterior draws (S, P).
 
-    drift: value of identify.drift. given: True for a run of identify.from=, False for an earlier fit in this run.
+    drift: value of identify.drift. given: True for the run that identify.from= names, False for a fit of this run.
     """
 
     run: str
@@ -31,7 +31,7 @@ class Earlier:
 
     @property
     def arm(self):
-        """The identified dynamics; an estimated payload is removed, because it will be estimated again."""
+        """The identified dynamics; an estimated payload is removed, because r2s will estimate it again."""
         x = self.x.copy()
         if "payload_mass" in self.space.blocks:
             x[self.space.where("payload_mass")] = 0.0
@@ -46,7 +46,7 @@ def earlier_run(cfg, robot):
     """
     from r2s.identification.parameter_file import load_parameters, load_posterior
 
-    run, option = cfg.identify.get("from"), "identify.from"  # older configs lack it
+    run, option = cfg.identify.get("from"), "identify.from"  # older configs lack this key
     if run is None:
         return None
     run = str(run)
@@ -62,9 +62,9 @@ def make_settings(cfg, torque, earlier=(), last=True):
     """Return the `Settings` of an identification from this kind of torque.
 
     Args:
-        earlier: list of `Earlier`. With another kind of torque, it provides links and payload. With the same kind,
-            it provides all values, friction family and terms, so that both identifications have the same model.
-        last: whether this is the last kind of torque; only there do stated values of friction and sensors apply.
+        earlier: list of `Earlier`. A fit with another kind of torque provides links and payload. A fit with the
+            same kind provides all values, friction family and terms, so that both identifications share a model.
+        last: whether this is the last kind of torque. Earlier kinds use only stated values of links and payload.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings
@@ -104,7 +104,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
 
 
 def check_known(robot, nominal, recording, settings):
-    """Raise UserError if a stated value does not fit the arm, or its parameter has no effect in the recording."""
+    """Raise UserError if a stated value does not fit the arm, or if its parameter does not affect the recording."""
     from r2s.identification.stated import check_stated, stated_prior
     from r2s.identification.terms import scaled_prior, search_space
     from r2s.physics.dynamics import with_family
@@ -117,7 +117,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the initial dynamics of a fit: `earlier`'s dynamics, or for another kind of torque only its links."""
+    """Return the initial dynamics of a fit: `earlier`, or `nominal` with its links if the kinds of torque differ."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -1,7 +1,7 @@
 """Find and read the recordings of stage=identify and `r2s check`: one or several files, each with a kind of torque.
 
-`data.path` and `data.validation` are a file, a pattern such as "logs/*.csv", a dict {path: FILE, torque: motor, ...},
-whose keys override those of `data`, or a list of files, patterns and dicts.
+`data.path` and `data.validation` each name a file, a pattern such as "logs/*.csv", a dict such as
+{path: FILE, torque: motor}, or a list of these. The keys of a dict override those of `data`.
 """
 
 import glob
@@ -18,12 +18,12 @@ from r2s.stages.parts import plain
 
 OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints", "payload")
 FIND = "find"  # value of `payload` for a recording whose payload is to be identified
-ORDER = ("measured", "motor", "commanded")  # order of fits; the last has the friction that a command has to overcome
+ORDER = ("measured", "motor", "commanded")  # order of fits; the last fit has the friction that a command overcomes
 
 
 @dataclass(frozen=True)
 class Group:
-    """Recordings of one kind of torque: {label: recording} of training and of validation motion.
+    """Recordings with one kind of torque; `train` and `validation` are {label: recording}.
 
     loaded: recordings with a payload that is to be identified.
     """
@@ -62,7 +62,7 @@ def recording_files(cfg, key="path"):
 
 
 def _matching(where: str, path: str) -> Iterator[str]:
-    """Yield the path itself, or, if the path is a pattern, the matching files in alphabetical order."""
+    """Yield the files that match a pattern, in alphabetical order; yield a path without wildcards unchanged."""
     if not glob.has_magic(path) or located(path).exists():
         yield path
         return
@@ -72,7 +72,7 @@ def _matching(where: str, path: str) -> Iterator[str]:
 
 
 def of_one_reader(files):
-    """Return the files; if the first is a bag, set `topic` and `joints` to None in files of other formats."""
+    """Return the files; if the first is a bag, files of other formats lose its settings `topic` and `joints`."""
     from r2s.recordings.readers import is_bag
 
     if not is_bag(Path(files[0].path)):
@@ -87,11 +87,11 @@ def labels_of(files):
 
 
 def read_groups(robot, files, validation, share, cutoff_hz):
-    """Read the recordings; return one `Group` per kind of torque, in the order of the fits.
+    """Read the recordings; return one `Group` per kind of torque, in the order ORDER of the fits.
 
     Args:
-        files, validation: `FileData` of each file. share: if `validation` is empty, the part at the end of each
-            recording, or of every period, that is held out. cutoff_hz: see `without_payload`.
+        files, validation: `FileData` of each file. share: part at the end of each recording, or of every period, that
+            r2s holds out if `validation` is empty. cutoff_hz: see `without_payload`.
     """
     made: dict[str, Group] = {}
 
@@ -132,7 +132,7 @@ def read_groups(robot, files, validation, share, cutoff_hz):
 
 
 def _read(robot, file, several, cutoff_hz):
-    """Read and check a recording, and subtract the torque of a known payload. several: name the file in errors."""
+    """Return a checked recording without the torque of a known payload. several: whether errors name the file."""
     from r2s.identification.checks import check_recording
     from r2s.identification.payload.unloaded import without_payload
     from r2s.physics.payload import payload_of

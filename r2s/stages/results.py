@@ -1,6 +1,6 @@
-"""stage=results: make a page of benchmarks/results again in a clean clone of this commit, and compare it.
+"""stage=results: reproduce a page of benchmarks/results in a clean clone of this commit; compare both pages.
 
-`python run.py -m +experiment=results` makes all pages that docs/results.md cites.
+`python run.py -m +experiment=results` reproduces all pages that docs/results.md cites.
 """
 
 import os
@@ -21,14 +21,14 @@ CLONE = "checkout"  # name of the clone in the run folder
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads, without the commands of other pages, which may change."""
+    """Return the config keys that this stage reads, except the commands of other pages."""
     return {"results.page", "results.data", f"results.pages.{cfg.results.page}"}
 
 
 def commands_of(settings):
-    """Return the commands (lists of words) that make `results.page`, with the folder `results.data` inserted.
+    """Return the commands (lists of words) that make the page `results.page` from the folder `results.data`.
 
-    A command is `make ...`, or arguments for python.
+    A command is `make ...` or consists of arguments for python.
 
     Raises:
         UserError: the page does not exist, r2s is not a checkout, or the data for the page are missing.
@@ -49,7 +49,7 @@ def commands_of(settings):
 
 
 def results(cfg, overrides):
-    """Make a page again; write the new page, differences.csv and report.md."""
+    """Reproduce a page of benchmarks/results; write the new page, differences.csv and report.md."""
     from r2s.progress import Progress
     from r2s.provenance import git
     from r2s.reporting.page_comparison import compare_all
@@ -78,8 +78,8 @@ def results(cfg, overrides):
 def cloned(clone, paths):
     """Clone this commit unless the clone exists; return {page: committed text, or ""} and the hash of the commit.
 
-    In the clone's pages, tables have no rows, so that a table which is not made again stays empty. The clone has a
-    temporary name until it is complete.
+    The clone's pages have tables without rows, so that a table stays empty if no command writes it. An incomplete
+    clone has a temporary name.
     """
     from r2s.reporting.page_comparison import without_rows
 
@@ -100,7 +100,7 @@ def cloned(clone, paths):
 
 
 def execute(words, clone, log):
-    """Run `python WORDS` (or `make ...`, if WORDS begin so) with the clone's r2s; append the output to `log`.
+    """Run `python WORDS`, or WORDS if they begin with make, with the clone's r2s; append the output to `log`.
 
     Raises:
         UserError: the command fails; the message quotes the last line of output.

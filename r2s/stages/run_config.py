@@ -1,4 +1,4 @@
-"""Read config.yaml of a run folder safely: anybody may have written it, so parts from unknown modules are refused."""
+"""Read config.yaml of a run folder safely: anybody may have written it, so r2s refuses unknown parts."""
 
 import os
 import re
@@ -36,10 +36,10 @@ def loaded(path):
 
 
 def modules(trust) -> list[str]:
-    """Return the module names in the option `trust=`, which is a name, names with commas, a list, or None.
+    """Return the module names in the option `trust=`: a name, comma-separated names, a list, or None.
 
     Raises:
-        UserError: the option is anything else.
+        UserError: the option has another type.
     """
     names = trust.strip("[]").split(",") if isinstance(trust, str) else trust
     if names is None:
@@ -59,21 +59,21 @@ def run_config(folder, trust=None):
 
 
 def replayed(cfg):
-    """Return a composed config; if its overrides come from a run folder, check it with `checked` first."""
+    """Return a composed config; a config with overrides from a run folder must first pass `checked`."""
     return checked(cfg, "resume", os.environ[TRUST]) if TRUST in os.environ else cfg
 
 
 def checked(cfg, where, trust=None):
-    """Return a run folder's config with resolved interpolations; raise UserError if it could run untrusted code.
+    """Return a run folder's config with resolved interpolations; raise UserError for untrusted code.
 
-    r2s imports the module of a part and calls the part. So conf/ has to name the part in the same group, or a module
-    in `trust` has to define it. Resolvers can read the environment, so they are treated as parts of the module `oc`.
+    r2s calls every part (`_target_`) that a config names. So conf/ must name the same part in the same group, or a
+    module in `trust` must define the part. Resolvers can read the environment, so r2s treats them as parts of `oc`.
 
     Args:
-        where: file name for errors. trust: modules that the user trusts (`modules`); replaces the config's `trust`.
+        where: file name for errors. trust: value of `trust=`, see `modules`; replaces the config's `trust`.
 
     Raises:
-        UserError: the config names an untrusted part; r2s has neither imported nor called it.
+        UserError: the config names an untrusted part, which r2s has neither imported nor called.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -111,7 +111,7 @@ def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...],
 
 
 def _is_own(key, value) -> bool:
-    """Return whether a setting is not the dotted path of a part, or conf/ names this part in the same group."""
+    """Return whether a setting is no dotted path of a part, or is a part that conf/ names in the same group."""
     if key == ("friction", "family"):
         return "." not in str(value)
     if key[-1:] != ("_target_",):

@@ -52,9 +52,9 @@ def reads(cfg):
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a training. They are made before the run folder, so that no folder remains after a config error.
+    """The parts of a training. r2s makes them before the run folder, so that a config error creates no folder.
 
-    For a controller without learning, only the first five are set, and `algo` is the controller.
+    For a controller without learning, only the first five attributes are set, and `algo` is the controller.
     """
 
     robot: Any
@@ -70,10 +70,10 @@ class Parts:
 
 
 def make_parts(cfg):
-    """Return the parts of the training that a config describes.
+    """Return the `Parts` of the training that a config describes.
 
     Raises:
-        UserError: a setting is wrong.
+        UserError: a setting is invalid.
     """
     import torch
 
@@ -121,13 +121,13 @@ def check_length(budget, loop, n_envs, key):
 
 
 class Selection:
-    """The best and the last evaluation of a training. If scores are equal, the later evaluation is the better one."""
+    """The best and the last evaluation of a training. Of evaluations with equal scores, the latest is the best."""
 
     def __init__(self, task):
         self._task, self.best, self.last = task, {}, {}
 
     def add(self, row):
-        """Add a row of evaluations.csv; return whether it is the best so far."""
+        """Add a row of evaluations.csv; return whether this evaluation is the best so far."""
         self.last = row
         better = not self.best or self._task.score(row) >= self._task.score(self.best)
         self.best = row if better else self.best
@@ -175,7 +175,7 @@ def train(cfg, overrides):
 
 
 def conclude(cfg, run, parts, selection):
-    """Evaluate the best and last policy on goals without selection; write policy.onnx, summary.json and the page."""
+    """Evaluate best and last policy on goals not used for selection; write policy.onnx, summary.json and the page."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.learning.policy import export_onnx, load_policy
     from r2s.reporting import pages
@@ -193,13 +193,13 @@ def conclude(cfg, run, parts, selection):
 
 
 def share_threads(cfg):
-    """Return the number of threads for updates and for the physics, which run at the same time."""
+    """Return the number of threads for network updates and the number for the physics, which run at the same time."""
     learning = max(1, min(UPDATE_THREADS, all_threads(cfg) // 2))
     return learning, max(1, all_threads(cfg) - learning)
 
 
 def split_algo(cfg):
-    """Return the number of arms, the env steps of demonstrations, the `Loop`, and the other settings of conf/algo."""
+    """Return settings of conf/algo: number of arms, env steps of demonstrations, `Loop`, algorithm arguments."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
@@ -214,7 +214,7 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config; a resumed training reads models from its run folder, because the originals may be gone."""
+    """Return the config; a resumed training reads the copies of models in its run folder: originals may be gone."""
     if not cfg.resume:
         return cfg
     model = cfg.copy()
@@ -246,7 +246,7 @@ def keep_calibration(cfg, folder):
 
 
 def title(cfg):
-    """Return the title of a training's table."""
+    """Return the title for the table of a training's measures."""
     spread = ", ".join(f"{k} {v}" for k, v in plain(cfg.dr).items() if k != "_target_" and v is not None)
     return f"{cfg.algo.name} in MuJoCo, dr: {spread}"
 

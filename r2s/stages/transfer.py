@@ -43,10 +43,10 @@ def reads(cfg):
 def trained_config(cfg, option="policy"):
     """Return the run folder `policy=` and its config; errors begin with `option`.
 
-    In this config, calibration and surface refer to the copies in the run folder, so no other folder is needed.
+    The config names the run folder's own copies of calibration and surface, so that no other folder is needed.
 
     Raises:
-        UserError: the folder is not that of a finished training.
+        UserError: the folder contains no finished training.
     """
     if not cfg.policy:
         raise UserError(f"{option} must be given: {option}=RUN_FOLDER, of a finished stage=train")
@@ -66,11 +66,11 @@ def trained_config(cfg, option="policy"):
 
 @dataclass(frozen=True)
 class Request:
-    """A policy and the episodes to run in every simulator and on the arm.
+    """A policy, and the episodes in which it runs in every simulator and on the arm.
 
     Attributes:
         robot, task: robot and task of the training. center: center of the training's randomization.
-        source: run folder of the training. policy: trained policy or controller. starts, goals: one per episode.
+        source: run folder of the training. policy: trained policy or controller. starts, goals: a row per episode.
         draw: randomization of the training; None with simulator=none. soft_start_s: soft start of the arm, s.
     """
 
@@ -86,7 +86,7 @@ class Request:
 
 
 def make_request(cfg):
-    """Return the request; if there is an arm, check that a safe path leads to every start posture.
+    """Return the `Request`; with an arm, check first that a safe path leads to every start posture.
 
     Raises:
         UserError: the training is unfinished, simulator and arm are none, the arm is unsuitable, or a path is unsafe.
@@ -141,7 +141,7 @@ def goal_progress(label):
 
 
 def run_in_simulators(cfg, request, engine):
-    """Run the episodes in MuJoCo and, unless None, in `engine`; return {name: measures} and {name: Episodes}."""
+    """Run the episodes in MuJoCo, and in `engine` unless it is None; return {name: measures} and {name: Episodes}."""
     from r2s.engines.episodes import EngineArms
     from r2s.learning.evaluate import make_evaluation
     from r2s.tasks.rollout import gap, rollout
@@ -160,13 +160,13 @@ def run_in_simulators(cfg, request, engine):
 
 @dataclass(frozen=True)
 class ArmResult:
-    """Result of the episodes on an arm.
+    """Result of running the episodes on an arm.
 
     Attributes:
         tried: (k,) indices of the goals whose episodes began. episodes: these k episodes; None if k = 0.
         stops: stops that ended episodes early. timing: durations of the 1 kHz cycles; None if unknown.
-        halted: reason why the remaining goals did not run; None: all ran.
-        blocked: reason of a stop that ended the last episode of an arm with an operator; None: no such stop.
+        halted: reason why the remaining episodes did not run; None: all episodes ran.
+        blocked: reason of a stop in the last episode that the operator has to confirm; None: no such stop.
     """
 
     tried: Any = ()
@@ -178,7 +178,7 @@ class ArmResult:
 
 
 def run_on_arm(cfg, request, runner, predicted):
-    """Run those goals whose predicted episodes stay far enough from a collision; return the `ArmResult`."""
+    """Run the episodes without a predicted collision or near collision; return the `ArmResult`."""
     import numpy as np
 
     from r2s.physics.collision import CollisionCheck
@@ -234,7 +234,7 @@ def predict(cfg, request, robot):
 def save_arm_result(run, request, name, result, predicted):
     """Write stops.txt, timing.csv and episodes_<arm>.csv with a row per episode; return the measures on the arm.
 
-    predicted: predicted episodes, with which the arm's episodes are compared, or None.
+    predicted: episodes of the model, for a comparison with those of the arm; None: no comparison.
     """
     import pandas as pd
 
@@ -254,9 +254,9 @@ def save_arm_result(run, request, name, result, predicted):
 
 
 def rest_warning(rows, name):
-    """Return a warning if fewer episodes end at rest on the arm than predicted, else None.
+    """Return a warning if fewer episodes than predicted end at rest on the arm, else None.
 
-    Success and path gap do not reveal a shaking policy, because the end effector hardly moves
+    A policy that shakes the joints hardly moves the end effector. So success and path gap do not reveal the shaking
     (benchmarks/results/transfer.md).
     """
     seen, expected = (rows.get(k, {}).get("rest") for k in (name, "predicted"))
@@ -287,7 +287,7 @@ def transfer(cfg, overrides):
     with opened as runner, open_run(cfg, overrides, parents=[str(request.source)]) as run:
         shutil.copyfile(request.source / "config.yaml", run.folder / "policy.yaml")
         write_measures(run.folder, task.measure_table)
-        if twin:  # first, because this forks processes, which must precede any thread
+        if twin:  # first, because this forks processes, and a fork must precede any thread
             result = run_on_twins(cfg, request, open_runner)
         if request.draw is not None:
             rows, episodes = run_in_simulators(cfg, request, engine)

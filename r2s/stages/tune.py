@@ -23,7 +23,7 @@ from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 MOST_STARTS = 3  # attempts to start a training that the system ends, for example because memory is short
 POLL_S = 0.2
 STOP_S = 20.0  # s, time for a training to end after each signal; a step or an evaluation takes less
-EDGE = 0.05  # share of a range, at each end, that is called its edge
+EDGE = 0.05  # share of a range at each end; a value in this share is at an edge
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 
@@ -37,11 +37,11 @@ class Tune:
     """Settings of the config group `tune`.
 
     Attributes:
-        trials: total number of trials. workers: number of parallel trainings, one thread each; None: threads=.
+        trials: total number of trials. workers: number of parallel trainings, one thread each; None: `threads`.
         startup: number of random trials before TPE and the pruner start.
         measure: key of the task's measure to optimize, in the last evaluation of each training.
         space: {option: list of values, or a range for `parse_range`}.
-        against: pattern of run folders of trainings to compare with, for example of a grid; None: no comparison.
+        against: pattern of run folders of trainings for comparison, for example a grid; None: no comparison.
 
     Raises:
         UserError: a number is outside its range, the space is invalid, or the pattern matches nothing.
@@ -74,7 +74,7 @@ def parse_range(key: str, axis: Any) -> tuple[float, float, bool]:
     """Return (low, high, whether logarithmic) of a range such as "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
 
     Raises:
-        UserError: the text has neither form.
+        UserError: the text describes no such range.
     """
     found = re.fullmatch(r"(log|interval)\(([^,]+),([^,]+)\)", str(axis).replace(" ", ""))
     try:
@@ -109,7 +109,7 @@ def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
-    """Return a line for each setting of the best trial that is at an edge of its range or list of numbers."""
+    """Return a line of text for each of the best trial's settings at an edge of its range or list of numbers."""
     from r2s.reporting.comparison.scores import edge, is_number
 
     lines = []
@@ -125,7 +125,7 @@ def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
 
 
 def training_words(cfg, overrides, settings):
-    """Return the overrides of a training: typed overrides that a training reads, and the settings {option: value}."""
+    """Return a training's overrides: the typed ones that a training reads, and `settings` {option: value}."""
     step = cfg.copy()
     step.stage = "train"
     typed = [o for o in overrides_for(overrides, step) if not o.startswith(("resume=", "skip_completed="))]
@@ -133,7 +133,7 @@ def training_words(cfg, overrides, settings):
 
 
 def check_trainings(cfg, overrides, space):
-    """Return the parts of one training; raise UserError if any training would refuse an override or a value."""
+    """Return the `Parts` of one training; raise UserError if any training would refuse an override or a value."""
     typed = {o.lstrip("+~").split("=")[0] for o in overrides}
     if both := sorted(typed & set(space)):
         raise UserError(f"{both[0]}: tune.space searches it; leave it out, or give tune.space={{{both[0]}: [VALUE]}}")
@@ -147,7 +147,7 @@ def check_trainings(cfg, overrides, space):
 
 
 def logged_measures(parts):
-    """Run a short evaluation; return {key: Measure} for the measures that a training logs (others need an arm)."""
+    """Return {key: Measure} of the measures that a training logs, which a short evaluation determines."""
     import torch
 
     from r2s.learning.evaluate import make_evaluation
@@ -161,7 +161,7 @@ def logged_measures(parts):
 class TrialRun:
     """The training of an Optuna trial: a run folder of stage=train, and the process that writes in the folder.
 
-    After stage=tune was killed, a training may go on in this folder; as long as it does, no other is started.
+    A training may outlive a killed stage=tune. While such a training runs in the folder, no second training starts.
 
     Args:
         trial: Optuna's trial. folder: run folder. words: command that starts the training. log: file for stderr.
@@ -181,9 +181,9 @@ class TrialRun:
             self._process = subprocess.Popen(self._words, stdout=subprocess.DEVNULL, stderr=log)
 
     def stop(self) -> None:
-        """End the training as Ctrl-C does, so that its run folder gets the status stopped.
+        """End the training as Ctrl-C does, so that the status in its run folder becomes stopped.
 
-        Processes in the background of a shell ignore SIGINT, so SIGTERM and SIGKILL follow if necessary.
+        Background processes of a shell ignore SIGINT. If the training still runs, SIGTERM and SIGKILL follow.
         """
         if self._process is None:
             return
@@ -196,7 +196,7 @@ class TrialRun:
                 continue
 
     def status(self) -> str:
-        """Return started (child of this process), left (runs in another process), or the status in the run folder."""
+        """Return started (by this process), left (in another process), none, or the status in the run folder."""
         from r2s.runs import is_locked, read_meta
 
         if self._process is not None and self._process.poll() is None:
@@ -206,7 +206,7 @@ class TrialRun:
         return "left" if is_locked(self.folder) else read_meta(self.folder)["status"]
 
     def report(self, measure: str) -> list[float]:
-        """Report new evaluations to Optuna; return the values of the measure in all evaluations so far."""
+        """Report new evaluations to Optuna; return the measure's values in all evaluations so far."""
         path = self.folder / "evaluations.csv"
         text = path.read_text() if path.is_file() else ""
         complete = text[: text.rfind("\n") + 1]  # the training may still be writing the last row
@@ -218,7 +218,7 @@ class TrialRun:
 
 
 def follow(study: Any, one: TrialRun, measure: str) -> bool:
-    """Report evaluations; start the training if necessary, or prune it; return whether the trial is finished.
+    """Report a trial's evaluations; start or prune the training if necessary; return whether the trial is finished.
 
     Raises:
         UserError: the training failed before its first evaluation, or ended early MOST_STARTS times.
@@ -337,7 +337,7 @@ def tune(cfg, overrides):
 
 
 def make_trial(cfg, overrides, run, space, trial):
-    """Return the `TrialRun` of an Optuna trial, with the settings that Optuna suggests for it."""
+    """Return the `TrialRun` of an Optuna trial, with the settings that Optuna suggests for this trial."""
     name = f"{run.folder.name}_{trial.number}"
     words = training_words(cfg, overrides, suggest(trial, space))
     words += [f"root={cfg.root}", f"name={name}", "skip_completed=true"]

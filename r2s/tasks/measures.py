@@ -1,7 +1,7 @@
 """Descriptions of a task's measures: key, unit, which direction is better, and how tables and figures show them.
 
-Each task class has a `measure_table`. Training and transfer write this table into their run folder as measures.json.
-So tables, pages and comparisons of run folders do not need the task's class.
+Each task class has a `measure_table`. Training and transfer write this table into their run folder as measures.json,
+so that tables, pages and comparisons of run folders do not need the task's class.
 """
 
 import json
@@ -49,11 +49,11 @@ class Measure:
 
     @property
     def sign(self) -> float:
-        """-1 if lower is better, else 1."""
+        """-1 if lower values of the measure are better, else 1."""
         return -1.0 if self.lower_is_better else 1.0
 
     def cell(self, value: float | None, digits: int | None = None) -> str:
-        """Return a stored value as shown; "-" if it is missing or not finite."""
+        """Return the displayed text of a stored value; "-" if the value is missing or not finite."""
         if value is None or not isfinite(value):
             return "-"
         return f"{self.scale * value:.{self.digits if digits is None else digits}f}"
@@ -81,17 +81,17 @@ class MeasureTable:
 
     Attributes:
         measures: the measures of the task itself; the measures COMMON are always added.
-        selection: measures that compare trainings. Rows must contain the first; the last ranks groups of trainings.
+        selection: measures that compare trainings. Rows must have the first; the last ranks groups of trainings.
         rows: columns of the table with a row per simulator and arm.
-        comparison: columns of the table of trainings. curves: panels of the learning figure.
+        comparison: columns of the table of trainings. curves: panels of the figure with learning curves.
         scores: panels of the figure of scores.
-        transfer: measures of a transfer to an arm that compare adapters, episode by episode.
+        transfer: measures that compare adapters episode by episode in transfers to an arm.
         diagnostics: columns of a transfer's second table.
         corner: heading of the column with the row labels. description: what a policy does, in one sentence.
         error: name, unit and scale of `Episodes.distance`. error_levels: lines in the error's figure, in its unit.
         reward: name of `Episodes.reward`.
 
-    Replacements of empty lists: in `rows` all `measures`, in `diagnostics` COMMON, elsewhere `selection`.
+    An empty `rows` means all `measures`, an empty `diagnostics` COMMON, any other empty list `selection`.
     """
 
     measures: tuple[Measure, ...]
@@ -129,7 +129,7 @@ class MeasureTable:
         return self.known[key]
 
     def in_words(self, row: Mapping[str, Any]) -> list[str]:
-        """Return the measures of `selection` that the row contains as words: ["success at 1 cm 98 %", ...]."""
+        """Return texts on the measures of `selection` in the row, such as ["success at 1 cm 98 %", ...]."""
         return [self[key].in_words(float(row[key])) for key in self.selection if row.get(key) not in (None, "")]
 
 
@@ -140,7 +140,7 @@ def write_measures(folder: Path, table: MeasureTable) -> None:
 
 
 def read_measures(folder: Path) -> MeasureTable | None:
-    """Return the table in measures.json of a run folder, None if there is no such file.
+    """Return the table in measures.json of a run folder, or None without this file.
 
     Raises:
         UserError: the file is damaged.

@@ -24,11 +24,11 @@ REVERSAL_S = 0.2  # s, duration of the friction feedforward's reversal after a f
 class PressTask(SurfaceTask):
     """Press on a surface; a `Task` (r2s/tasks/task.py) from conf/task/press.yaml.
 
-    A goal is a row as in `SurfaceTask`; its two forces are the requested forces before and after the step.
+    A goal is a row as in `SurfaceTask`; its two forces are the requested forces before and after the force step.
 
     Attributes:
         step_s: s, time of the force step. Other attributes: see `SurfaceTask`.
-        creep: m/s, tip speed along the normal with the fastest joint at FIRST_DQ (r2s/physics/impedance.py).
+        creep: m/s, tip speed along the normal when the fastest joint moves at FIRST_DQ (r2s/physics/impedance.py).
     """
 
     step_s: float = 3.5
@@ -58,7 +58,7 @@ class PressTask(SurfaceTask):
         return away * np.array([[np.cos(about), np.sin(about)]]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return two forces, N, ~ U(force); they differ by at least the share LEAST_STEP of the range `force`."""
+        """Return two forces, N, ~ U(force), which differ by at least LEAST_STEP times the width of `force`."""
         low, high = self.force
         first = rng.uniform(low, high)
         second = first
@@ -71,7 +71,7 @@ class PressTask(SurfaceTask):
         return self.at(np.zeros(len(goals)), goals)
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force, N, for hybrid control at t (m,) s; the step is a ramp of `force_rate`."""
+        """Return (m, 4), normal and force, N, for hybrid control at t (m,) s; the step has the slope `force_rate`."""
         first, second = goals[:, 6], goals[:, 7]
         moved = (self.force_rate * (t - self.step_s)).clip(0.0)
         force = first + np.sign(second - first) * np.minimum(moved, np.abs(second - first))
@@ -80,17 +80,17 @@ class PressTask(SurfaceTask):
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return the target (m, 6) of an impedance: position, m, and a velocity, m/s, for the friction feedforward.
 
-        The position moves from the start along the normal through the nominal plane, until the spring exerts the
-        larger of the two forces even on a surface at the farthest allowed position. The velocity only sets the
-        direction in which the friction feedforward expects the joints to move: against the normal while the force
-        rises, along the normal after a step down.
+        The target position moves against the normal through the nominal plane, so deep that the spring exerts the
+        larger of the two forces even on a surface at the lowest allowed position. Only the friction feedforward uses
+        the target velocity, as the expected direction of motion, which is along the normal after a force step down,
+        and against the normal otherwise.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = self.at(t, goals) - self.depth(t, goals)[:, None] * goals[:, NORMAL]
         return np.concatenate([place, (self.creep * (2.0 * share - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the requested force, a step without a ramp."""
+        """Return (m, 2) N, the force against the nominal normal, and the requested force, which jumps at `step_s`."""
         before = state.t < self.step_s + 0.5 / self.ctrl_hz
         return self.pressed(state, goals, np.where(before, goals[:, 6], goals[:, 7]))
 
@@ -99,8 +99,8 @@ class PressTask(SurfaceTask):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the force error (m,) N, and the reward terms (m, 5).
 
-        force -tanh(error / 5 N); precision 1 - tanh(error / 5 N) / 2 - tanh(error / 0.5 N) / 2; excess
-        -tanh(excess force / 10 N); smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        Terms: force = -tanh(error / 5 N), precision = `near`(error, 5 N, 0.5 N), excess = -tanh(excess force / 10 N),
+        smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2), filter_penalty = -`State.limited`.
         """
         beyond = -np.diff(self.forces(state, goals))[:, 0]
         error, excess = np.abs(beyond), np.tanh(beyond.clip(0.0) / HARD_N)
@@ -108,7 +108,7 @@ class PressTask(SurfaceTask):
         return error, np.stack(terms, axis=1)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
-        """Return one row of evaluations.csv, see `press_measures`."""
+        """Return one row of evaluations.csv; see `press_measures`."""
         return press_measures(episodes, round(self.step_s * self.ctrl_hz), self.ctrl_hz)
 
     def score(self, row: Mapping[str, float]) -> float:

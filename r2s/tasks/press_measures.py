@@ -1,4 +1,4 @@
-"""The measures of task press, from the force against the surface and the requested force."""
+"""Compute the measures of task press from the contact force and the requested force."""
 
 import numpy as np
 
@@ -41,11 +41,11 @@ PRESS = MeasureTable(
 def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
-    force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the step, and in the
-    last second. overshoot_N: mean of the largest excess over the new force in the direction of the force step;
-    overshoot_share: the same, divided by the step. impact_N: mean of the largest force within IMPACT_S of the first
-    touch. contact: share of the time in contact after the first touch. success: share of episodes within GOOD_N, and
-    OVER_N or OVER_SHARE. Stopped episodes are failures in `success`; the other measures above exclude them.
+    force_rmse_first_N, force_rmse_last_N: RMS force error in the second before the force step, and the last second.
+    overshoot_N: largest excess over the new force in the direction of the force step. overshoot_share: overshoot_N
+    divided by the force step. impact_N: largest force within IMPACT_S of the first touch. contact: share of the time
+    after the first touch with contact. These measures average the episodes that were not stopped. success: share of
+    all episodes without a stop, with both RMS errors within GOOD_N and the overshoot within OVER_N or OVER_SHARE.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]
@@ -71,7 +71,7 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
 
 
 def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> tuple[float, ...]:
-    """Return one episode's RMSE before the step and at the end, overshoot as N and share, impact N, and contact."""
+    """Return an episode's RMSE N before the step and in the last second, overshoot N and share, impact N, contact."""
     window = round(WINDOW_S * ctrl_hz)
     error, change = force - asked, asked[-1] - asked[0]
     rmse = [float(np.sqrt((error[part] ** 2).mean())) for part in (slice(step - window, step), slice(-window, None))]
@@ -80,7 +80,7 @@ def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> 
 
 
 def impact_of(force: np.ndarray, ctrl_hz: int) -> tuple[float, float]:
-    """Return the peak of force (T,) N within IMPACT_S of the first touch, and the share of contact from then on."""
+    """Return the peak of `force` (T,) N within IMPACT_S of the first touch, and then the share of time in contact."""
     touched = np.flatnonzero(force > TOUCH_N)
     if not len(touched):
         return 0.0, 0.0

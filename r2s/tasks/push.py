@@ -1,7 +1,7 @@
 """Task push: push a box of unknown mass and friction to a pose on its table.
 
-The task knows the table and the size of the box. Observations contain the box's pose with `pose_noise`, as from a
-camera. Mass and friction of the box belong to the dynamics (`dr=box`, `arm.surface`); no observation contains them.
+The table and the size of the box are known. Observations contain the pose of the box with `pose_noise`, as a camera
+measures it. Mass and friction of the box are part of the dynamics (`dr=box`, `arm.surface`), not of an observation.
 """
 
 from collections.abc import Mapping
@@ -46,7 +46,7 @@ WEIGHTS = {
     "smoothness": 1.0,
     "filter_penalty": 1.0,
 }
-# columns of an observation, numbered from the end of q, dq, effort and `limited`, in the frame of the table: position
+# columns of an observation, counted after q, dq, effort and `limited`, in the frame of the table: position
 # of the tip m, velocity of the tip m/s, pose of the box and pose error (each x m, y m, yaw rad)
 TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 
@@ -56,7 +56,7 @@ class PushTask(TipTask):
     """Push a box to a pose; a `Task` (r2s/tasks/task.py) from conf/task/push.yaml.
 
     A goal is a row (6 + n,): goal pose of the box, in the form of `State.box`, and start posture of the arm, rad.
-    In the start posture the tip is behind the box, at the share PUSHED_AT of the box's height.
+    In the start posture, the tip is behind the box, at PUSHED_AT times the height of the box.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
@@ -67,8 +67,8 @@ class PushTask(TipTask):
         point, normal: nominal position of the box on its table, m, and normal of the table; None: see `table_frame`.
         displacement: m, by which an action of 1 shifts the tip's target under the default controller.
         tool, pool: see `SurfaceTask`. torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
-        tip_radius: m, radius of the tip. frame: frame of the table. own, parameters: default controller and its
-            parameters. `with_model` sets these four attributes.
+        tip_radius, frame, own, parameters: radius of the tip, m, frame of the table, default controller and its
+            parameters, all set by `with_model`.
     """
 
     ctrl_hz: int = 25
@@ -121,14 +121,14 @@ class PushTask(TipTask):
 
     @property
     def height(self) -> float:
-        """Height above the table, m, at which the tip's centre pushes."""
+        """Height above the table, m, at which the tip's center pushes."""
         return PUSHED_AT * self.size[2]
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task with a default controller for the model of one arm, and with the frame of the table.
+        """Return the task with the default controller and the frame of the table for one arm.
 
         Raises:
-            UserError: there is no tool, it is too short for the box, or its tip would touch the table.
+            UserError: the robot has no tool, the tool is too short for the box, or the tip would touch the table.
         """
         Tip(robot)
         length, radius = float(np.linalg.norm(robot.tool.tip)), robot.tool.radius  # type: ignore[union-attr]
@@ -160,11 +160,11 @@ class PushTask(TipTask):
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) m, the tip's target at zero action, ahead of the box's nominal position by the mean of `away`."""
+        """(3,) m, target of the tip at zero action: the mean distance `away` ahead of the nominal box."""
         return self.table.outside(np.array([0.5 * sum(self.away), 0.0, self.height]))
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 3) m of an impedance: `centre`, at all times."""
+        """Return the target (m, 3) m of an impedance controller: always the point `centre`."""
         return np.tile(self.centre, (len(goals), 1))
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
@@ -176,13 +176,13 @@ class PushTask(TipTask):
         return goals[:, START : START + starts.shape[1]]
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return goals (count, 6 + n), see the class.
+        """Return random goals (count, 6 + n); the class describes a goal.
 
-        distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts with a gap of
-        BEHIND to the rearmost corner that any box can have, shifted sideways by U(-half edge, half edge).
+        A goal has distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts at
+        a distance BEHIND from the rearmost possible corner of a box, shifted sideways by U(-half edge, half edge).
 
         Raises:
-            UserError: the tip does not reach a start or the far side of a goal.
+            UserError: the tip cannot reach its start position, or the far side of the box at its goal.
         """
         tip, wide = Tip(robot), 0.5 * float(np.hypot(*self.size[:2]))
         back = self.spread + wide + robot.tool.radius + BEHIND  # type: ignore[union-attr]
@@ -204,11 +204,11 @@ class PushTask(TipTask):
         return np.array(rows)
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 3) m, the centre of the box at the goals."""
+        """Return (m, 3) m, the center of the box at each goal."""
         return goals[:, :3]
 
     def planar(self, state: State, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return box, goal and goal minus box in the table frame, (m, 3) each: x m, y m, yaw rad (error: +-pi)."""
+        """Return box, goal and goal minus box in the table frame, (m, 3) each: x m, y m, yaw rad (error in +-pi)."""
         seen = self.table.pose(np.zeros((len(goals), 3)), 0.5 * self.size[2]) if state.box is None else state.box
         box, goal = self.table.planar(seen), self.table.planar(goals[:, POSE])
         error = goal - box
@@ -221,7 +221,7 @@ class PushTask(TipTask):
         return self.table.inside(place), np.einsum("ij,mjn->min", self.table.axes, jacobian)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 25,) that normalise observations: fixed scales of the task."""
+        """Return mean and standard deviation (3 n + 25,) that normalize observations: fixed scales of the task."""
         n, (low, high) = robot.n, robot.q_range
         mean = np.zeros(3 * n + 25)
         mean[:n] = 0.5 * (low + high)
@@ -250,12 +250,12 @@ class PushTask(TipTask):
         return np.concatenate(rows, axis=1, dtype=np.float32)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the magnitude of the force on the box, and 0: the task requests no force."""
+        """Return (m, 2) N, the magnitude of the force on the box, and zeros, because the task requests no force."""
         none = np.zeros(len(goals))
         return np.stack([none if state.force is None else np.linalg.norm(state.force, axis=1), none], 1)
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 11), pose of the box, yaw error rad, height of the tip's lowest point m, edges of the box m."""
+        """Return (m, 11): pose of the box, yaw error rad, height of the tip's lowest point m, edges of the box m."""
         box, _, error = self.planar(state, goals)
         pose, height = self.table.pose(box, 0.5 * self.size[2]), self.tip(state.q)[0][:, 2]
         edges = np.tile(self.size, (len(goals), 1))
@@ -264,12 +264,12 @@ class PushTask(TipTask):
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance d of the box from its goal (m,) m, and the reward terms (m, 7).
+        """Return the distance d (m,) m of the box from its goal, and the reward terms (m, 7).
 
-        distance -tanh(d / 10 cm); yaw -tanh(|error| / 0.5 rad); precision: product of 1 - tanh(d / 10 cm) / 2 -
-        tanh(d / 3 cm) / 2 and the same of yaw with 0.5 rad and 10 degrees; gap -tanh(distance of the tip from the
-        box / 5 cm); height -tanh(error of the tip's height / 2 cm); smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2);
-        filter_penalty -limited.
+        Terms with the yaw error e: distance = -tanh(d / 10 cm), yaw = -tanh(|e| / 0.5 rad), precision =
+        `near`(d, 10 cm, 3 cm) `near`(|e|, 0.5 rad, 10 degrees), gap = -tanh(distance of the tip from the box / 5 cm),
+        height = -tanh(height error of the tip / 2 cm), smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2),
+        filter_penalty = -`State.limited`.
         """
         place, _ = self.tip(state.q)
         box, _, error = self.planar(state, goals)
@@ -282,7 +282,7 @@ class PushTask(TipTask):
         return d, np.stack([*terms, -rough(ddq), -state.limited], axis=1)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
-        """Return one row of evaluations.csv, see `push_measures`."""
+        """Return one row of evaluations.csv; see `push_measures`."""
         return push_measures(episodes, self.ctrl_hz)
 
     def score(self, row: Mapping[str, float]) -> float:

@@ -1,4 +1,4 @@
-"""The measures of task push, from the pose of the box."""
+"""Compute the measures of task push from the pose of the box."""
 
 import numpy as np
 
@@ -39,10 +39,10 @@ PUSH = MeasureTable(
 def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
-    within_3cm, within_10deg: share of episodes with the box this close to its goal throughout the last 0.5 s.
-    success: share of episodes with both, without a stop, and with the tip always above the table (a simulated tip can
-    enter it). distance_median_m, yaw_median_deg: median over episodes of the mean in the last 0.5 s. force_peak_N:
-    mean over episodes of the largest force at a control step. on_table: share of episodes with the tip in the table.
+    within_3cm, within_10deg: share of episodes with the box within 3 cm, or 10 degrees, of its goal throughout the
+    last 0.5 s. success: share of episodes within both limits, without a stop, and with the tip above the table.
+    distance_median_m, yaw_median_deg: median over episodes of the mean error in the last 0.5 s. force_peak_N: mean
+    over episodes of the largest force. on_table: share of episodes in which the simulated tip enters the table.
     """
     hold, box = round(HOLD_S * ctrl_hz), episodes.box
     assert box is not None

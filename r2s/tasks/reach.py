@@ -1,4 +1,4 @@
-"""Task reach: move the end effector to a point and hold it there. Goals, observations and reward terms."""
+"""Goals, observations and reward terms of task reach: move the end effector to a point and hold it there."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.rollout import measures
 from r2s.tasks.task import BaseTask, Episodes, ObservationTerm, State
 
-FINE_M = 0.02  # m, tanh scale of the observed error, so that the last centimetres span a network input's range
+FINE_M = 0.02  # m, tanh scale of the observed error, so that the last centimeters span a network input's range
 FINE_RAD = 0.015  # m^2/rad, tanh scale of the observed J^T error
 FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds: makes creeping joints visible
 OBSERVED = (  # terms of `observe`, for metadata
@@ -65,11 +65,11 @@ class ReachTask(BaseTask):
         torque_fraction: share of tau_max that an action of 1 commands; one number for all joints, or one each.
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         start_spread: rad, episodes start at q_home + U(-spread, spread).
-        reach: (low, high) m, distance of goals from the shoulder (the second joint, or the only one); None: the
-            quantiles MIDDLE of random postures.
+        reach: (low, high) m, distance of goals from the shoulder (the second or only joint); None: the quantiles
+            MIDDLE of this distance in random postures.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
         speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise learns not to react to noise. So it does not excite oscillations of
+            else 0. A policy trained with noise learns not to react to noise. Such a policy excites no oscillations of
             elastic gears, which rigid models do not have (benchmarks/results/transfer.md).
     """
 
@@ -102,7 +102,7 @@ class ReachTask(BaseTask):
         return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the torque limit of the controller, or else the torque of an action of 1."""
+        """Return (n,) Nm, the controller's torque limit, or without one the torque that an action of 1 commands."""
         if self.controller is not None and self.controller.torque_limit is not None:
             return self.controller.torque_limit
         share = np.array(self.torque_fraction, dtype=float)
@@ -128,7 +128,7 @@ class ReachTask(BaseTask):
         return robot.q_home + rng.uniform(-self.start_spread, self.start_spread, (count, robot.n))
 
     def region(self, robot: Robot) -> tuple[float, float]:
-        """Return (low, high) m, distance of goals from the shoulder."""
+        """Return (low, high) m, the range of the distance between goals and shoulder."""
         if self.reach is not None:
             return self.reach
         postures = zip(range(POSTURES), _postures(robot, np.random.default_rng(0)), strict=False)
@@ -139,7 +139,7 @@ class ReachTask(BaseTask):
         """Return (count, 3) m: end-effector positions of random joint angles, so that every goal is reachable.
 
         Raises:
-            UserError: hardly any position of the arm lies in the task's region.
+            UserError: hardly any random posture has its end effector in the task's region.
         """
         reach = self.region(robot)
         found: list[np.ndarray] = []
@@ -156,11 +156,11 @@ class ReachTask(BaseTask):
         )
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 3) m of an impedance: the goals themselves."""
+        """Return the target (m, 3) m of an impedance controller, which is the goal."""
         return goals
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (6 n + 12,) that normalise observations: fixed scales of the task.
+        """Return mean and standard deviation (6 n + 12,) that normalize observations: fixed scales of the task.
 
         Statistics of random motion would be unsuitable: random torques spin the wrist at 10 rad/s, whereas 0.1 rad/s
         matters for stopping at a goal.
@@ -183,7 +183,7 @@ class ReachTask(BaseTask):
         return observation_terms(self.torque_limit(robot))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, the distances at the start, at least CLOSE_M."""
+        """Return (m,) m, the initial distances from the goals, but at least CLOSE_M."""
         return np.maximum(np.linalg.norm(goals - state.ee, axis=-1), CLOSE_M)
 
     def judge(
@@ -241,14 +241,14 @@ def observe(
 ) -> np.ndarray:
     """Return the observation (m, 6 n + 12) float32 in SI units, for arms and simulators alike.
 
-    q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm),
-    tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector towards the goal, which a network would
-    otherwise have to learn. The effort is part of the state, because torque changes by at most 1 Nm per ms.
+    Terms: q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm),
+    tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector toward the goal; otherwise a network
+    would have to learn the Jacobian. The effort is part of the state, because torque changes by at most 1 Nm per ms.
 
     Args:
-        q, dq: (m, n) rad, rad/s.
-        ee, goal: (m, 3) m.
-        jacobian: (m, 3, n) m/rad.
+        q, dq: (m, n) rad, rad/s, joint angles and speeds.
+        ee, goal: (m, 3) m, position of the end effector and goal position.
+        jacobian: (m, 3, n) m/rad, translational Jacobian of the end effector.
         effort: (m, n) Nm, the target torque after the low-pass. torque: (n,) Nm, the torque limit.
     """
     m, n = q.shape

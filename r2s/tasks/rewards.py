@@ -1,9 +1,8 @@
-"""The paper's reward, eq. (2), and the curriculum that leads to it.
+"""The paper's reward, eq. (2), and a curriculum toward this reward.
 
 A reward is a weighted sum of named terms. The replay buffer stores the terms, and each update applies the current
-weights to them. So a curriculum can change its weights without making stored transitions stale. Three terms are not
-in the paper: a bonus for precision, a penalty for motion close to the goal, and a penalty for commands that the
-safety filter changes.
+weights. So stored transitions stay valid when a curriculum changes the weights. Three terms are not in the paper,
+namely a bonus for precision and penalties for motion close to the goal and for commands changed by the safety filter.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # m, tanh scales of the precision bonus
-STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint, on whose axis the end effector may be at rest
+STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint's speed; the end effector can rest on this joint's axis
 TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 
 
@@ -25,19 +24,19 @@ TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 def terms(
     distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray, limited: np.ndarray
 ) -> np.ndarray:
-    """Return (m, 5): the two halves of eq. (2), which add up to it, and the three terms that are not in the paper.
+    """Return the reward terms (m, 5): two whose sum is eq. (2) of the paper, and three that are not in the paper.
 
-    distance        -k1 d, with d the ratio of distance and initial distance
-    smoothness      -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
-    precision       1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2
-    stillness       -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2)
-    filter_penalty  -limited
+    distance = -k1 d, where d = distance / distance0,
+    smoothness = -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d),
+    precision = 1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2,
+    stillness = -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2),
+    filter_penalty = -limited.
 
     Args:
-        distance, distance0: (m,) m, now and at the start of the episode.
+        distance, distance0: (m,) m, distance from the goal now and at the start of the episode.
         dq: (m, n) rad/s.
         ddq: (m, n) rad/s^2, mean over the last control period.
-        limited: (m,), share of that period's cycles in which the safety filter changed the command.
+        limited: (m,), share of the last control period's cycles in which the safety filter changed the command.
     """
     out = np.empty((len(distance), 5))
     for i in range(len(distance)):
@@ -56,7 +55,7 @@ def terms(
     return out
 
 
-PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms that make eq. (2)
+PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms in eq. (2)
 
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
@@ -65,8 +64,9 @@ MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2
 
 
 class Reward:
-    """A weighted sum of named terms. `reward._target_` names a subclass; other keys of the yaml are its arguments.
-    This base class uses the terms and weights of the task: `reward=task`.
+    """Reward with the terms and weights of the task: `reward=task`. Subclasses define other rewards.
+
+    `reward._target_` names the class. The other keys of the yaml are the arguments of the class.
 
     Attributes:
         factor: initial value of the argument `factor` of `weights` and `adapt`, a number or an array.
@@ -85,34 +85,34 @@ class Reward:
         return task.judge(state, ddq, goals, reference)
 
     def weights(self, task: Any, progress: float, factor: Any = 1.0) -> np.ndarray:
-        """Return the (k,) weights.
+        """Return the weights (k,) of the terms.
 
         Args:
-            task: task of the training. progress: spent fraction of its budget. factor: last result of `adapt`.
+            task: task of the training. progress: spent fraction of the budget. factor: last result of `adapt`.
         """
         return task.paper_weights
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> Any:
-        """Return the factor for the next steps; the terms' means over the last `env_steps` are `seen` (k,)."""
+        """Return the next `factor` after `env_steps` env steps in which the terms had the means `seen` (k,)."""
         return factor
 
 
 @dataclass(frozen=True)
 class Curriculum(Reward):
-    """A reward whose weights change during a training.
+    """A reward whose weights change in the course of a training.
 
-    Eq. (2) alone makes exploration difficult: its acceleration terms reward early stopping. So training starts with a
-    small weight of smoothness and a bonus for precision. Between the `anneal` fractions of the budget, the weights
-    move linearly towards eq. (2). reward=paper has the constant weights of eq. (2): smoothness 1, the others 0.
+    Eq. (2) alone makes exploration difficult, because its acceleration terms reward early stopping. So a training
+    starts with a small weight of smoothness and a bonus for precision. Between the `anneal` fractions of the budget,
+    the weights change linearly toward eq. (2). reward=paper has constant weights: smoothness 1, the others 0.
 
     Attributes:
-        smoothness, precision, stillness, filter_penalty: weights before and after the change.
-        anneal: fractions of the budget where the change starts and ends.
-        max_filter_rate: largest share of the cycles, exploration included, in which the safety filter may change the
-            command; None: no limit. From the first fraction of `anneal` on, a higher share raises the filter penalty,
-            and a lower share reduces it, down to the curriculum's weight. With a fixed weight, the share varies with
-            the seed from 1 to 6 % (benchmarks/results/minutes.md). The adaptation is integral control of a Lagrange
-            multiplier's logarithm (Stooke, Achiam and Abbeel, ICML 2020).
+        smoothness, precision, stillness, filter_penalty: (before, after), weights before and after the change.
+        anneal: fractions of the budget at which the change starts and ends.
+        max_filter_rate: largest filter rate, exploration included; None: no limit. From the start of the change on, a
+            higher filter rate raises the weight of the filter penalty. A lower filter rate reduces this weight, but
+            not below that of the curriculum. With a fixed weight, the filter rate varies with the seed from 1 to 6 %
+            (benchmarks/results/minutes.md). The weight follows integral control of a Lagrange multiplier's logarithm
+            (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.
@@ -145,7 +145,7 @@ class Curriculum(Reward):
         return TERMS
 
     def weights(self, task: Any, progress: float, factor: float = 1.0) -> np.ndarray:
-        """Return the (5,) weights; `factor` multiplies the weight of the filter penalty."""
+        """Return the weights (5,) of TERMS; `factor` multiplies the weight of the filter penalty."""
         start, end = self.anneal
         at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
         pairs = (getattr(self, name) for name in TERMS[1:])
@@ -154,7 +154,7 @@ class Curriculum(Reward):
         return np.array([1.0, *moving])
 
     def adapt(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
-        """Return the factor of the filter penalty; see `Reward.adapt`."""
+        """Return the next factor of the filter penalty; see `Reward.adapt`."""
         if self.max_filter_rate is None or progress < self.anneal[0]:
             return factor
         limited = -seen[TERMS.index("filter_penalty")]

@@ -1,4 +1,4 @@
-"""The rollout of a policy, with one function for simulators and arms, and the measures of task reach."""
+"""One rollout function for policies in simulators and on arms, and the measures of task reach."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -61,10 +61,10 @@ def rollout(
     goals: np.ndarray,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Episodes:
-    """Run one episode per goal.
+    """Run one episode for each goal, and return the `Episodes`.
 
     A stop ends an episode, and so does a contact of the arm with itself or the table (r2s/physics/collision.py)
-    that `task.may_touch` does not allow. Contacts are checked after every control step. An ended episode repeats
+    that `task.may_touch` does not allow. `rollout` checks contacts after every control step. An ended episode repeats
     its last state, and its last distance is infinite.
 
     Args:
@@ -112,7 +112,7 @@ def _run(
     contacts: CollisionCheck,
     out: Episodes,
 ) -> None:
-    """Run the episodes with the indices `now` from their first state, and write them into `out`."""
+    """Run the episodes with the indices `now` from their first state, and write the results into `out`."""
     weights, scale, before = task.paper_weights, task.distance_scale(state, goals), state.dq.copy()
     over = np.zeros(arms.width, dtype=bool)  # whether a contact has ended the episode
     for k in range(task.steps):
@@ -149,7 +149,7 @@ def _run(
 
 
 def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
-    """Return the state, but with the `last` q, dq, ee and tau for the arms whose episode is `over` (m,) bool."""
+    """Return the state with the `last` q, dq, ee and tau of those arms whose episode is `over` (m,) bool."""
     names, here = ("q", "dq", "ee", "tau"), over[:, None]
     kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
     return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
@@ -159,13 +159,13 @@ def measures(episodes: Episodes) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
     success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
-    of the mean distance in this time. return_paper: mean sum of eq. (2); return_smooth: the same without the noise of
-    measured speeds, which eq. (2) mistakes for acceleration. time_to_reach_s: median time until the end effector
-    stays within 2 cm, over the episodes in which it does. overshoot_m: largest distance beyond 2 cm after it first
-    came within 2 cm, mean over episodes. rest: share of episodes with every joint slower than REST for the whole last
-    0.5 s (the end effector may rest on the axis of a moving joint). q_left_rad: distance to the position limits, 5 %
-    quantile over episodes. limited: share of the cycles in which the safety filter changed the torque. collision:
-    share of episodes that a contact ended.
+    of the mean distance in the last 0.5 s. return_paper: mean sum of eq. (2) over an episode. return_smooth: mean sum
+    without speed noise, which eq. (2) mistakes for acceleration. time_to_reach_s: median time after which the end
+    effector stays within 2 cm, over the episodes in which this occurs. overshoot_m: mean over episodes of the largest
+    distance beyond 2 cm after the first time within 2 cm. rest: share of episodes in which every joint is slower than
+    REST throughout the last 0.5 s (an end effector on the axis of a moving joint rests as well). q_left_rad: 5 %
+    quantile over episodes of the distance from the position limits. limited: mean filter rate. collision: share of
+    episodes that a contact ended.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)
@@ -207,7 +207,7 @@ def gap(one: Episodes, other: Episodes) -> dict[str, float]:
 
 
 def select_episodes(episodes: Episodes, which: slice | np.ndarray) -> Episodes:
-    """Return the episodes at these indices."""
+    """Return the episodes with the indices `which`."""
     arrays = {f.name: getattr(episodes, f.name) for f in fields(episodes) if f.name != "t"}
     chosen = {name: a[which] for name, a in arrays.items() if a is not None}
     return replace(episodes, **chosen)
@@ -216,7 +216,7 @@ def select_episodes(episodes: Episodes, which: slice | np.ndarray) -> Episodes:
 def episode_measures(task: Task, episodes: Episodes, predicted: Episodes | None = None) -> list[dict[str, float]]:
     """Return a row per episode: measures, `gap` to the same episode in `predicted`, and whether the arm stopped.
 
-    The gap of a stopped episode is nan.
+    In a stopped episode, the values of `gap` are nan.
     """
     rows = []
     for k in range(len(episodes.goal)):

@@ -1,8 +1,8 @@
-"""Base class of tasks on a surface, with nominal plane, approach, force estimate, and parts of the reward terms.
+"""Base class of tasks on a surface: nominal plane, approach, force estimate, and functions for reward terms.
 
-The task knows a nominal plane only. The true plane, its stiffness and its friction are part of the dynamics
-(`dr=contact`, `arm.surface`). Neither observation nor controller uses the true force: the policy observes a
-force estimate from q, dq and the commanded torque.
+A task contains only the nominal plane. The true plane, its stiffness and its friction are part of the dynamics
+(`dr=contact`, `arm.surface`). The policy observes a force estimate from q, dq and the commanded torque. Neither
+observation nor controller uses the true force.
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,20 +40,20 @@ class SurfaceTask(TipTask):
     """A task that presses a tool's tip on a surface whose position is known roughly.
 
     A goal begins with (9 + n,) numbers: first touched point of the nominal plane, m; normal of the plane; two forces,
-    N; start height of the tip's centre above the point, m; start posture, rad.
+    N; start height of the tip's center above the point, m; start posture, rad.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        force: (low, high) N, range of the requested forces. force_rate: N/s, at which a requested force changes.
+        force: (low, high) N, range of the requested forces. force_rate: N/s, rate of a change of force.
         approach_speed: m/s, speed of the target along the nominal normal, thus the highest closing speed at contact.
         clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
-            from `point`. place: m, tilt: degrees, largest deviation of the true plane from the nominal one.
+            from `point`. place: m, tilt: degrees, largest deviation of the true from the nominal plane.
         point, normal: the nominal plane in the base frame, m; None: a table below the tip at home.
         tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of goals that a training draws from.
-        stop: what a stop of the arm does to a contact, one of `r2s.physics.push_limit.STOPS`; None: release.
-        model, own, parameters: identified arm, default controller and its parameters; `with_model` sets them.
+        stop: how a stop of the arm treats a contact force, a key of `r2s.physics.push_limit.STOPS`; None: release.
+        model, own, parameters: model of the arm, default controller and its parameters, all set by `with_model`.
     """
 
     ctrl_hz: int = 100
@@ -108,7 +108,7 @@ class SurfaceTask(TipTask):
         return self.place + self.spread * float(np.tan(np.radians(self.tilt)))
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task with the model of one arm, for its default controller and its force estimate.
+        """Return the task with the model of one arm, which the default controller and the force estimate use.
 
         Raises:
             UserError: the robot has no tool, or cannot exert the largest force.
@@ -123,18 +123,18 @@ class SurfaceTask(TipTask):
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """Settings of the default controller that replace defaults of `cartesian_impedance`."""
+        """Settings of the default controller that differ from the defaults of `cartesian_impedance`."""
         return {}
 
     def controlled_by(self, controller: Controller) -> Self:
-        """Return the task with this controller; raise UserError if it cannot exert the largest force."""
+        """Return the task with this controller; raise UserError if the controller cannot exert the largest force."""
         self._check_force(controller)
         return super().controlled_by(controller)
 
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with limits of force and speed at the nominal plane, which admit the requested forces."""
+        """Return the task with limits of force and speed at the nominal plane that allow the requested forces."""
         limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1], self.stop)
         if limit is not None:
             limit = replace(limit, place=self.place, tilt=float(np.radians(self.tilt)))
@@ -180,10 +180,10 @@ class SurfaceTask(TipTask):
         raise NotImplementedError
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return goals (count, 9 + n), see the class.
+        """Return random goals (count, 9 + n or more); the class describes a goal.
 
         Raises:
-            UserError: the tip does not reach a drawn point.
+            UserError: the tip cannot reach a randomly drawn point.
         """
         point, normal = self.plane(robot)
         tip = Tip(robot)
@@ -210,7 +210,7 @@ class SurfaceTask(TipTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return the part of `path` (k, 3) m that a goal stores after its start posture."""
+        """Return the values from `path` (k, 3) m that a goal stores after its start posture; by default none."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -218,12 +218,12 @@ class SurfaceTask(TipTask):
         return goals[:, POINT]
 
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, how far the target of the tip's centre is below the nominal plane at t (m,) s.
+        """Return (m,) m, the depth of the target of the tip's center below the nominal plane at t (m,) s.
 
-        The target moves at approach_speed until the tip has certainly touched. Then the force rises at force_rate.
+        The target moves at approach_speed until the tip certainly touches; then the force rises at force_rate.
         """
         height, K = goals[:, HEIGHT], self.spring
-        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` is that of the tip's centre
+        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` refers to the tip's center
         slow, late = self.approach_speed * t - height, (t - self.down_s).clip(0.0)
         return np.minimum(
             slow.clip(None, touched) + self.force_rate / K * late, touched + goals[:, FORCES].max(1) / K
@@ -231,19 +231,19 @@ class SurfaceTask(TipTask):
 
     @property
     def down_s(self) -> float:
-        """Time after which the tip has certainly touched, s."""
+        """Time, s, after which the tip certainly touches the surface."""
         return (self.beyond + LAG_M + self.clearance) / self.approach_speed
 
     @property
     def spring(self) -> float:
-        """Stiffness, N/m, of the controller's spring; without a spring, that of the default controller."""
+        """Stiffness, N/m, of the controller's spring, or else of the default controller's spring."""
         for control in (self.controller, self.own):
             if isinstance(control, Impedance) and control.parameters[K_DEFAULT] > 0:
                 return float(control.parameters[K_DEFAULT])
         raise UserError(f"task: {type(self).__name__} needs a model of the arm; call with_model first")
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 12,) that normalise observations: fixed scales of the task."""
+        """Return mean and standard deviation (3 n + 12,) that normalize observations: fixed scales of the task."""
         n = robot.n
         low, high = robot.q_range
         mean = np.zeros(3 * n + 12)
@@ -283,10 +283,10 @@ class SurfaceTask(TipTask):
         ]
 
     def estimate(self, state: State, normal: np.ndarray, jacobian: np.ndarray | None = None) -> np.ndarray:
-        """Return (m,) N, the force against the normal (m, 3), estimated from q, dq and the last command.
+        """Return (m,) N, the force against the normal (m, 3) that q, dq and the last command imply.
 
-        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest its error may
-        reach friction level / lever arm; model errors bias it.
+        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest, joint
+        friction causes an error of up to friction / lever arm. Model errors bias the estimate.
         """
         jacobian = self.tip(state.q)[1] if jacobian is None else jacobian
         q, dq = np.ascontiguousarray(state.q), np.ascontiguousarray(state.dq)
@@ -296,11 +296,11 @@ class SurfaceTask(TipTask):
         return -(force * normal).sum(1)
 
     def tip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (m, 3) m and Jacobian (m, 3, n) m/rad of the tip's centre at q (m, n) rad."""
+        """Return position (m, 3) m and Jacobian (m, 3, n) m/rad of the tip's center at q (m, n) rad."""
         return arm_tips(np.ascontiguousarray(q), self.of_model("parameters"))
 
     def tip_velocity(self, state: State) -> np.ndarray:
-        """Return (m, 3) m/s, the velocity of the tip's centre in base axes."""
+        """Return (m, 3) m/s, the velocity of the tip's center in base axes."""
         return np.einsum("mkn,mn->mk", self.tip(state.q)[1], state.dq)
 
     def normals(self, goals: np.ndarray) -> np.ndarray:
@@ -314,7 +314,7 @@ class SurfaceTask(TipTask):
 
 
 def near(error: np.ndarray, coarse: float, fine: float) -> np.ndarray:
-    """Return 1 - tanh(error / coarse) / 2 - tanh(error / fine) / 2: 1 at `error` (m,) 0, 0 at large errors."""
+    """Return 1 - tanh(error / coarse) / 2 - tanh(error / fine) / 2, which falls from 1 to 0 as `error` (m,) grows."""
     return 1.0 - 0.5 * (np.tanh(error / coarse) + np.tanh(error / fine))
 
 

@@ -1,4 +1,4 @@
-"""The protocol `Task`, the interface of tasks for environment, rollout and policies.
+"""The protocol `Task`: the interface through which environment, rollout and policies use a task.
 
 A task defines start postures, goals, observations, reward terms, and the measures of episodes. To add a task, write
 one file next to reach.py and one yaml (docs/how_to/extending.md).
@@ -21,12 +21,12 @@ from r2s.tasks.rewards import TERMS
 
 # the score penalizes only filter rates above this value; lower rates do not make policies better
 MAX_FILTER_RATE = 0.04
-TORQUE_STD = 0.3  # share of the torque limit, standard deviation that normalises an observed controller torque
+TORQUE_STD = 0.3  # share of the torque limit, standard deviation that normalizes an observed controller torque
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The state of m arms with n joints. Its arrays may be views that the next step overwrites.
+    """The state of m arms with n joints. The next step may overwrite the arrays.
 
     Attributes:
         t: (m,) s, time since the episode began. q, dq: (m, n) rad, rad/s.
@@ -34,12 +34,12 @@ class State:
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target torque after the low-pass.
         stopped: (m,), whether the arm has stopped before the end of its episode.
         limited: (m,), share of the last control period in which the safety filter changed the command.
-        noise: (m, n) rad/s, sensor noise, which `measured` adds to the true speed dq. None: dq is already the
-            measured speed, or the sensors are exact.
+        noise: (m, n) rad/s, sensor noise, which `measured` adds to the true speed dq. None: dq includes the sensor
+            noise, or the sensors are exact.
         force: (m, 3) N, force that the tool exerts, in base axes: the true force in simulation and on twins, the
-            force that the arm reports otherwise. Rewards and measures use it, observations do not. None: unknown.
-        box: (m, 6), perceived pose of the box that the tool pushes, in the base frame: its centre, m, and its first
-            axis. None: there is no box.
+            reported force on other arms; None: unknown. Rewards and measures use this force, observations do not.
+        box: (m, 6), perceived pose of the box that the tool pushes, in the base frame: its center, m, and its first
+            axis; None: the task has no box.
     """
 
     t: np.ndarray
@@ -61,7 +61,7 @@ class State:
 
     @staticmethod
     def at_home(robot: Robot) -> "State":
-        """Return an arm at rest at home, with zero ee and Jacobian, for calls that only compile functions."""
+        """Return the state of an arm at rest at home, with zero ee and Jacobian, for the compilation of functions."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
         none = np.zeros(1, dtype=bool), np.zeros(1)
         return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
@@ -72,7 +72,7 @@ class Episodes:
     """E finished episodes of T control steps; index k along T is the state after step k.
 
     Attributes:
-        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) if it moves; see
+        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) if the goal moves; see
             `Task.goal_positions`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m.
         reward: (E, T), with the weights `Task.paper_weights`; in task reach, eq. (2).
         reward_smooth: (E, T), the reward computed from speeds without measurement noise.
@@ -105,9 +105,9 @@ class ObservationTerm:
 
     Attributes:
         name: name of the term. unit: its SI unit, "1" if dimensionless.
-        of: source: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). With a plan, `goal` is the
-            current reference position. A plan adds the sources ahead (next positions - ee), velocity (of the path),
-            limited, q_off and dq_off (plan minus arm). Source control: torque of a controller with `observes_torque`.
+        of: source of the term: q, dq, ee, goal, error (goal - ee), effort, pull (J^T error), or control (torque of a
+            controller with `observes_torque`). In a plan, goal is the current reference position. A plan has the
+            further sources ahead (next positions - ee), velocity (of the path), limited, q_off, dq_off (plan - arm).
         divided_by: divisor, one number or one per element; None: 1. tanh: whether tanh is applied afterwards.
     """
 
@@ -119,7 +119,7 @@ class ObservationTerm:
 
 
 class Task(Protocol):
-    """What an arm has to do in episodes of `steps` control steps.
+    """Interface of a task that an arm does in episodes of `steps` control steps.
 
     Attributes:
         ctrl_hz: policy rate. cutoff_hz: cut-off of the low-pass on the torque. steps: control steps per episode.
@@ -128,11 +128,11 @@ class Task(Protocol):
         reward_terms: names of the reward terms. paper_weights: (k,), their weights in `Episodes.reward`.
         pool: number of goals that a training draws from.
         speed_noise: rad/s; in training, each arm draws a lower bound of its speed noise (standard deviation) from
-            U(0, speed_noise). None or 0: the noise of the arm's own sensors.
+            U(0, speed_noise). None or 0: no lower bound.
         measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
         may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
-        touches: whether the tool touches a surface, so that simulated arms need one (`Dynamics.surface`).
-        moves_box: whether the surface is a box that the tool pushes, so that arms must perceive it (`State.box`).
+        touches: whether the tool touches a surface; simulated arms then need `Dynamics.surface`.
+        moves_box: whether the surface is a box that the tool pushes; arms must then perceive the box (`State.box`).
         push_limit: limit of the force and the speed of contacts; None: no limit.
     """
 
@@ -174,13 +174,13 @@ class Task(Protocol):
         ...
 
     def controlled_by(self, controller: Controller) -> "Task":
-        """Return the task with this controller."""
+        """Return a copy of the task with this controller."""
         ...
 
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "Task":
-        """Return the task with limits of contact force, N, and speed, m/s; joint friction (n,) Nm may add force."""
+        """Return the task with limits of contact force, N, and speed, m/s, for arms with joint friction (n,) Nm."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -192,7 +192,7 @@ class Task(Protocol):
         ...
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, ...), the goals of `count` episodes: points, or timed paths."""
+        """Return the random goals (count, ...) of `count` episodes: points or timed paths."""
         ...
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -204,7 +204,7 @@ class Task(Protocol):
         ...
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (d,) that normalise observations."""
+        """Return mean and standard deviation (d,) that normalize observations."""
         ...
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
@@ -251,7 +251,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, goals: see `Task.observe`. controller: the task's controller. state: its noise is added here.
+        task, goals: see `Task.observe`. controller: the task's controller. state: state without sensor noise.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()
@@ -263,7 +263,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
 
 
 def observation_scale(task: Task, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (d,) that normalise the result of `observe`."""
+    """Return mean and standard deviation (d,) that normalize the result of `observe`."""
     mean, std = task.observation_scale(robot)
     if not task.control(robot).observes_torque:
         return mean, std
@@ -295,11 +295,11 @@ class BaseTask:
         return round(1.0 / (self.ctrl_hz * SIM_DT))
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task itself: it needs no model."""
+        """Return the task unchanged, because it uses no model of the arm."""
         return self
 
     def controlled_by(self, controller: Controller) -> Self:
-        """Return the task with this controller."""
+        """Return a copy of the task with this controller."""
         return self._with("controller", controller)
 
     def pushing_within(
@@ -314,11 +314,11 @@ class BaseTask:
         return task
 
     def control(self, robot: Robot) -> Controller:
-        """Return the controller of `controlled_by`, else `control=torque`."""
+        """Return the controller that `controlled_by` set, or else `control=torque`."""
         return self.controller or torque(robot, self)  # type: ignore[arg-type]
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the starts: they do not depend on the goals."""
+        """Return `starts`, because start postures do not depend on the goals."""
         return starts
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
@@ -326,22 +326,22 @@ class BaseTask:
         return goals
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
-        """Return None: the task requests no force."""
+        """Return None, because the task requests no force."""
         return None
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Raise TypeError: the task moves no box."""
+        """Raise TypeError, because the task moves no box."""
         raise TypeError(f"{type(self).__name__} moves no box")
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
-        """Return the dynamics unchanged: there is nothing around the arm."""
+        """Return the dynamics unchanged, because the task has no surface and no box."""
         return dynamics
 
     def score(self, row: Mapping[str, float]) -> float:
         """Return the score of one evaluation.
 
-        One percentage point of success within 1 cm, or of episodes at rest, equals 1 of the return. Each
-        percentage point of the filter rate above MAX_FILTER_RATE costs 10.
+        The score is the return, plus 1 per percentage point of success within 1 cm and of episodes that end at rest,
+        minus 10 per percentage point of the filter rate above MAX_FILTER_RATE.
         """
         price = 1e3 * max(row["limited"] - MAX_FILTER_RATE, 0.0)
         return 100 * (row["success_1cm"] + row["rest"]) + row["return_paper"] - price

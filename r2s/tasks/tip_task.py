@@ -1,4 +1,4 @@
-"""Base class of tasks for a tool's tip, with default controller, torque limit, and starts that goals define."""
+"""Base class of tasks for a tool's tip: default controller, torque limit, and start postures from the goals."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ class TipTask(BaseTask):
     Attributes:
         torque_fraction: largest torque of the default controller and of control=torque, as a share of tau_max.
         cutoff_hz, speed_noise: see `ReachTask`.
-        own: the default controller; None until `with_model` makes it.
+        own: the default controller; None before `with_model` is called.
     """
 
     torque_fraction: float | tuple[float, ...]
@@ -33,20 +33,20 @@ class TipTask(BaseTask):
         )
 
     def noise_for(self, dynamics: Dynamics) -> float:
-        """Return `speed_noise`, rad/s, or if None, the default in trainings for an arm with these dynamics."""
+        """Return `speed_noise`, rad/s, or the default for an arm with these dynamics if `speed_noise` is None."""
         if self.speed_noise is not None:
             return self.speed_noise
         return SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0
 
     def of_model(self, name: str) -> Any:
-        """Return an attribute that `with_model` sets; raise UserError if it is not set yet."""
+        """Return an attribute that `with_model` sets; raise UserError if the attribute is None."""
         value = getattr(self, name)
         if value is None:
             raise UserError(f"task: {type(self).__name__} needs a model of the arm; call with_model first")
         return value
 
     def control(self, robot: Robot) -> Controller:
-        """Return the controller of `controlled_by`, else the default one."""
+        """Return the controller that `controlled_by` set, or else the default controller."""
         return self.controller or self.own or super().control(robot)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
@@ -55,7 +55,7 @@ class TipTask(BaseTask):
         return self.as_reach().torque_limit(robot) if limit is None else limit
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return the home posture (count, n) rad, which `begin` replaces by the start postures of the goals."""
+        """Return home postures (count, n) rad; `begin` replaces them by the start postures in the goals."""
         return np.tile(robot.q_home, (count, 1))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:

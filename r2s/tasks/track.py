@@ -1,4 +1,4 @@
-"""Task track: follow a timed path with the end effector. Paths, observations and reward terms."""
+"""Paths, observations and reward terms of task track: follow a timed path with the end effector."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -66,10 +66,10 @@ class TrackTask(BaseTask):
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         preview: samples of the path ahead in an observation.
         speed: (low, high) m/s, drawn peak speed; lower where the arm's limits require it.
-        size: (low, high) m, drawn radius of a path about its centre. kinds: subset of KINDS, equally probable.
+        size: (low, high) m, drawn radius of a path about its center. kinds: subset of KINDS, equally probable.
         reach, height, azimuth: region that contains the paths, see `ReachTask`.
         pool: number of paths that a training draws from.
-        model: the identified arm, for the default controller; see `with_model`.
+        model: dynamics of the arm for the default controller, set by `with_model`.
     """
 
     ctrl_hz: int = 100
@@ -143,7 +143,7 @@ class TrackTask(BaseTask):
         return np.minimum(self.boost * fraction, robot.tau_max)
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "TrackTask":
-        """Return the task with this model of one arm, for its default controller."""
+        """Return the task with the model of one arm, which the default controller uses."""
         return replace(self, model=dynamics)
 
     def control(self, robot: Robot) -> Controller:
@@ -153,7 +153,7 @@ class TrackTask(BaseTask):
         return super().control(robot)
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return the home posture (count, n) rad, which `begin` replaces by the first postures of the paths."""
+        """Return home postures (count, n) rad; `begin` replaces them by the first postures of the paths."""
         return np.tile(robot.q_home, (count, 1))
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -201,7 +201,7 @@ class TrackTask(BaseTask):
     def plan(self, robot: Robot, start: Sequence[float], shape: Curve, pace: float) -> np.ndarray:
         """Return the plan (steps + 1 + preview, 6 + 3 n) of a custom curve.
 
-        This checks neither contacts nor whether trainings contain such curves.
+        This method checks neither for contacts nor whether trainings contain such curves.
 
         Args:
             robot: the arm. start: (3,) m, first end-effector position. shape: maps u (T,) m, the arc length, to the
@@ -217,14 +217,14 @@ class TrackTask(BaseTask):
 
     @property
     def _times(self) -> np.ndarray:
-        """(T,) s, times of the rows of a plan."""
+        """(T,) s, the time of each row of a plan."""
         return np.arange(self.steps + 1 + self.preview) / self.ctrl_hz
 
     def _paths(self, robot: Robot) -> Paths:
         return Paths(robot, self.torque_limit(robot), self.episode_s, self.ramp_s)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (d,) that normalise observations: fixed scales of the task."""
+        """Return mean and standard deviation (d,) that normalize observations: fixed scales of the task."""
         n = robot.n
         centre, scale = self._region.observation_scale(robot)
         ahead = np.repeat(self.speed[1] * np.arange(1, self.preview + 1) / self.ctrl_hz, 3)
@@ -263,7 +263,7 @@ class TrackTask(BaseTask):
     def trajectory(
         self, t: np.ndarray, goals: np.ndarray, ahead_s: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, dq, ddq (m, n) of the plans `goals` at t (m,) s plus ahead_s."""
+        """Return q, dq, ddq (m, n) of the plans `goals` at the times t (m,) s + ahead_s."""
         return at_time(goals, self._at(t), ahead_s, self.ctrl_hz)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -289,11 +289,11 @@ class TrackTask(BaseTask):
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv.
 
-        path_rmse_mm: RMS distance of end effector and reference, over all steps of all paths that were not stopped.
-        path_max_mm: mean over paths of their largest error. within_x: share of steps within x; steps of stopped
-        paths are outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: RMS over joints
-        and time. jerk: m/s^3, RMS of the end effector, from cubic fits over JERK_S. stopped: share of stopped paths.
-        q_left_rad, limited: as for reaching.
+        path_rmse_mm: RMS distance between end effector and reference over the steps of the paths without a stop.
+        path_max_mm: mean over these paths of the largest distance. within_x: share of steps with a distance below x;
+        steps of stopped paths never qualify. return_track: mean sum of the reward under `paper_weights`.
+        torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS of the end effector, from cubic fits over
+        JERK_S. stopped: share of stopped paths. q_left_rad, limited: see `r2s.tasks.rollout.measures`.
         """
         ended = ~np.isfinite(episodes.distance).all(1)
         error = 1e3 * episodes.distance[~ended]
@@ -347,13 +347,13 @@ class _Inside:
 
 @njit(cache=True)
 def _judge(error, dq, ddq, limited):
-    """Return the distance (m,) m and the terms (m, 5).
+    """Return the distance (m,) m and the reward terms (m, 5).
 
-    distance        -2 tanh(distance / 3 cm)
-    smoothness      -0.03 sum tanh(|dq| / 1 rad/s) - 0.03 sum tanh(|ddq| / 10 rad/s^2)
-    precision       1 - tanh(distance / 1 cm) / 2 - tanh(distance / 3 mm) / 2
-    stillness       0: the path defines where to rest
-    filter_penalty  -limited
+    distance = -2 tanh(distance / 3 cm),
+    smoothness = -0.03 sum tanh(|dq| / 1 rad/s) - 0.03 sum tanh(|ddq| / 10 rad/s^2),
+    precision = 1 - tanh(distance / 1 cm) / 2 - tanh(distance / 3 mm) / 2,
+    stillness = 0, because the path defines where the arm rests,
+    filter_penalty = -limited.
 
     Args:
         error: (m, 3) m. dq, ddq: (m, n) rad/s, rad/s^2, deviations from the plan. limited: (m,), see `State`.

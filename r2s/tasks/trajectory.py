@@ -1,9 +1,9 @@
-"""End-effector trajectories: curves, the postures that follow them, and the fastest feasible timing.
+"""End-effector trajectories: curves, joint postures along the curves, and the fastest feasible timing.
 
 A curve is x(u), m, with |dx/du| <= 1. Inverse kinematics on a grid of u and a cubic spline yield the postures q(u).
-The clock u(t) accelerates along a minimum-jerk polynomial to the pace v, m/s, and slows down likewise at the end. So
-position, velocity and acceleration of end effector and joints are continuous. The pace is reduced until torque, speed
-and acceleration keep a margin to the limits of the arm and of its safety filter.
+The clock u(t) accelerates along a minimum-jerk polynomial to the pace v, m/s, and slows down likewise at the end, so
+that position, velocity and acceleration of end effector and joints are continuous. `Paths` reduces the pace until
+torque, speed and acceleration are well within the limits of the arm and of its safety filter.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ INSIDE = 0.05  # rad, least distance of a path from the position limits of the s
 TORQUE, SPEED, ACCELERATION = 0.5, 0.9, 0.8
 SLOWEST = 0.02  # share of the drawn pace; a path that must be slower is rejected
 CHECK_HZ = 50  # Hz, rate at which a path is checked against limits
-TRIES = 20  # most paces tried for a path
+TRIES = 20  # largest number of paces tried for a path
 PEAK = 1.875  # peak over mean speed of a minimum-jerk motion
 X, V = slice(0, 3), slice(3, 6)  # columns of a plan, followed by q, dq, ddq
 
@@ -38,7 +38,7 @@ Curve = Callable[[np.ndarray], np.ndarray]
 
 
 def curve(kind: str, rng: np.random.Generator, size: float, axes: np.ndarray = SPACE) -> Curve:
-    """Return the curve u (T,) m -> x(u) - x(0) (T, 3) m, within `size` m of its centre and with |dx/du| <= 1.
+    """Return the curve u (T,) m -> x(u) - x(0) (T, 3) m, within `size` m of its center and with |dx/du| <= 1.
 
     axes: (k, 3), orthonormal vectors that span the plane (k = 2) or the space (k = 3) of the curve.
     """
@@ -95,7 +95,7 @@ def smooth(s: np.ndarray) -> np.ndarray:
 def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return u, du/dt and d2u/dt2 at t (T,) s of a clock with pace 1 that runs from 0 to `seconds`.
 
-    The pace du/dt rises along `smooth` in the first `ramp` s and falls in the last `ramp` s; outside it is 0.
+    The pace du/dt rises along `smooth` in the first `ramp` s and falls in the last `ramp` s. Outside, du/dt is 0.
     """
 
     def integral(s: np.ndarray) -> np.ndarray:
@@ -110,7 +110,7 @@ def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.nd
 
 @dataclass(frozen=True)
 class Paths:
-    """Feasible paths of an arm.
+    """Paths that an arm can follow.
 
     Attributes:
         robot: the arm. torque: (n,) Nm, largest target torque.
@@ -131,7 +131,7 @@ class Paths:
     def postures(self, start: np.ndarray, shape: Curve, pace: float) -> tuple[CubicSpline, np.ndarray] | None:
         """Return the spline q(u) and the points (T, 3) m of the curve from `start` (3,) m.
 
-        Return None if a point is out of reach, or a posture is too near to a position limit.
+        Return None if a point is out of reach, or a posture is too close to a position limit.
         """
         home, hand, limits = self.robot.q_home, self._hand, self._limits  # type: ignore[attr-defined]
         first = hand.place(home[None])[0]
@@ -147,16 +147,16 @@ class Paths:
         return CubicSpline(u, q), points
 
     def timed(self, q: CubicSpline, pace: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, dq, ddq (T, n) of the path at t (T,) s, at a pace in m/s."""
+        """Return q, dq, ddq (T, n) of the path at t (T,) s for a pace in m/s."""
         u, rate, slope = (pace * x[:, None] for x in clock(t, self.seconds, self.ramp))
         along = q(u[:, 0], 1)
         return q(u[:, 0]), along * rate, q(u[:, 0], 2) * rate**2 + along * slope
 
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
-        """Return the largest ratio of a path's torque, or of its speed and acceleration, to the allowed value.
+        """Return the largest ratio of a path's torque to the allowed torque, or of its motion to the allowed motion.
 
-        The torque comes from the nominal model. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq), with
-        the speed v that is allowed at q.
+        The nominal model predicts the torque. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq), where
+        v is the allowed speed at q.
         """
         limits = self._limits  # type: ignore[attr-defined]
         shares = [np.abs(self._model.rigid(q, dq, ddq)) / (TORQUE * self.torque)]  # type: ignore[attr-defined]
@@ -170,7 +170,7 @@ class Paths:
         return float(max(s.max() for s in shares))
 
     def plan(self, start: np.ndarray, shape: Curve, pace: float, t: np.ndarray) -> np.ndarray | None:
-        """Return the plan (T, 6 + 3 n) at t (T,) s, slower than `pace` m/s if `strain` exceeds 1; None: not feasible.
+        """Return the plan (T, 6 + 3 n) at t (T,) s, or None if infeasible; reduce `pace` m/s until `strain` <= 1.
 
         Columns: position and velocity of the end effector, m, m/s; q, dq, ddq of the joints. t may exceed `seconds`.
         """
@@ -196,7 +196,7 @@ class Paths:
 
 
 def at_time(plans: np.ndarray, k: np.ndarray, ahead_s: float, hz: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, dq, ddq (m, n) of plans `ahead_s` s after rows k (m,); acceleration is linear between rows."""
+    """Return q, dq, ddq (m, n) of the plans `ahead_s` s after their rows k (m,), with ddq linear between rows."""
     n, whole = (plans.shape[2] - 6) // 3, int(ahead_s * hz)
     rows, last = np.arange(len(plans)), plans.shape[1] - 1
     a, b = plans[rows, np.minimum(k + whole, last)], plans[rows, np.minimum(k + whole + 1, last)]

@@ -1,4 +1,4 @@
-"""Task wipe: follow a timed path on a surface whose position is roughly known, with a normal force."""
+"""Task wipe: follow a timed path on a surface of roughly known position while pressing with a normal force."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -31,13 +31,13 @@ STEADY = 0.25  # integral rate as a share of its stability limit: a gain margin 
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal is a row as in `SurfaceTask`, with the forces at start and end of the path; `goals` draws equal forces. The
-    path follows: position, velocity and acceleration (9,) before the first control step and after each step.
+    A goal begins as in `SurfaceTask`; `goals` draws equal forces for the start and the end of the path. Then
+    the goal contains the path as rows of position, velocity and acceleration (9,), at the start and after each step.
 
     Attributes:
         speed: (low, high) m/s, drawn peak speed. size: (low, high) m, drawn radius of a path. kinds: subset of
             KINDS, equally probable. ramp_s: s, duration of the path's acceleration, and of its deceleration.
-        friction: expected friction coefficient of the surface. Others: see `SurfaceTask`.
+        friction: expected friction coefficient of the surface. Other attributes: see `SurfaceTask`.
         inertia: (3, 3) kg, effective mass of the tip at the nominal plane.
     """
 
@@ -66,14 +66,14 @@ class WipeTask(SurfaceTask):
                 raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
         check_number(
             "task.size", self.size[1], f"(0, {self.spread / np.sqrt(2):.3g}]"
-        )  # a path's middle is that of its bounding box
+        )  # the middle of a path is that of its bounding box
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
         check_number("task.friction", self.friction, "[0, inf)")
         check_number("task.episode_s", self.episode_s, f"[{self.begin_s + 2 * self.ramp_s + REST_S:g}, 60]")
 
     @property
     def begin_s(self) -> float:
-        """Start of the path, s: by then the tip has certainly touched, and the largest force has built up."""
+        """Time, s, of the start of the path, when the tip certainly touches and the largest force has built up."""
         return self.down_s + self.force[1] / self.force_rate + REST_S
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
@@ -87,11 +87,11 @@ class WipeTask(SurfaceTask):
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """Stiffness, N/m, and rate r of the integral action, 1/s, from the tip's effective mass at the plane.
+        """Stiffness K, N/m, and rate r of the integral action, 1/s, from the tip's effective mass at the plane.
 
         A path needs the stiffest spring that the latency allows: K = m w^2 with the smallest effective mass m. With
-        the law's critical damping, the largest mass M has the characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s
-        + K r = 0. It is stable for r < 2 (K / M)^(1/2) (Routh and Hurwitz); STEADY is the used share of this limit.
+        critical damping, the largest effective mass M has the characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s
+        + K r = 0. The motion is stable for r < 2 (K / M)^(1/2) (Routh and Hurwitz), and r is STEADY times this limit.
         """
         masses = np.linalg.eigvalsh(self.inertia)
         K = float(masses[0] * fastest_spring(self) ** 2)
@@ -109,12 +109,12 @@ class WipeTask(SurfaceTask):
         return path - middle + away * np.array([np.cos(about), np.sin(about)]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return the same force ~ U(force), N, twice."""
+        """Return a random force ~ U(force), N, as the force at start and end of the path."""
         force = rng.uniform(*self.force)
         return force, force
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return ((steps + 1) 9,), position m, velocity m/s and acceleration m/s^2 of the path's rows."""
+        """Return (9 (steps + 1),), position m, velocity m/s and acceleration m/s^2 in each row of the path."""
         spline = CubicSpline(np.arange(len(path)) / self.ctrl_hz, path)
         return np.hstack([path, spline(spline.x, 1), spline(spline.x, 2)]).ravel()
 
@@ -157,7 +157,7 @@ class WipeTask(SurfaceTask):
         return now[:, A] @ self.inertia + self.friction * force * now[:, V] / np.maximum(speed, SLOW_V)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 18,) that normalise observations: fixed scales of the task."""
+        """Return mean and standard deviation (3 n + 18,) that normalize observations: fixed scales of the task."""
         mean, std = super().observation_scale(robot)
         return np.append(mean, np.zeros(6)), np.concatenate([std, np.ones(3), np.full(3, 0.5 * self.speed[1])])
 
@@ -184,11 +184,11 @@ class WipeTask(SurfaceTask):
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance from the path along the nominal plane (m,) m, and the reward terms (m, 6).
+        """Return the distance d (m,) m from the path along the nominal plane, and the reward terms (m, 6).
 
-        force -tanh(error / 5 N); path -tanh(distance / 1 cm); precision: product of 1 - tanh(error / 5 N) / 2 -
-        tanh(error / 2 N) / 2 and the same for the distance with 1 cm and 3 mm; excess -tanh(e / 10 N) with the excess
-        e of the force, N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        Terms with the force error e: force = -tanh(|e| / 5 N), path = -tanh(d / 1 cm), precision =
+        `near`(|e|, 5 N, 2 N) `near`(d, 1 cm, 3 mm), excess = -tanh(max(e, 0) / 10 N),
+        smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2), filter_penalty = -`State.limited`.
         """
         beyond, normal = -np.diff(self.forces(state, goals))[:, 0], goals[:, NORMAL]
         offset = self.tip(state.q)[0] - self.at(state.t, goals)
@@ -198,7 +198,7 @@ class WipeTask(SurfaceTask):
         return away, np.stack([*terms, -rough(ddq), -state.limited], axis=1)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
-        """Return one row of evaluations.csv, see `wipe_measures`."""
+        """Return one row of evaluations.csv; see `wipe_measures`."""
         return wipe_measures(episodes, round(self.begin_s * self.ctrl_hz), self.ctrl_hz)
 
     def score(self, row: Mapping[str, float]) -> float:

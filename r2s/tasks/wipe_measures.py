@@ -1,4 +1,4 @@
-"""The measures of task wipe, from path error and force against the surface while the path runs."""
+"""Compute the measures of task wipe from the path error and the contact force along the path."""
 
 import numpy as np
 
@@ -38,12 +38,12 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv, over the steps from `begin` on, at which the path starts.
+    """Return one row of evaluations.csv for the steps of the path, which starts at step `begin`.
 
-    within_2N, within_3mm: share of the steps with a force error, or path error, within the limit; wiped: with both;
-    contact: with more than TOUCH_N. Steps of stopped episodes are in none of these. success: share of episodes wiped
-    to SUCCESS. force_rmse_N, path_rmse_mm: RMS error over the steps of the episodes that were not stopped. impact_N:
-    mean over these episodes of the largest force within IMPACT_S of the first touch, also before `begin`.
+    within_2N, within_3mm: share of steps with a force error within 2 N, or a path error within 3 mm. wiped: share of
+    steps within both limits. contact: share of steps above TOUCH_N. Steps of stopped episodes meet no limit here.
+    success: share of episodes wiped to SUCCESS. Without stopped episodes: force_rmse_N, path_rmse_mm are RMS errors,
+    and impact_N is the mean of the largest force within IMPACT_S of the first touch, even before `begin`.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = ~ended[:, None]

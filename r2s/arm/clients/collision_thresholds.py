@@ -19,9 +19,9 @@ FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/cont
 
 @dataclass(frozen=True)
 class CollisionThresholds:
-    """External torque and force at which the arm stops itself.
+    """Thresholds of external torque and force above which the arm stops itself.
 
-    libfranka's contact thresholds get the same values. The defaults are the lowest in libfranka's motion examples.
+    libfranka's contact thresholds have the same values. The default values are the lowest in libfranka's examples.
 
     Attributes:
         torque: (7,) Nm at the joints. force: (6,) N and Nm at the end effector.
@@ -45,10 +45,10 @@ CAUTIOUS = CollisionThresholds()
 
 
 def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
-    """Return the thresholds for a task: above every force that its push limit allows, and at least CAUTIOUS.
+    """Return a task's collision thresholds: above every force that the push limit allows, and at least CAUTIOUS.
 
-    In the load case, the tip exerts on the plane the largest normal force that the limit allows on a rigid surface,
-    and FRICTION times this force tangentially. ERROR times CAUTIOUS is added for model errors.
+    The tip is assumed to exert the largest normal force that the limit allows on a rigid surface, and
+    FRICTION times this force tangentially. An allowance of ERROR times CAUTIOUS covers model errors.
 
     Raises:
         UserError: the thresholds would switch the reflexes off.

@@ -1,4 +1,4 @@
-"""Check whether this computer and its cable keep up with an arm: kernel, permissions, states of an arm at rest."""
+"""Check whether computer and network are fast enough for an arm: kernel, permissions, states of a resting arm."""
 
 import os
 import resource
@@ -30,7 +30,7 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check the states of an arm at rest; arm, here: times (k,) s of the states, by the arm's and our clock."""
+    """Check the states of a resting arm; arm, here: their times (k,) s on the arm's clock and on this computer's."""
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)

@@ -59,10 +59,10 @@ FR3 = ArmType("FR3", 10, fr3_limits.Q_MIN, fr3_limits.Q_MAX, fr3_limits.DQ_MAX, 
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of the comparison of one quantity.
+    """The comparison of one quantity of an arm or a computer with its expected value.
 
     Attributes:
-        name: the quantity. expected: its value in r2s. found: on arm or computer. refused: whether not allowed.
+        name: the quantity. expected: value in r2s. found: value on arm or computer. refused: True forbids motion.
     """
 
     name: str
@@ -76,11 +76,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class Connection:
-    """What a client expects of its arm.
+    """The properties that a client requires of its arm.
 
     Attributes:
         arm: type of the arm. declared: payload, with end effector, for which the arm should compensate gravity.
-        moves: False for `r2s check`: a mismatch is only reported, and no motion begins.
+        moves: False (for `r2s check`): the client only reports a mismatch, and cannot move the arm.
     """
 
     arm: ArmType
@@ -128,7 +128,7 @@ def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
 
 
 def _load_of(robot: Robot, s: Any) -> np.ndarray:
-    """Return the `mass_and_moment` (4,) of end effector and load as the arm's RobotState declares them."""
+    """Return mass and first moment (4,) of the end effector plus load that the arm's RobotState declares."""
     place, axes = ee_pose(robot)
     tool = np.array(s.F_T_EE).reshape(4, 4).T
     flange = axes @ tool[:3, :3].T
@@ -184,7 +184,7 @@ def _end_effector(robot: Robot, s: Any) -> Finding:
 
 
 def _external(s: Any) -> Finding:
-    """Report the external torque, but never refuse it: an adapter may be meant to find an undeclared payload."""
+    """Report the external torque without refusing it, because an adapter may compensate an undeclared payload."""
     return Finding("external torque at rest", "about 0 Nm", f"{_row(np.array(s.tau_ext_hat_filtered), 1)} Nm")
 
 

@@ -1,4 +1,4 @@
-"""The operator's consent to further motion of an arm after a stop."""
+"""Ask the operator whether an arm may move again after a stop."""
 
 import sys
 import termios

@@ -1,4 +1,4 @@
-"""Open a Franka client on our emulator of the control box, which drives a hidden twin."""
+"""Open a Franka client that is connected to the emulated control box of a hidden twin."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -34,13 +34,12 @@ def emulated_arm(
     moves: bool = True,
     speed_share: float = 1.0,
 ) -> AbstractContextManager[Franka]:
-    """Open an emulated Panda or FR3. The arguments are the keys of conf/arm/*_emulated.yaml.
+    """Open an emulated Panda or FR3; conf/arm/*_emulated.yaml sets these arguments.
 
     Args:
-        robot: nominal model. client: 'panda' or 'fr3'.
-        seed: seed of the rigid twin behind the emulator. noise, payload, declared_payload, surface: see `TwinBase`.
-        realtime: run at 1 kHz instead of in lock-step. operator, collision_torque, collision_force, speed_share,
-            moves: see `Panda`.
+        robot: nominal model. client: 'panda' or 'fr3'. seed: seed of the emulated arm, a rigid twin.
+        realtime: run at 1 kHz instead of in lock-step. noise, payload, declared_payload, surface: see `TwinBase`.
+        operator, collision_torque, collision_force, speed_share, moves: see `Panda`.
     """
     if client not in CLIENTS:
         raise UserError(f"arm.client: {client!r}; allowed: {choices(CLIENTS)}")

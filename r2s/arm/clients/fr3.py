@@ -1,6 +1,6 @@
 """Connect to an FR3 through pylibfranka (libfranka 0.18 and later): hardware, or the emulator in FCI version 10.
 
-pylibfranka has neither rate limiter nor low-pass in this loop: the arm receives each command unchanged.
+pylibfranka's readOnce and writeOnce have no rate limiter and no low-pass: the arm receives unchanged commands.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ STOP_DISTANCE = 0.02  # rad, braking distance of a joint from 0.2 rad/s, the spe
 def within_fr3(robot: Robot) -> Robot:
     """Return the robot with its limits clipped to an FR3's and with an FR3's position-dependent velocity limit.
 
-    An FR3 allows no speed in the last hundredths of a radian. The new limits exclude these and a stopping distance.
+    An FR3 allows no speed close to a position limit, so the new limits exclude this range and a stopping distance.
     """
     margin = fr3_limits.VELOCITY_OFFSET**2 / (2 * fr3_limits.DECELERATION) + STOP_DISTANCE
     return replace(
@@ -92,7 +92,7 @@ class _FR3Client(Client):
 
 
 class FR3(Panda):
-    """A Franka Research 3; arguments as in `Panda`, limits restricted by `within_fr3`.
+    """A Franka Research 3, with the arguments of `Panda` and the limits of `within_fr3`.
 
     Raises:
         UserError: pylibfranka is missing, no server of its FCI version answers at the address, or the arm there does

@@ -1,8 +1,8 @@
 """Implement the `Arm` protocol on a libfranka client, hardware or emulated: the base of Panda and FR3.
 
-libfranka has no point-to-point motion in torque control. `move_to` therefore follows a slow, checked joint path with
-the recorder's tracking controller, in the same 1 kHz torque loop as every other motion. So `move_to` needs no model
-from the client package, and tests on the emulator exercise the same code that moves the hardware.
+libfranka has no point-to-point motion in torque control. So `move_to` follows a slow, checked joint path with the
+recorder's tracking controller, in the same 1 kHz torque loop as every other motion. The path needs no robot model
+from libfranka, and tests on the emulator run the same code that moves the hardware.
 """
 
 import weakref
@@ -46,24 +46,24 @@ MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
 
 
 class Franka:
-    """An `Arm` (r2s/arm/interface.py) on a `Client`, with an operator (`Operated`).
+    """An `Arm` (r2s/arm/interface.py) that is commanded through a `Client`, with an operator (`Operated`).
 
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked: see `Operated`. Any end of a motion other than `stop` blocks the arm: a reflex, a stop
+        operator, blocked: see `Operated`. Every end of a motion except `stop` sets `blocked`: a reflex, the stop
             button (even if released since), a rejected command, a failed `move_to`. hold: see `Holds`.
         findings: results of the check at connection.
-        realtime: whether motions run in a `realtime_section`; a recording or an episode in which less than 99 % of
-            the commands arrive in time is then rejected.
+        realtime: whether motions run in a `realtime_section`. Recordings and episodes are then rejected if less
+            than 99 % of the commands arrive in time.
 
     Args:
         robot: limits and nominal model.
         client: the connection.
-        operator: called with the reason of a stop before the arm moves again. None: after a stop, `move_to` refuses
-            to move until a new connection finds the arm ready.
+        operator: called with the reason of a stop before the arm moves again. None: after a stop, `move_to` raises
+            NotCleared until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
-        connection: properties that the arm must have; None: they are not checked.
+        connection: properties that the arm must have; None: no check.
         speed_share: factor on all allowed speeds, in every motion.
 
     Raises:
@@ -103,15 +103,15 @@ class Franka:
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Move to q (7,) rad at up to a fifth of the speed limits, unless the arm is within 2 mrad of q; hold there.
+        """Move to q (7,) rad at up to a fifth of the speed limits; do not move if the arm is within 2 mrad of q.
 
-        The path is the first one of r2s/excitation/paths.py that keeps clear of limits, table and arm.
+        The path is the first candidate of r2s/excitation/paths.py without a violation of limits or clearances.
 
         Raises:
             NotCleared: the arm stopped before, and no operator agreed that it may move.
-            StopRequested: a signal came, or the policy's process ended; the arm is at rest.
-            ArmStopped: q is outside the limits, the arm is not ready, or no path exists (in these cases nothing
-                moved); the arm stopped on the path, deviated from it by 0.1 rad, or ended more than 10 mrad from q.
+            StopRequested: a signal requested a stop, or the policy's process ended; the arm is at rest.
+            ArmStopped: q is outside the limits, the arm is not ready, or no path exists (the arm has not moved); or
+                the arm stopped itself, deviated from the path by 0.1 rad, or ended more than 10 mrad from q.
 
         """
         q = np.array(q, dtype=float)
@@ -151,7 +151,7 @@ class Franka:
         self._send(tau)
 
     def stop(self) -> None:
-        """Damp the remaining motion for at most 0.5 s, and end it; do not change an earlier reason in `blocked`."""
+        """Damp the motion for at most 0.5 s, then end the motion; `blocked` retains an earlier reason."""
         if self._damping:  # the command loop calls `stop` while it damps
             return
         for part in (self._damp, self._end):  # `_end` also runs if damping failed
@@ -229,7 +229,7 @@ class Franka:
         return found
 
     def _read_idle(self) -> None:
-        """Read the state between motions; set tau_J_d to 0, because the arm then reports its controller's torque."""
+        """Read the state between motions, and set tau_J_d to 0 instead of the torque of the arm's own controller."""
         s = self._client.idle()
         self._begun = _ms(s)
         sample = self._sample(s)

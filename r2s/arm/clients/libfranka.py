@@ -20,7 +20,7 @@ CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in 
 class Client:
     """Base of the clients for libfranka's two Python packages, whose RobotState has the same attributes.
 
-    Every method raises ArmStopped with libfranka's message.
+    If libfranka reports an error, a method raises ArmStopped with libfranka's message.
 
     Attributes:
         name: option of the group `arm`, and the extra that installs the package. package: name of its module.
@@ -54,7 +54,7 @@ class Client:
         raise NotImplementedError
 
     def idle(self) -> Any:
-        """Return a fresh RobotState while no motion runs; the first one read may be old."""
+        """Return a fresh RobotState while no motion runs; read twice, because the first state may be outdated."""
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +102,7 @@ def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
 def is_reachable(address: str) -> bool:
     """Return whether a computer answers at the address; a refused connection is an answer too.
 
-    The FCI port is tried second, because opening it occupies the arm's only client slot.
+    Try the FCI port second, because a connection to this port occupies the arm's only client slot.
     """
     for port in (DESK_PORT, fci.PORT):
         try:

@@ -1,8 +1,8 @@
 """Connect to a Panda (FER) through panda-python (libfranka 0.9): hardware, or the emulator in FCI version 5.
 
-libfranka calls a callback once per millisecond, while r2s calls an `Arm`. So libfranka's loop runs in a thread, where
-the callback passes the state on and waits for the command. libfranka's rate limiter and low-pass are off: the arm
-receives each command unchanged.
+libfranka calls a callback once per millisecond, but r2s calls the methods of an `Arm`. So libfranka's loop runs in a
+thread, in which the callback passes each state to r2s and waits for the command. libfranka's rate limiter and
+low-pass are off: the arm receives unchanged commands.
 """
 
 import threading
@@ -57,7 +57,7 @@ class _PandaClient(Client):
 
 
 class _Motion:
-    """libfranka's control loop in a thread, driven by calls of `next` and `answer`."""
+    """Runs libfranka's control loop in a thread: `next` returns a state, `answer` returns the command to the loop."""
 
     def __init__(self, robot: Any, libfranka: Any):
         self._robot, self._libfranka = robot, libfranka
@@ -77,11 +77,11 @@ class _Motion:
         return state  # None only follows an answer of None
 
     def answer(self, tau: np.ndarray | None) -> None:
-        """Answer the state that `next` returned last; None ends the motion."""
+        """Send the command tau (7,) Nm for the last state from `next`; None ends the motion."""
         self._answers.put(tau if tau is None else tau.tolist())
 
     def join(self) -> None:
-        """Wait for the end of the motion after an answer of None."""
+        """Wait until the motion has ended, after `answer(None)`."""
         self._thread.join()
         while not self._states.empty():  # an interrupted reader may leave a state in the queue
             end = self._states.get()
@@ -122,7 +122,7 @@ class Panda(Franka):
     """A Franka Emika Panda.
 
     Attributes:
-        arm_type, client_type, within: overridden by `FR3`; `within` restricts a robot's limits to the arm's.
+        arm_type, client_type: types of arm and client. within: function that clips a robot's limits to the arm's.
 
     Args:
         robot: limits and nominal model.

@@ -1,6 +1,6 @@
 """Emulate the control box between FCI server and arm: modes, cycles, missed answers, reflexes, injected faults.
 
-The box is Franka's Control, here without sockets and without a clock: one call of `cycle` is one millisecond.
+The control box (Franka's Control) has no sockets and no clock here: a call of `cycle` is one millisecond.
 """
 
 from collections import deque
@@ -37,14 +37,14 @@ class Fault:
     """A fault that begins at a fixed cycle of a motion.
 
     Attributes:
-        kind: 'late': the answers in these cycles arrive too late, and the arm repeats its last torque. 'drop': the
-            states of these cycles do not reach the client. 'discontinuity': the first joint's torque steps by twice
-            the allowed size. 'joint_limit': the arm reports a position limit. 'estop': the stop button is pressed and
-            stays pressed. 'press': the button is pressed, and released after `cycles` ms. 'hold': an external force
-            stops the first link; for this, the arm needs the attribute `external`.
-        cycle: the first control cycle, from 0.
-        motion: number of the server's motion, from 0; a client's `move_to` makes one per straight part of its path.
-        cycles: number of consecutive cycles of the fault; 20 late or dropped cycles stop the arm.
+        kind: 'late': the client's answers arrive too late, and the arm repeats its last torque. 'drop': the arm's
+            states do not reach the client. 'discontinuity': the first joint's torque steps by twice the allowed size.
+            'joint_limit': the arm reports a position limit. 'estop': the stop button is pressed and stays pressed.
+            'press': the stop button is pressed for `cycles` ms. 'hold': an external force stops the first link; the
+            arm needs the attribute `external`.
+        cycle: first control cycle of the fault, from 0.
+        motion: number of the server's motion, from 0; each straight part of a `move_to` path is a motion.
+        cycles: number of consecutive cycles with the fault; 20 late or dropped cycles stop the arm.
 
     """
 
@@ -72,9 +72,9 @@ class Control:
         stopped_by: why the last motion was aborted; None if the motion was not aborted.
 
     Args:
-        arm: the arm behind the box. If its state lacks the true external torque, the box reports zero.
+        arm: arm of the box. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
         version: version of the FCI. faults, max_missed: see `Emulator`.
-        desk: settings of `DESK` by name, such as {"m_ee": 0.73}; they may be wrong and do not change the arm.
+        desk: settings of `DESK` by name, such as {"m_ee": 0.73}; they may differ from the arm's true settings.
     """
 
     def __init__(
@@ -138,12 +138,12 @@ class Control:
         self._sense()
 
     def first_answer(self) -> None:
-        """Record the first answer of the client's loop; the success rate is above 0 from now on."""
+        """Record the client's first answer, which raises control_command_success_rate above 0."""
         self._answered.append(True)
         self._sense()
 
     def cycle(self, tau: np.ndarray | None) -> None:
-        """Advance the arm by 1 ms under tau (7,) Nm, or under its last torque if no answer came (None)."""
+        """Advance the arm by 1 ms under tau (7,) Nm, or under its last torque if tau is None (no answer)."""
         if self._has("late"):
             tau = None
         self._answered.append(tau is not None)
@@ -186,7 +186,7 @@ class Control:
             self._place(self._arm.read().q)
 
     def idle(self, ms: int) -> None:
-        """Advance time between motions by `ms`; a released stop button makes the arm idle, as on a Franka."""
+        """Advance the time between motions by `ms`; an arm becomes idle when its stop button is released."""
         if self._mode == fci.USER_STOPPED and self._pressed_ms > 0:
             self._pressed_ms -= ms
             if self._pressed_ms <= 0:
@@ -206,9 +206,9 @@ class Control:
         self._sense()
 
     def recover(self) -> bool:
-        """Clear a reflex; return whether the arm can move again. A pressed stop button stays pressed.
+        """Clear a reflex; return whether the arm can move again, which a pressed stop button prevents.
 
-        A real arm beyond its joint limits has to be guided back by a person; here `recover` moves it back.
+        A person must guide a real arm back into its joint limits; `recover` moves the emulated arm back.
         """
         if self._mode == fci.USER_STOPPED:
             return False
@@ -260,13 +260,13 @@ class Control:
             self._arm.external = np.zeros(7)
 
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
-        """Filter the external torque, set wrench and flags, and return error and message of a collision, or None.
+        """Filter the external torque, set wrench and contact flags; return a collision's error and message, or None.
 
         As in libfranka, external torque is tau_J minus the model's torque: what the joints exert on the surroundings,
-        plus the effect of wrong `DESK` settings. Here it is exact: free of friction and of other model errors.
+        plus the effect of wrong `DESK` settings. Friction and model errors do not affect it here.
 
         Args:
-            gain: gain of the low-pass; 1, without filtering, for an arm at rest.
+            gain: gain of the low-pass; 1 (no filtering) for an arm at rest.
         """
         s, arm = self.state, self._arm.read()
         raw = np.zeros(7) if arm.tau_ext_hat_filtered is None else arm.tau_ext_hat_filtered

@@ -3,11 +3,11 @@
     with Emulator(partial(RigidTwin, robot, 3), version=5) as address:
         arm = Panda(robot, address, operator=lambda reason: True)
 
-Any `Arm` of r2s can be behind it. In lock-step, the default, the arm's clock advances only with a command: the same
-commands cause the same motion, bit for bit, however slow either side is. In real time the clock runs at 1 kHz, and an
-answer that arrives after its millisecond is too late: it is missed.
+The emulated box can use any `Arm`. In lock-step, the default, the arm's clock advances only with a command: the same
+commands cause the same motion, bit for bit, even on a slow computer. In real time the clock runs at 1 kHz, and an
+answer that arrives after its millisecond has no effect.
 
-It emulates no network jitter, no brakes, and nothing that makes a motion safe beside a person.
+The emulator has no network jitter and no brakes, and does not show whether a motion is safe beside a person.
 """
 
 import multiprocessing

@@ -1,4 +1,4 @@
-"""Model the arm as the emulated control box does: URDF, poses, gravity torque and external wrench."""
+"""The emulated control box's model of its arm: URDF, poses, gravity torque and external wrench."""
 
 from dataclasses import replace
 from xml.etree import ElementTree as ET
@@ -25,7 +25,7 @@ def urdf(robot: Robot) -> str:
 
 
 class BoxModel:
-    """The box's model of its arm: computes poses, wrenches, and the torques of gravity and declared load."""
+    """The control box's model of its arm: poses, wrenches, and the gravity torque with the declared load."""
 
     def __init__(self, robot: Robot):
         self._model = robot.model(gravity=True)
@@ -45,7 +45,7 @@ class BoxModel:
     def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that explains torque (n,) Nm best.
 
-        Near a singularity it is zero, as in libfranka.
+        Near a singularity the wrench is zero, as in libfranka.
         """
         place, j = self.pose(q, tool)[:3, 3], self._jacobian
         mujoco.mj_comPos(self._model, self._data)

@@ -24,8 +24,8 @@ class Server:
     """Serves one client at a time, in one thread.
 
     A motion begins when the client has answered the newest state. Until then the arm stands still and the server
-    repeats states, because a client may skip some while it starts. The server does not execute that first answer.
-    Its first executed command answers the first state with a control_command_success_rate above zero.
+    repeats states, because a starting client may skip some. The server does not execute the first answer. The
+    first executed command answers the first state whose control_command_success_rate is above zero.
     """
 
     def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
@@ -203,7 +203,7 @@ class Server:
             self._finish(self._control.aborted_as)
 
     def _tick(self) -> None:
-        """Send the state that is due, and set the time of the next one."""
+        """Send the state that is due, and schedule the next state."""
         assert self._due is not None
         if self._started and self._realtime:
             if not self._ahead:
@@ -245,7 +245,7 @@ class Server:
 
 
 def open_port() -> socket.socket:
-    """Open the FCI's port, which clients always use, on the first free loopback address; return the server socket.
+    """Open the FCI's fixed port on the first loopback address where this port is free; return the server socket.
 
     Raises:
         UserError: the port is in use on all addresses.

@@ -1,1 +1,1 @@
-"""The hidden twins: simulated stand-ins for a real arm, whose parameters no other code reads."""
+"""Hidden twins: simulated arms that replace a real arm, with parameters that no other code reads."""

@@ -1,4 +1,4 @@
-"""Draw the parameters that both variants of hidden twin have: links, torque offset, cable drag, sensor noise."""
+"""Draw the parameters that both twin variants have: links, torque offset, cable drag and sensor noise."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ ENCODER = 2e-5  # rad, resolution
 
 
 def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
-    """Draw masses, centers of mass and inertia tensors."""
+    """Draw masses, centers of mass and inertia tensors of the links."""
     model = robot.model(gravity=True)
     n, bodies = robot.n, model.jnt_bodyid
-    small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # scale of arms smaller than a Panda's wrist
+    small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # scale for joints weaker than a Panda's wrist
     masses = model.body_mass[bodies] * rng.uniform(0.98, 1.02, n)  # U(0.98, 1.02) of the nominal mass
     coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
     scale = rng.uniform(0.73, 1.37, n)  # the range of the paper's NEW / OLD; a scaled tensor stays physical
@@ -21,9 +21,9 @@ def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
 
 
 def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return friction in motion (n,), range of |offset| (n, 2), largest cable drag (n,) and torque noise (n,), Nm.
+    """Return kinetic friction (n,), range of |offset| (n, 2), largest cable drag (n,) and torque noise (n,), Nm.
 
-    A Panda has the magnitudes of the paper's Tables I and IV; other arms scale them with their torque limits.
+    The magnitudes for a Panda follow the paper's Tables I and IV; for other arms they depend on the torque limits.
     """
     big = robot.tau_max >= 40
     if robot.n == 7 and np.allclose(robot.tau_max, [87] * 4 + [12] * 3):
@@ -36,11 +36,11 @@ def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw (8, n): torque offset, Nm; four cable parameters of `drag`; standard deviations of q, dq, tau_J noise.
+    """Draw (8, n): torque offset, Nm; four parameters of `drag`; standard deviations of noise on q, dq and tau_J.
 
     Args:
-        robot, rng: the arm, and the random stream.
-        hold: (n,) Nm, lower bound of static friction. unbalanced: (n,) Nm, compensation minus gravity at home.
+        robot: the arm. rng: random number generator. hold: (n,) Nm, lower bound of static friction.
+        unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
     """
     _, offset_range, drag_max, noise_max = magnitudes(robot)
     n = robot.n
@@ -62,5 +62,5 @@ def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, 
 
 @njit(cache=True)
 def drag(own, along, waves, phase, q, q_next):
-    """Return the torque, Nm, of a cable on a joint at q rad, with the next joint at q_next rad."""
+    """Return a cable's torque, Nm, on a joint at the angle q, rad, if the next joint is at q_next, rad."""
     return own * np.sin(waves * q + phase) + along * np.sin(q_next - phase)

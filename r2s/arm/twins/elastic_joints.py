@@ -1,19 +1,18 @@
-"""Simulate a 1 ms cycle of the elastic twin, compiled: joints with elastic gears and dry friction that warms up.
+"""Simulate a 1 ms cycle of the elastic twin (compiled): elastic gears, and friction that decreases with heat.
 
-Per joint, theta and w = dtheta/dt are of the motor (scaled to the joint's side of the gear), q and v of the link:
+A joint has the motor angle theta and velocity w, scaled to the joint's side of the gear, and the link's q and v:
     rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v + J'F
     s = K (theta - q) + D (w - v)
-    f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c one value per direction
-s is the gear torque, F the contact force of a surface (r2s/physics/contact.py).
-L (w - v) is the damping of the gear by the drive's torque loop. A motor at rest stays exactly at rest while the net
-torque on it is within f at w = 0; friction then balances that torque.
-warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus three sines of theta: their periods are one revolution
-of the joint, one of the motor, and half of one of the motor (the two lobes of a strain wave gear).
+    f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c has a value per direction
+s is the gear torque, and F the contact force of a surface (r2s/physics/contact.py). The drive's torque loop damps the
+gear by L (w - v). A resting motor does not move while the net torque on it is below the breakaway torque, f at w = 0.
+warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus three sines of theta, whose periods are one joint
+revolution, one motor revolution and half a motor revolution (the two lobes of a strain wave gear).
 
-Integration is Verlet's: half a step of positions, a whole step of velocities with the forces there, half a step of
-positions. Velocity-dependent forces are taken at the middle of the step, with one correction. A motor that comes to
-rest within a step rests or reverses from that moment on (as in r2s/physics/stick_slip.py; motors act on each other
-only through their gears, so each motor is solved separately).
+A step follows position Verlet: positions advance by half a step, velocities by a whole step with the forces at
+mid-step, then positions by the other half. Velocity-dependent forces are computed at the mid-step velocity that a
+first pass predicts. A motor that reaches zero velocity within a step then stays at rest or reverses, as in
+r2s/physics/stick_slip.py. Motors act on each other only through their gears, so each motor is solved separately.
 """
 
 import numpy as np
@@ -33,24 +32,24 @@ FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: friction power, W, at which h
 HELP, HELP_VISCOUS, HELP_WIDTH = range(18, 21)  # the arm's own friction compensation: Nm, Nm s/rad, rad/s
 ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
 OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
-# ... of the state (STATES, n); *_AT: when the sensors read; ADDED: Nm, added to the command by the arm's control
+# ... of the state (STATES, n); *_AT: at the time of measurement; ADDED: Nm, torque that the arm adds to the command
 LINK_Q, LINK_V, THETA, W, MOTOR, HEAT, Q_MEASURED, DQ_MEASURED, TAU_MEASURED, THETA_AT, W_AT, S_AT, ADDED, STATES = (
     range(14)
 )
-# ... and of the forces within a step (FORCES, n); the velocities are those at its middle
+# ... and of the forces within a step (FORCES, n), with the velocities at mid-step
 F_DRIVE, F_FACTOR, F_SPRING, F_LINK_V, F_W, F_POWER, F_TOUCH, FORCES = range(8)
-HALF_WARM = 0.6  # heat scale of warming; heat is 1 at a quarter of the speed limit
+HALF_WARM = 0.6  # heat scale of the friction decrease; steady motion at a quarter of the speed limit has heat 1
 
 
 @njit(cache=True)
 def warmth(p, heat, i):
-    """Return the temperature-dependent factor of all friction: 1 when cold, down to 1 - FALL when warm."""
+    """Return the factor by which heat changes friction: 1 for a cold joint, down to 1 - FALL for a warm one."""
     return 1.0 - p[FALL, i] * (1.0 - np.exp(-heat / HALF_WARM))
 
 
 @njit(cache=True)
 def ripple(p, theta, i):
-    """Return the position-dependent factor of all friction."""
+    """Return the factor by which the motor angle theta, rad, changes the friction of joint i."""
     joint = p[RIPPLE, i] * np.sin(theta + p[PHASE, i])
     motor = p[RIPPLE + 1, i] * np.sin(p[RATIO, i] * theta + p[PHASE + 1, i])
     return 1.0 + joint + motor + p[RIPPLE + 2, i] * np.sin(2 * p[RATIO, i] * theta + p[PHASE + 2, i])
@@ -58,7 +57,7 @@ def ripple(p, theta, i):
 
 @njit(cache=True)
 def level(p, w, load, side, i):
-    """Return cold friction without ripple, Nm, in direction `side` at w rad/s; at w = 0, breakaway torque."""
+    """Return a cold joint's friction without ripple, Nm, at w rad/s in direction `side`; w = 0: breakaway torque."""
     coulomb = p[C_POS, i] if side > 0 else p[C_NEG, i]
     speed = abs(w)
     rise = (p[BREAK, i] - 1.0) / (1.0 + (speed / p[V_STRIBECK, i]) ** p[SHAPE, i])
@@ -67,11 +66,11 @@ def level(p, w, load, side, i):
 
 @njit(cache=True)
 def _next_velocity(p, w, middle, push, load, factor, h, i):
-    """Return the motor's velocity, rad/s, after h s; `push`, Nm, is the net torque on it without friction.
+    """Return a motor's velocity, rad/s, after h s under friction and the torque `push`, Nm, of all other effects.
 
     Args:
-        p, i: parameters, joint. w: velocity now, rad/s. middle: velocity, rad/s, at which friction is evaluated if
-            the motor keeps its direction. load: gear torque, Nm. factor: factor on friction.
+        p, i: parameters, index of the joint. w: present velocity, rad/s. middle: mid-step velocity, rad/s, at which
+            friction is evaluated if it has the motor's direction. load: gear torque, Nm. factor: scale of friction.
     """
     side = np.sign(w)
     if w != 0.0:
@@ -90,7 +89,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
 
 @njit(cache=True)
 def _active(line, cycle, t, delay):
-    """Return the row of `line` that a joint executes at t cycles: the newest whose delay is over; -1: none yet."""
+    """Return the row of `line` with the newest command whose delay has passed at time t, cycles; -1 if none has."""
     slots, arrival = len(line), line.shape[1] - 1
     for k in range(cycle, max(cycle - slots, -1), -1):
         if line[k % slots, arrival] + delay <= t:
@@ -100,7 +99,7 @@ def _active(line, cycle, t, delay):
 
 @njit(cache=True)
 def _commanded(line, cycle, begin, end, delay, i):
-    """Return the mean command, Nm, that joint i executes from `begin` to `end`, cycles."""
+    """Return the mean of joint i's delayed command, Nm, between the times `begin` and `end`, cycles."""
     older, newer = _active(line, cycle, begin, delay), _active(line, cycle, end, delay)
     after = line[newer, i] if newer >= 0 else 0.0
     if older == newer:
@@ -111,7 +110,7 @@ def _commanded(line, cycle, begin, end, delay, i):
 
 @njit(cache=True)
 def compensate(p, s, gravity):
-    """Write the torque that the arm's control adds to commands: gravity (n,) Nm and partial friction compensation."""
+    """Set ADDED, the torque that the arm adds to a command: gravity (n,) Nm and partial friction compensation."""
     for i in range(s.shape[1]):
         dq = s[DQ_MEASURED, i]
         s[ADDED, i] = gravity[i] + p[HELP, i] * np.tanh(dq / p[HELP_WIDTH, i]) + p[HELP_VISCOUS, i] * dq
@@ -119,13 +118,13 @@ def compensate(p, s, gravity):
 
 @njit(cache=True)
 def advance(p, s, arm, line, cycle, steps, age):
-    """Advance the arm by one cycle in `steps` steps; the sensors read `age` cycles before the cycle's end.
+    """Advance the arm by one cycle in `steps` steps; the sensors measure `age` cycles before the end of the cycle.
 
     Args:
-        p, s: parameters, and the state, which is updated.
-        arm: links and gravity of the true arm, and from its `Touch`: contact, Jacobian, frames, axes, and whether
-            there is a surface.
-        line: (slots, n + 1), the last commands, Nm, and the time when each arrived, cycles. cycle: current cycle.
+        p: parameters. s: state, updated in place.
+        arm: (links, gravity, touch) of the true arm, where touch is (contact, Jacobian, frames, axes, whether there
+            is a surface), see `Touch`.
+        line: (slots, n + 1), the last commands, Nm, and their arrival times, cycles. cycle: number of this cycle.
     """
     links, gravity, touch = arm
     n, h = s.shape[1], SIM_DT / steps
@@ -146,7 +145,7 @@ def advance(p, s, arm, line, cycle, steps, age):
                 factor(mass, root)
             _accelerate(p, s, f, bias, root, h, correction == 1)
         _move(s, 0.5 * h)
-        share = steps * (1.0 - age) - step  # part of this step that has passed when the sensors read
+        share = steps * (1.0 - age) - step  # share of this step before the time of measurement
         if 0.0 <= share <= 1.0:
             for i in range(n):
                 s[THETA_AT, i] = (1.0 - share) * before[0, i] + share * s[THETA, i]
@@ -170,7 +169,7 @@ def _move(s, h):
 
 @njit(cache=True)
 def _touch(s, links, touch, h, out):
-    """Write the joint torque (n,) Nm of the contact at the middle of a step of h s to `out`."""
+    """Write to `out` the joint torque (n,) Nm of the contact force at the middle of a step of h s."""
     contact, jacobian, frames, axes, _ = touch
     link_frames(links, s[LINK_Q], frames, axes)
     place = frames[-1, :3], frames[-1, 3:]
@@ -182,7 +181,7 @@ def _touch(s, links, touch, h, out):
 
 @njit(cache=True)
 def _external_forces(p, s, f, line, cycle, begin, end, h):
-    """Write motor torques, friction factors, spring torques and velocities of a step from `begin` to `end` to `f`."""
+    """Set motor torque, friction factor, spring torque and velocities in `f` for a step from `begin` to `end`."""
     for i in range(s.shape[1]):
         target = s[ADDED, i] + _commanded(line, cycle, begin, end, p[DELAY, i], i)
         change = (target - s[MOTOR, i]) * -np.expm1(-h / p[LAG, i])
@@ -195,7 +194,7 @@ def _external_forces(p, s, f, line, cycle, begin, end, h):
 
 @njit(cache=True)
 def _accelerate(p, s, f, bias, root, h, last):
-    """Predict the velocities at the middle of the step; if `last`, take the step with the earlier prediction."""
+    """Predict the velocities at mid-step; if `last`, complete the step with the velocities predicted before."""
     n, q = s.shape[1], s[LINK_Q]
     for i in range(n):
         gear = f[F_SPRING, i] + p[GEAR, i] * (f[F_W, i] - f[F_LINK_V, i])
@@ -218,7 +217,7 @@ def _accelerate(p, s, f, bias, root, h, last):
 
 @njit(cache=True)
 def sense(p, s, noise, dq_filter):
-    """Compute the sensor values from the *_AT rows; noise (3, n) is standard normal."""
+    """Compute the sensor values from the state in the rows *_AT and the standard normal `noise` (3, n)."""
     for i in range(s.shape[1]):
         s[Q_MEASURED, i] = ENCODER * np.round((s[THETA_AT, i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
         s[DQ_MEASURED, i] += dq_filter * (s[W_AT, i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_MEASURED, i])

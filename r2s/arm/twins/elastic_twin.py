@@ -1,13 +1,13 @@
 """The elastic variant of the hidden twin, with effects that the identification's models lack.
 
-It has elastic gears that oscillate; friction with exact rest, another Stribeck curve, warming, and ripple with the
-gears' rotation (elastic_joints.py); a control box that compensates a part of the friction from the measured
-speed; a clock that jitters and occasionally loses a packet; a different delay and lag for each joint. Wrong masses,
-centres and tensors, offsets, cable drag, noise and quantisation are as in the rigid variant. `seed` draws a robot.
-Only this file reads that robot's parameters. Seeds 0-9 are for development; seeds of 200 and above are for judging.
+The gears are elastic and oscillate. Friction holds a resting motor exactly, has another Stribeck curve, decreases
+with heat, and ripples with the gears' rotation (elastic_joints.py). The control box compensates part of the friction,
+has a clock that jitters, and occasionally loses a command. Delay and lag differ between joints. Links, offsets, cable
+drag, noise and quantization are drawn as in the rigid variant. The seed determines the robot's parameters, which only
+this file reads. Seeds 0-9 are for development, seeds of 200 and above for final evaluation.
 
-One cycle of 1 ms: the control box adds its compensations to the command; elastic_joints.py integrates rotors and
-links in steps of at most 0.05 ms; the sensors read the motors up to half a millisecond before the end.
+In each 1 ms cycle the control box adds its compensation to the command, elastic_joints.py integrates rotors and links
+in steps of at most 0.05 ms, and the sensors measure the motors up to 0.5 ms before the end of the cycle.
 """
 
 from typing import Any
@@ -22,25 +22,25 @@ from r2s.physics.newton_euler import WORK, equations, links_of
 from r2s.physics.payload import Payload, with_payload
 from r2s.physics.robot import SIM_DT, Robot
 
-MIN_STEPS = 20  # per cycle: 1 s of open loop is then within 1e-5 rad of the result with finer steps
+MIN_STEPS = 20  # per cycle; finer steps change an open-loop motion of 1 s by less than 1e-5 rad
 MAX_STEPS = 200
-PHASE_STEP = 0.1  # rad, largest phase change in one step of the fastest oscillation (at home)
-SLOTS = 8  # cycles of stored commands
+PHASE_STEP = 0.1  # rad, largest phase change of the fastest oscillation (at home) in one step
+SLOTS = 8  # number of stored commands, one per cycle
 WARM_SPEED = 0.25  # share of dq_max, speed at which heat settles at 1
 STATIC_ROUNDS = 50  # fixed-point iterations that find the posture in which the gears balance gravity
 
 
 class ElasticTwin(TwinBase):
-    """The elastic variant; arguments as in `TwinBase`.
+    """The elastic twin; its arguments are those of `TwinBase`.
 
-    Time, noise and oscillation restart at every `move_to`. The joints' heat remains, so the k-th motion of a twin
-    depends on its earlier motions. A new twin is cold, and `move_to` takes no time.
+    Each `move_to` resets time, noise and oscillation. The joints do not cool in `move_to`, so a motion depends on the
+    twin's earlier motions. A new twin is cold.
 
     Args:
-        stiffness: None: drawn at random, like the other parameters.
+        stiffness: None: gear stiffness drawn at random, like the other parameters.
 
     Raises:
-        UserError: the gears are so stiff, or rotors and links so light, that a cycle needs more than MAX_STEPS.
+        UserError: the gears are so stiff, or rotors and links so light, that a cycle needs more than MAX_STEPS steps.
     """
 
     def __init__(self, robot: Robot, seed: int, **settings: Any):
@@ -67,7 +67,7 @@ class ElasticTwin(TwinBase):
             self._nominal = links_of(robot, *declared)
         self._update_payload()
         self._dq_filter = -np.expm1(-2 * np.pi * rng.uniform(60.0, 120.0) * SIM_DT)
-        self._jitter = rng.uniform(0.2, 0.5)  # cycles, of sensors and of commands
+        self._jitter = rng.uniform(0.2, 0.5)  # cycles, largest jitter of sensors and commands
         self._loss = rng.uniform(5e-4, 3e-3)  # share of the commands that miss their cycle
         self._line = np.zeros((SLOTS, robot.n + 1))
         self._state = np.zeros((ej.STATES, robot.n))
@@ -77,7 +77,7 @@ class ElasticTwin(TwinBase):
         self._links = links_of(self.robot, *with_payload(self.robot, payload, self._unloaded))
 
     def _gravity(self, links: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that holds these links at rest at q (n,) rad."""
+        """Return the torque (n,) Nm that holds `links` at rest at q (n,) rad."""
         equations(links, self.robot.gravity, q, np.zeros(self.robot.n), self._mass, self._bias, self._work)
         return self._bias.copy()
 
@@ -128,10 +128,10 @@ class ElasticTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw all parameters (ROWS, n) except the gears' damping.
+    """Draw the parameters (ROWS, n) of all joints except the damping of the gears.
 
     Args:
-        robot, rng: the arm, and the random stream.
+        robot: the arm. rng: random number generator.
         inertia: (n, n) kg m^2, mass matrix of the true links at home.
         unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
 
@@ -140,7 +140,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, with the other joints free
     p = np.zeros((ej.ROWS, n))
     size = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
-    coulomb = 0.75 * size  # the control box compensates about a quarter of it; viscous friction adds to it
+    coulomb = 0.75 * size  # viscous friction adds to this value; the control box compensates about a quarter
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[ej.C_NEG] = coulomb - asymmetry + model.dof_frictionloss
     p[ej.C_POS] = coulomb + asymmetry + model.dof_frictionloss
@@ -173,7 +173,7 @@ def _critical_damping(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
 
 
 def _steps(p: np.ndarray, inertia: np.ndarray) -> int:
-    """Return the number of steps per cycle that the gears' fastest oscillation needs."""
+    """Return the number of steps per cycle that resolve the fastest oscillation of the gears."""
     mobility = np.linalg.inv(inertia) + np.diag(1 / p[ej.ROTOR])  # of the gears' deflections
     root = np.sqrt(p[ej.STIFF])
     fastest = np.sqrt(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])

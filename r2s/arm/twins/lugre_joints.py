@@ -1,8 +1,8 @@
-"""Compute the rigid twin's LuGre friction, implicitly for the engine's step, and its sensor values (compiled).
+"""Compute the implicit LuGre friction and the sensor values of the rigid twin in an engine step (compiled).
 
-Per joint (Canudas de Wit et al., IEEE TAC 40(3), 1995), with bristle deflection z rad and velocity v:
+Friction f of a joint with velocity v and bristle deflection z, rad (Canudas de Wit et al., IEEE TAC 40(3), 1995):
     dz/dt = v - s0 |v| z / g(v),   f = s0 z + s1(v) dz/dt + s2 v,   s1(v) = s1 exp(-(v / vd)^2)
-    g(v) = c (1 + (b - 1) exp(-(v / vs)^2)) + mu |load|,   c one value per direction
+    g(v) = c (1 + (b - 1) exp(-(v / vs)^2)) + mu |load|,   c has a value per direction
 """
 
 import numpy as np
@@ -23,12 +23,12 @@ Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED,
 Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, joint torque of the contact with a surface
 
 DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, otherwise each reversal would cause a torque pulse
-SWEEPS, CONVERGED = 50, 1e-9  # most Gauss-Seidel sweeps, and the change, rad/s, at which they end
+SWEEPS, CONVERGED = 50, 1e-9  # largest number of Gauss-Seidel sweeps; velocity change, rad/s, that ends them
 
 
 @njit(cache=True)
 def _stribeck(p, z, v, load, i):
-    """Return the friction level g(v), Nm, in the direction of the sign of z."""
+    """Return the friction level g(v), Nm, for the sign of the bristle deflection z."""
     coulomb = p[C_POS, i] if z >= 0 else p[C_NEG, i]
     fade = np.exp(-((v / p[V_STRIBECK, i]) ** 2))
     return coulomb * (1 + (p[BREAK, i] - 1) * fade) + p[MU, i] * abs(load)
@@ -36,14 +36,14 @@ def _stribeck(p, z, v, load, i):
 
 @njit(cache=True)
 def cable_drag(p, q, i):
-    """Return the cable's torque on joint i at q (n,) rad, Nm."""
+    """Return the cable's torque, Nm, on joint i at the joint angles q (n,) rad."""
     own, along, waves, phase = p[DRAG_OWN, i], p[DRAG_NEXT, i], p[DRAG_WAVES, i], p[DRAG_PHASE, i]
     return drag(own, along, waves, phase, q[i], q[(i + 1) % len(q)])
 
 
 @njit(cache=True)
 def rest(p, s, q, compensation, gravity):
-    """Set the state to rest at q (n,) rad; bristles balance compensation + offset + cable drag - gravity, Nm."""
+    """Set the state to rest at q (n,) rad, with friction equal to compensation + offset + cable drag - gravity."""
     s[:] = 0
     for i in range(len(q)):
         s[Q, i] = q[i]
@@ -59,16 +59,16 @@ def rest(p, s, q, compensation, gravity):
 
 @njit(cache=True)
 def drive(p, s, line, cycle, tau, compensation, mass, touch):
-    """Apply a command; return passive torque and implicit damping (n,) for the engine's step.
+    """Apply a command; return passive torque (n,) Nm and implicit damping (n,) Nm s/rad for the engine's step.
 
-    The coupled implicit equation of the step, mass (w - v) / h + bias + f(w) = drive, is solved for the next velocity
-    w by Gauss-Seidel. The equation of one joint is solved exactly: with the bristle's backward Euler step
-    z' = (z + h w) / (1 + k |w|), k = h s0 / g, it is a quadratic with one root of the right sign.
+    Gauss-Seidel iteration solves the coupled implicit equation mass (w - v) / h + bias + f(w) = drive for the next
+    velocity w. Each joint's equation has an exact solution: with the bristle's backward Euler step
+    z' = (z + h w) / (1 + k |w|), k = h s0 / g, it is quadratic in w and has one root of the right sign.
 
     Args:
         p, s: parameters and state. line: (slots, n) Nm, the last commands. cycle: number of this cycle.
         tau, compensation: (n,) Nm, command and gravity compensation. mass: (n, n) kg m^2.
-        touch: contact and Jacobian of r2s/physics/contact.py, and whether the tip may touch the surface.
+        touch: (contact, Jacobian, whether the tip may touch the surface), see r2s/physics/contact.py.
     """
     n, slots, h = len(tau), len(line), SIM_DT
     q, v, w = s[Q], s[V], s[V_GUESS]
@@ -114,7 +114,7 @@ def _solve(p, s, damping, mass):
 
 @njit(cache=True)
 def _solve_touch(p, s, damping, mass, contact, jacobian):
-    """Solve the step with the contact, which adds to mass and drive; store the contact's joint torque in TOUCH."""
+    """Solve the step including the contact force, and store the joint torque of this force in TOUCH."""
     n, h = len(damping), SIM_DT
     added, soft, guess = np.empty(n * (n + 1) // 2), np.empty((n, n)), np.empty(GUESS)
     start_guess(contact, jacobian, s[V], h, guess)
@@ -133,7 +133,7 @@ def _solve_touch(p, s, damping, mass, contact, jacobian):
 
 @njit(cache=True)
 def _sweep(p, s, damping, mass):
-    """Solve each joint's equation once for its next velocity; return the largest change, rad/s."""
+    """Solve each joint's equation once for the joint's next velocity; return the largest velocity change, rad/s."""
     n, h, v, w, change = len(damping), SIM_DT, s[V], s[V_GUESS], 0.0
     for i in range(n):
         free = s[DRIVE, i] + s[TOUCH, i] - s[BIAS, i] + mass[i, i] / h * v[i]
@@ -154,10 +154,10 @@ def _sweep(p, s, damping, mass):
 
 @njit(cache=True)
 def sense(p, s, mass, noise):
-    """Complete the step after the engine's part: update bristles, friction, bias and sensors.
+    """Update bristles, friction, bias torque and sensor values after the engine has taken its step.
 
     Args:
-        p, s: parameters, and the state with Q, V after the step and V_BEFORE before it.
+        p: parameters. s: state, with Q and V after the step and V_BEFORE before the step.
         mass: (n, n) kg m^2. noise: (3, n), standard normal, of q, dq and tau_J.
     """
     n, h, v, before = s.shape[1], SIM_DT, s[V], s[V_BEFORE]

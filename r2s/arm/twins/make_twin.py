@@ -1,4 +1,4 @@
-"""Make a hidden twin of either variant: `arm=twin arm.variant=rigid|elastic`."""
+"""Make a hidden twin, rigid or elastic: `arm=twin arm.variant=rigid|elastic`."""
 
 from typing import Any
 
@@ -24,11 +24,11 @@ def make_twin(
     extra_delay_s: float = 0.0,
     surface: Any = False,
 ) -> TwinBase:
-    """Return a hidden twin. The arguments are the keys of conf/arm/twin.yaml; see `TwinBase`.
+    """Return a hidden twin with the settings of conf/arm/twin.yaml, which `TwinBase` explains.
 
     Args:
-        variant: 'rigid': rigid or quasi-statically elastic gears, LuGre friction, in DART. 'elastic': effects that no
-            model of r2s contains, see r2s/arm/twins/elastic_twin.py.
+        variant: 'rigid': LuGre friction and rigid or quasi-static gears, simulated in DART. 'elastic': effects that
+            no identified model contains, see r2s/arm/twins/elastic_twin.py.
 
     Raises:
         UserError: an unknown variant, or an argument out of its range.

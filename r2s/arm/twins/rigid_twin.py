@@ -1,13 +1,13 @@
-"""The rigid variant of hidden twin: a stand-in for a real arm, with effects that a rigid simulator lacks.
+"""The rigid variant of the hidden twin: it replaces a real arm and has effects that a rigid-body simulator lacks.
 
-It runs in another engine (DART), with another friction family (LuGre: bristles, Stribeck, load and direction
-dependence, breakaway), torque offsets, torque delay and lag, cable drag, sensor noise and quantisation. Its masses,
-centres and tensors are wrong: they differ from the nominal ones that gravity compensation uses. `seed` draws a robot;
-only this file reads that robot's parameters. Seeds 0-9 are for development; seeds of 100 and above are for judging.
+The twin runs in DART, not in the training engine, with LuGre friction (bristles, Stribeck effect, load and direction
+dependence, breakaway), torque offsets, delay and lag, cable drag, sensor noise and quantization. Masses,
+centers and tensors differ from the nominal values that gravity compensation uses. The seed determines the robot's
+parameters, which only this file reads. Seeds 0-9 are for development, seeds of 100 and above for final evaluation.
 
-One cycle: the command passes delay and lag; lugre_joints.py solves the friction of the next step implicitly, together
-with the coupled joint velocities and the contact with a surface; DART takes the step with that friction linearised
-about the solution and that contact force; then the sensors are read.
+In each cycle the command passes delay and lag. lugre_joints.py then solves the next step implicitly for joint
+velocities, friction and contact force. DART takes the step with this contact force and with the friction linearized
+about the solution. Finally the sensors measure the new state.
 """
 
 from typing import Any
@@ -21,18 +21,18 @@ from r2s.engines.dart import DartEngine
 from r2s.physics.payload import Payload, with_payload
 from r2s.physics.robot import SIM_DT, Robot
 
-MASS_EVERY = 4  # cycles between mass matrices for the implicit solution; DART itself always uses the current one
+MASS_EVERY = 4  # cycles between updates of the mass matrix in lugre_joints.py; DART updates its own in every step
 STOP_MARGIN = 0.1  # rad by which the mechanical stops lie beyond the position limits, where the reflexes stop the arm
 
 
 class RigidTwin(TwinBase):
-    """The rigid variant; arguments as in `TwinBase`.
+    """The rigid twin; its arguments are those of `TwinBase`.
 
     Each `move_to` also resets clock and bristles, so an evaluation on a new twin is reproducible.
 
     Args:
-        stiffness: None: rigid gears. Otherwise the gears bend without oscillation, and the encoders, which are on the
-            motors' side, do not measure the bending.
+        stiffness: None: rigid gears. Elastic gears deflect without oscillation, and the encoders, on the motors'
+            side, do not measure this deflection.
     """
 
     def __init__(self, robot: Robot, seed: int, **settings: Any):
@@ -105,11 +105,11 @@ class RigidTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw all parameters (ROWS, n) except delay, lag and speed filter.
+    """Draw the parameters (ROWS, n) of all joints except delay, lag and speed filter.
 
     Args:
-        robot, rng: the arm, and the random stream.
-        inertia: (n,) kg m^2, inertia of each joint at home with the others free.
+        robot: the arm. rng: random number generator.
+        inertia: (n,) kg m^2, inertia of each joint at home with the other joints free.
         unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
 
     """

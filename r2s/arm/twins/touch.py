@@ -1,6 +1,6 @@
-"""Draw a twin's surface from its seed, near the nominal place, and compute the tool's contact with this surface.
+"""Draw a twin's surface from the twin's seed, and compute the tool's contact with this surface.
 
-A box is drawn from the seed as well; each episode places the box anew.
+The surface may be a box on a table, which has a new random place in each episode.
 """
 
 from collections.abc import Mapping
@@ -41,18 +41,18 @@ CAMERA = 33, 1e-3, np.radians(0.5)  # cycles between two images, and noise of a 
 
 @dataclass(frozen=True)
 class BoxSurface:
-    """A box as surface: the frame of its table, and the drawn box at its nominal place."""
+    """A box that serves as surface: the frame of its table, and the drawn box at the nominal place."""
 
     frame: TableFrame
     surface: Surface
 
 
 class Touch:
-    """The contact of a tool's tip with a surface, in arrays for a twin's compiled cycle; the surface may be absent.
+    """The contact of a tool's tip with a surface, stored in arrays for the compiled code of a twin.
 
     Attributes:
-        contact: (COLUMNS,), see r2s/physics/contact_layout.py; jacobian: (ROWS, n); frames: (n, POSE); axes: (n, 3).
-        links: from `links_of`. there: whether there is a surface.
+        contact, jacobian: (COLUMNS,) and (ROWS, n), see contact_layout.py. frames, axes: (n, POSE) and (n, 3).
+        links: nominal links, see `links_of`. there: whether the twin has a surface.
 
     Args:
         robot: the arm. surface: the drawn surface; None: no surface.
@@ -71,14 +71,14 @@ class Touch:
         self._first = self.contact.copy()
 
     def start(self, q: np.ndarray, seed: list[int]) -> float:
-        """Reset the contact, place a box anew, and return the penetration depth, m, of the tip at q (n,) rad.
+        """Reset the contact, draw the place of a box, and return the tip's penetration depth, m, at q (n,) rad.
 
-        `seed` is the episode's seed. Far from the surface, the depth is -inf. The bristle starts undeflected.
+        `seed` is the episode's seed. Far from the surface the depth is -inf. The friction bristle is undeflected.
         """
         self.contact[DEFLECTION:] = self._first[DEFLECTION:]
         if self._table is not None:
             self._camera = np.random.default_rng([*seed, 1])
-            most = np.array([[box.SPREAD, box.SPREAD, np.radians(box.YAW)]])  # U about the nominal place
+            most = np.array([[box.SPREAD, box.SPREAD, np.radians(box.YAW)]])  # uniform about the nominal place
             planar = np.random.default_rng(seed).uniform(-most, most)
             pose = self._table.moved(box_pose(self._first)[None], planar)[0]
             up = self._table.axes[2]
@@ -88,7 +88,7 @@ class Touch:
         return float(self.contact[DEPTH]) if self.near(q, np.zeros_like(q)) else -np.inf
 
     def near(self, q: np.ndarray, dq: np.ndarray) -> bool:
-        """Return whether the tip may touch within a cycle from q, dq (n,); update `jacobian`."""
+        """Return whether the tip may touch the surface in a cycle that begins at q, dq (n,); update `jacobian`."""
         if not self.there:
             return False
         link_frames(self.links, q, self.frames, self.axes)
@@ -107,7 +107,7 @@ class Touch:
         return self._seen
 
     def wrench(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the arm exerts on the surface: joint torque (n,) Nm, and end effector's wrench (6,) N, Nm."""
+        """Return joint torque (n,) Nm and end effector wrench (6,) N, Nm that the arm exerts on the surface."""
         link_frames(self.links, q, self.frames, self.axes)
         last, force = self.frames[-1], -self.contact[FORCE : FORCE + 3]
         R, normal = last[3:].reshape(3, 3), self.contact[NORMAL : NORMAL + 3]
@@ -118,14 +118,14 @@ class Touch:
 
 
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
-    """Draw a twin's surface near its nominal place; in comments, U is the uniform distribution.
+    """Draw a twin's surface near the nominal place that the setting `surface` describes.
 
-    surface: False: none. True: a table below the tip at home. {point: m, normal}: a plane at this place. box: a box
-    of `r2s.physics.box.SIZE` on a table in front of the tip at home; {box: [3 edges m]}: a box of this size, with
-    point and normal at another place.
+    False: no surface. True: a table below the tip at home. {point: m, normal}: a plane at this place. box: a box of
+    the edges `r2s.physics.box.SIZE` on a table in front of the tip at home. {box: [3 edges, m]}: a box of these
+    edges; with point and normal, the box stands at that place.
 
     Raises:
-        UserError: the value is invalid, the robot has no tool, or its tip at home would be inside the surface.
+        UserError: `surface` is invalid, the robot has no tool, or the tip at home would be inside the surface.
     """
     if surface is False or surface is None:
         return None
@@ -134,7 +134,7 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
     if surface == "box" or (isinstance(surface, Mapping) and "box" in surface):
         return _draw_box(robot, {"box": list(box.SIZE)} if surface == "box" else dict(surface), rng)
     point, normal = default_plane(robot) if surface is True else _place(surface)
-    # point: U(-5, 5) mm along the normal; normal: tilted by U(0, 5) degrees; stiffness: log U(2e3, 1e5) N/m
+    # uniform: shift of -5 to 5 mm along the normal, tilt of 0 to 5 degrees; log-uniform: stiffness, 2e3 to 1e5 N/m
     about, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, TILT)
     tip = Tip(robot)(robot.q_home)[0]
     inside = float(robot.tool.radius - normal @ (tip - point))
@@ -155,18 +155,18 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
 
 
 def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) -> BoxSurface:
-    """Draw a box from the ranges of r2s/physics/box.py."""
+    """Draw the mass and the contact parameters of a box from the ranges in r2s/physics/box.py."""
     size = settings.pop("box")
     point, normal = _place(settings) if settings else (None, None)
     edges, frame = check_size("arm.surface.box", size, box.TABLE[1]), table_frame(robot, point, normal)
-    mass, stiffness = (float(np.exp(rng.uniform(*np.log(pair)))) for pair in (box.MASS, box.STIFFNESS))  # log U
+    mass, stiffness = (float(np.exp(rng.uniform(*np.log(pair)))) for pair in (box.MASS, box.STIFFNESS))  # log-uniform
     pairs = {"table": box.TABLE, "friction": box.TIP, "damping": box.DAMPING, "bristle": box.BRISTLE}
     law = {name: float(rng.uniform(*pair)) for name, pair in pairs.items()}
     return BoxSurface(frame, standing_box(frame, np.zeros(3), edges, mass=mass, stiffness=stiffness, **law))
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return point, m, and unit normal of the nominal place from the setting `surface`."""
+    """Return the nominal place that the setting `surface` describes, as a point, m, and a unit normal."""
     if not isinstance(surface, Mapping):
         raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):

@@ -1,7 +1,7 @@
-"""Implement what both variants of hidden twin share: settings, reflexes, payload, surface, extra delay, episodes.
+"""Implement the base of both twin variants: settings, reflexes, payload, surface, extra delay and episodes.
 
-A variant (rigid_twin.py, elastic_twin.py) draws a random robot near the nominal one from its seed, and adds a
-model of drives and friction. Only the variant's code reads the drawn parameters.
+Each variant (rigid_twin.py, elastic_twin.py) draws a random robot near the nominal robot from the seed, and adds a
+model of drives and friction. No code outside the variant reads the drawn parameters.
 """
 
 from collections import deque
@@ -17,34 +17,34 @@ from r2s.physics.robot import SIM_DT, Robot
 
 NOISE_BLOCK = 1000  # cycles of noise drawn at once
 MAX_EXTRA_DELAY_S = 0.02
-STAYS = 2e-3  # rad; a `move_to` that moves no joint farther may leave the tip pressed into the surface
+STAYS = 2e-3  # rad; a `move_to` that moves each joint by less may leave the tip pressed into the surface
 
 
 class TwinBase:
     """An `Arm` (r2s/arm/interface.py) whose parameters are hidden: only its seed is known.
 
-    The same seed, noise stream and calls lead to bit-identical states. `move_to` begins an episode with a separate
-    noise stream: the noise of a twin's k-th episode does not depend on what happened in earlier episodes.
+    The same seed, noise stream and calls produce bit-identical states. Each `move_to` begins an episode with its own
+    random numbers, so the noise of the k-th episode does not depend on earlier episodes.
 
-    A variant implements `_start(q)`, which places the arm, `_advance(tau)`, which runs one cycle under a command,
-    `_attach(payload)`, which changes the payload at once, and `_sensors()`, which returns q, dq and tau_J. It sets
-    `_cycle`, `_tau_J_d`, and `_q` and `_dq`, which the reflexes check. It multiplies its friction by
-    `_friction_scale`, and adds the force of the contact `_touch` to its links, whose angles are `_link_q`.
+    A variant implements `_start(q)`, which places the arm, `_advance(tau)`, which runs one cycle with a command,
+    `_attach(payload)`, which changes the payload at once, and `_sensors()`, which returns q, dq and tau_J. A variant
+    sets `_cycle`, `_tau_J_d`, and the `_q` and `_dq` that the reflexes check. A variant multiplies its friction by
+    `_friction_scale` and applies the contact force of `_touch` to its links, which have the angles `_link_q`.
 
     Attributes:
-        robot, declared_payload: see the arguments.
+        robot, declared_payload: see Args.
 
     Args:
-        robot: the nominal arm. seed: determines the hidden robot, which is drawn near the nominal one.
-        payload: the carried body, see `r2s.physics.payload.payload_of`: kg of a point mass, or a mapping.
-        declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), in the same form;
-            None: no payload.
-        stiffness: Nm/rad, gear stiffness of the strongest joints; for others, in proportion to their torque limits.
-        noise: number of the sensor noise stream; two recordings of one robot need different numbers.
+        robot: the nominal arm. seed: random seed; the hidden robot is drawn near the nominal arm.
+        payload: carried body, a point mass in kg or a mapping, see `r2s.physics.payload.payload_of`.
+        declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), given like
+            `payload`; None: no payload.
+        stiffness: Nm/rad, gear stiffness of the strongest joints; gears of other joints scale with the torque limit.
+        noise: number of the random stream of sensor noise; two recordings of one robot need different numbers.
         friction_scale: factor on the drawn friction, except on its load-dependent part; below 1 for a warm arm.
-        extra_delay_s: s, delay of commands in addition to the variant's own; whole milliseconds.
-        surface: what the robot's tool may touch, drawn from the seed. False: nothing. True: a table below the tip at
-            home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of this one, in the base frame.
+        extra_delay_s: s, delay of commands in addition to the twin's own delay; whole milliseconds.
+        surface: surface that the tool may touch, drawn from the seed. False: no surface. True: a table below the tip
+            at home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of this plane in the base frame.
             box: a box on a table. See `draw_surface`.
 
     Raises:
@@ -87,9 +87,9 @@ class TwinBase:
         self._sent = np.zeros(robot.n)
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad; friction balances the error of the gravity compensation.
+        """Place the arm at rest at q (n,) rad, where friction balances the error of the gravity compensation.
 
-        A tip that already presses on the surface may stay there, but `move_to` places no tip inside the surface.
+        A tip that presses on the surface may stay there. Otherwise the tip must not be inside the surface at q.
         """
         q = np.array(q, dtype=float)
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
@@ -107,7 +107,7 @@ class TwinBase:
         return self.read()
 
     def read(self) -> ArmState:
-        """Return the sensor values of the current cycle; external torque (undeclared payload, contact) is exact."""
+        """Return the state of this cycle; its external torque (undeclared payload, contact) has no sensor error."""
         q, dq, tau_J = self._sensors()
         load = mass_and_moment(self.robot, self._payload if self._carries else None) - self._declared
         external, wrench = self._load_torque(self._q, load), None
@@ -121,7 +121,7 @@ class TwinBase:
         )  # fmt: skip
 
     def command(self, tau: np.ndarray) -> None:
-        """Advance one 1 ms cycle under tau (n,) Nm without gravity; the reflexes raise ArmStopped."""
+        """Run a 1 ms cycle with the command tau (n,) Nm, without gravity; raise ArmStopped after a reflex."""
         if self._stopped is not None:
             raise ArmStopped(f"the arm is stopped: {self._stopped}")
         tau = np.array(tau, dtype=float)
@@ -135,12 +135,12 @@ class TwinBase:
             raise
 
     def stop(self) -> None:
-        """End the motion; `command` is refused until the next `move_to`."""
+        """End the motion; until the next `move_to`, `command` raises ArmStopped."""
         if self._stopped is None:
             self._stopped = "stop was called"
 
     def carry(self, payload: Payload | None) -> None:
-        """Change the payload, now and in all later motions."""
+        """Replace the payload for the present motion and all later motions."""
         self._payload = payload
         self._attach(payload if payload is not None and payload.attached(self._cycle * SIM_DT) else None)
         self._carries = payload is not None and bool(payload.attached(self._cycle * SIM_DT))
@@ -152,11 +152,11 @@ class TwinBase:
 
     @property
     def _last_command(self) -> np.ndarray:
-        """(n,) Nm, the last command sent; without an extra delay, the command that the arm executes."""
+        """(n,) Nm, the command sent last or, without extra delay, the command executed last."""
         return self._sent if self._extra_delay else self._tau_J_d
 
     def _delayed(self, tau: np.ndarray) -> np.ndarray:
-        """Queue a command (n,) Nm and return the one to execute now."""
+        """Queue the command tau (n,) Nm, and return the command that the arm executes after the extra delay."""
         self._pending.append(tau)
         self._sent = tau
         # rate-limited, because a variant may have lost the previous command
@@ -164,7 +164,7 @@ class TwinBase:
         return executed + np.clip(self._pending.popleft() - executed, -step, step)
 
     def _update_payload(self) -> None:
-        """Attach or detach the payload if its time has come."""
+        """Attach or detach the payload at the time that its `on_s` and `off_s` set."""
         payload = self._payload
         if payload is not None and self._carries != (now := bool(payload.attached(self._cycle * SIM_DT))):
             self._attach(payload if now else None)
@@ -184,7 +184,7 @@ class TwinBase:
 
 
 def _delay_cycles(extra_delay_s: float) -> int:
-    """Return the delay in cycles; raise UserError unless it is a whole number within the limit."""
+    """Return the extra delay in cycles; raise UserError unless it is whole ms up to MAX_EXTRA_DELAY_S."""
     check_number("arm.extra_delay_s", extra_delay_s, f"[0, {MAX_EXTRA_DELAY_S}]")
     cycles = round(extra_delay_s / SIM_DT)
     if abs(extra_delay_s / SIM_DT - cycles) > 1e-6:

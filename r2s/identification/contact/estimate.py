@@ -30,12 +30,12 @@ class ContactEstimate:
     """An identified surface.
 
     Attributes:
-        surface: the estimate. Its `point` is the point of the plane that is closest to the mean contact.
+        surface: the estimate; `surface.point` is the mean tip center in contact, projected onto the plane.
         draws: posterior draws {name: (S, ...)} of the values of a `Surface`, its point and normal, and of `slope`,
             the slope of the force at LOAD, N/m.
         identifiable: {name: whether the data determine it}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
-        training, validation: forces predicted for the fitted presses and for other presses; None without others.
+        training: predicted and measured forces of the fitted presses. validation: those of other presses, or None.
     """
 
     surface: Surface
@@ -52,12 +52,12 @@ class ContactEstimate:
 
     @property
     def slope(self) -> float:
-        """Slope of the force at LOAD, N/m; it is the posterior mean, because the exponent is seldom certain."""
+        """Slope of the force curve at LOAD, N/m: its posterior mean, because the exponent is seldom certain."""
         return float(self.draws["slope"].mean())
 
     @property
     def height(self) -> tuple[float, float]:
-        """95 % interval, m, of the plane's position along its normal at `surface.point`, relative to the estimate."""
+        """95 % interval, m, of the plane's position along its normal, relative to the estimate `surface.point`."""
         along = (self.draws["point"] - self.surface.point) @ self.surface.normal
         low, high = np.percentile(along, COVERED)
         return float(low), float(high)

@@ -1,8 +1,8 @@
 """Export an identified surface to other simulators as contact parameters of MuJoCo and SDF, linearized at 10 N.
 
 MuJoCo's contact force is d (aref - a0) / A with impedance d, inverse mass A and the acceleration a0 without contact
-(MuJoCo documentation, Computation: Constraint model). With a small d the contact acts as a spring and damper
-whose N/m and Ns/m are those of solref divided by A. A high `impratio` makes friction stiff despite the small d.
+(MuJoCo documentation, Computation: Constraint model). With a small d the contact acts as a spring and damper with
+coefficients solref / A (N/m, Ns/m). A high `impratio` makes friction stiff despite the small d.
 """
 
 import xml.etree.ElementTree as ET
@@ -27,7 +27,7 @@ IMPRATIO = 1000.0  # makes the impedance of friction 0.91
 def linearized(surface: Surface, load: float = LOAD) -> tuple[float, float, float]:
     """Return slope (N/m), damping (Ns/m) and depth (m) of the spring that is tangent to the force curve at `load` N.
 
-    The spring's force begins at `depth`, so its plane lies this much below the surface.
+    The spring exerts no force above `depth`, so a simulated plane with this spring lies `depth` below the surface.
     """
     depth = float((load / surface.coefficient) ** (1.0 / surface.exponent))
     slope = load * float(surface.exponent) / depth
@@ -35,7 +35,7 @@ def linearized(surface: Surface, load: float = LOAD) -> tuple[float, float, floa
 
 
 def inverse_mass(robot: Robot) -> float:
-    """Return MuJoCo's inverse mass of the last link, 1/kg (`body_invweight0`); a geom of the tool uses it."""
+    """Return MuJoCo's inverse mass of the last link, 1/kg (`body_invweight0`); MuJoCo uses it for the tip."""
     model = robot.model(gravity=False)
     return float(model.body_invweight0[model.jnt_bodyid[-1], 0])
 
@@ -43,7 +43,7 @@ def inverse_mass(robot: Robot) -> float:
 def mujoco_contact(surface: Surface, inverse_mass: float) -> dict[str, Any]:
     """Return MuJoCo's contact parameters for a body of `inverse_mass`, 1/kg, on the plane.
 
-    solref has negative values, (-stiffness, -damping). The other geom must be fixed and have equal parameters.
+    solref is (-stiffness, -damping). The other geom of the contact must be fixed and have equal parameters.
     """
     slope, damping, deeper = linearized(surface)
     share = (1.0 - IMPEDANCE) * inverse_mass
@@ -76,7 +76,7 @@ def write_surface(folder: Path, robot: Robot, surface: Surface) -> None:
     The surface is a plane or a box. In arm.xml, only surface and tip can touch. A missing arm.sdf is skipped.
 
     Args:
-        folder: output of `write_description`. robot: an arm with a tool. surface: the surface of one arm.
+        folder: output of `write_description`. robot: an arm with a tool. surface: the surface, without batch axes.
     """
     site, own_axes = ee_pose(robot)
     tip, radius = site + own_axes @ robot.tool.tip, robot.tool.radius  # type: ignore[union-attr]

@@ -15,9 +15,9 @@ from r2s.identification.search.levenberg_marquardt import minimize
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
-SLOWEST = 0.01  # rad/s, slowest sliding; below it residuals rise, as a joint that seems to slide may stick and slip
-DRIFT = 0.02  # of each joint's friction; sigma of friction's and offset's change since the calibration
-EXACT = 1e-4  # of a joint's friction: lower limit of a row's sigma, even in a noise-free simulation
+SLOWEST = 0.01  # rad/s, slowest sliding; below it residuals rise: a joint that seems to slide may stick and slip
+DRIFT = 0.02  # sigma of the change of friction and offset since the calibration, relative to a joint's friction
+EXACT = 1e-4  # lower limit of a row's sigma, relative to the joint's friction, even in a noise-free simulation
 SEEN = 0.03  # posterior directions with less effect on all rows together, in standard deviations, are dropped
 FTOL = 1e-6  # a search ends when a step lowers the cost by less (relative)
 STEP = 1e-5  # finite-difference step on the unit cube
@@ -30,16 +30,16 @@ FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 class ContactProblem:
     """Least squares over a surface u (8,) and the arm's uncertainty w (r,), whose prior is standard normal.
 
-    Rows are the R windows in which a joint slides in one direction (see `TorqueResidual`), because the friction of a
-    resting joint may have any value between its breakaway torques. Rows are linear in w, so w is eliminated in closed
-    form (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+    Each of the R rows is a window in which a joint slides in one direction (see `TorqueResidual`). Resting joints
+    have no rows, since their friction may have any value between the breakaway torques. The residual is linear in w,
+    so w is eliminated in closed form (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
     Attributes:
         torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
         error: (T, n) Nm, the torque residual at x.
         directions: (T, n, r) Nm, change of the residual per unit of each element of w.
         sigma: (T, n) Nm, standard deviation of an independent row.
-        space: the space of the surfaces.
+        space: the space of the surface vectors u.
     """
 
     torque: TorqueResidual
@@ -52,13 +52,13 @@ class ContactProblem:
 
     @property
     def motion(self) -> SlidingMotion:
-        """The recording's motion in windows of sliding."""
+        """The recording's motion, averaged over windows in which joints slide."""
         assert isinstance(self.torque.motion, SlidingMotion)
         return self.torque.motion
 
     @property
     def rows(self) -> np.ndarray:
-        """(T, n) bool, whether the window of a moment and joint is used as a row."""
+        """(T, n) bool, whether a joint's window at a moment is a row of the residual."""
         return self.torque.seen
 
     @property
@@ -89,7 +89,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return the w (r,) that minimizes the sum of squares for a surface u (8,)."""
+        """Return the arm's errors w (r,) that minimize the sum of squares for a surface u (8,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return rows (C, R + r + 8) of trials u (C, 8) at the best w; a normal prior replaces u's flat prior."""
+        """Return residuals (C, R + r + 8) of surfaces u (C, 8) at their best w; u's flat prior is made normal."""
         return np.stack([np.concatenate([self._projected(self.data(u)), FLAT * (u - 0.5)]) for u in trials])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
@@ -110,21 +110,21 @@ class ContactProblem:
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with weights from the residual at u (8,) and from the correlation of rows."""
+        """Return the problem with rows weighted by the size and correlation of their residual at u (8,)."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
 
     def within(self, kept: np.ndarray) -> "ContactProblem":
-        """Return the problem with only those moments for which `kept` (T,) is true."""
+        """Return the problem restricted to the moments at which `kept` (T,) is true."""
         return replace(self, torque=self.torque.within(kept))
 
     def whole(self, u: np.ndarray) -> np.ndarray:
-        """Return u (8,) and its best w, scaled to the unit cube, as one vector (8 + r,) for `linearize`."""
+        """Return the argument (8 + r,) of `linearize`: u (8,), and the best w for u, scaled to the unit cube."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return residual (R + 8 + r,) and its derivative at a vector `whole` (8 + r,), in a list of one part."""
+        """Return [(residual (R + 8 + r,), its derivative)] at the vector `whole` (8 + r,)."""
         u, w = whole[:8], (whole[8:] - 0.5) * 2 * REACH
         prior = np.concatenate([np.full(8, FLAT), np.full(len(w), 2 * REACH)])
         r = np.concatenate([self.data(u) + self.arm @ w, prior * (whole - 0.5)])
@@ -134,11 +134,11 @@ class ContactProblem:
 def contact_problem(
     space: ParameterSpace, x: np.ndarray, samples: np.ndarray | None, recording: Recording, surfaces: SurfaceSpace
 ) -> ContactProblem:
-    """Return the problem of a recording with contact.
+    """Return the least-squares problem for a recording with contact.
 
     Args:
-        space, x: the arm's parameter space, with a tool, and values (P,).
-        samples: (S, P), draws of their posterior; None: only DRIFT makes the arm uncertain.
+        space: parameter space of an arm with a tool. x: (P,) its values.
+        samples: (S, P), posterior draws of x; None: the arm's uncertainty consists only of DRIFT.
         recording: recording with commanded torque. surfaces: the space of the unknown surface.
     """
     torque = TorqueResidual(space, recording, slowest=SLOWEST)

@@ -25,7 +25,7 @@ def first_guesses(
     """Return the space of surfaces about a first plane, and start vectors u (8,) in it.
 
     Args:
-        space, x: the arm's parameter space, with a tool, and values (P,). recording: recording with commanded torque.
+        space: parameter space of an arm with a tool. x: (P,) values. recording: recording with commanded torque.
 
     Raises:
         UserError: the recording shows no contact.
@@ -54,7 +54,7 @@ def first_guesses(
 def _starts(
     surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield starts u for each normal (3,) and two exponents, with the stiffness of a line fit of height to force."""
+    """Yield a start vector u per normal (3,) and exponent; a line fitted to height over force sets its stiffness."""
     for normal in normals:
         height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
         slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0
@@ -67,7 +67,7 @@ def _starts(
 
 
 def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return tip centre (T, 3) m, force on the tip (T, 3) N, and whether the force is certain (T,), at T moments.
+    """Return tip center (T, 3) m, force on the tip (T, 3) N, and whether the force is certain (T,), at T moments.
 
     The force is a least-squares fit over the joints, below 10 Hz; a resting joint's friction is treated as unknown.
     """

@@ -29,8 +29,8 @@ WIDTH = UPPER - LOWER
 class SurfaceSpace:
     """The space of surfaces near a plane through `origin` (3,) m with unit normal `normal` (3,).
 
-    A vector u tilts the plane about two axes through the origin, and then shifts it along its normal so that the
-    force LOAD presses the tip to the height in u.
+    A vector u contains two tilts of the plane about axes through `origin`, the tip's height along the normal under
+    the force LOAD, and five values of the force law.
     """
 
     origin: np.ndarray
@@ -64,10 +64,10 @@ class SurfaceSpace:
         return Surface(point, normal, K * UNIT_DEPTH ** (rest[0] - 1.0), *rest)
 
     def tilt_of(self, normal: np.ndarray) -> np.ndarray:
-        """Return the change (2,) of u[:2] that tilts the plane to another normal (3,)."""
+        """Return by how much (2,) u[:2] must change to tilt the first plane to the normal (3,)."""
         return self.axes @ (normal / (normal @ self.normal)) / WIDTH[:2]
 
     def unit(self, height: float, slope: float, exponent: float, friction: float) -> np.ndarray:
-        """Return u (8,) of an untilted plane that has the tip at `height` m and the slope `slope` N/m under LOAD."""
+        """Return u (8,) of an untilted plane whose tip height is `height` m and slope `slope` N/m under LOAD."""
         p = np.array([0.0, 0.0, height, np.log(slope), exponent, 0.0, friction, np.log(2e-4)])
         return np.clip((p - LOWER) / WIDTH, 0.0, 1.0)

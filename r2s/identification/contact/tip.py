@@ -15,13 +15,13 @@ from r2s.physics.surface import Surface, normal_force
 
 @dataclass(frozen=True)
 class TipMotion:
-    """A spherical tip at F instants of an arm with n joints.
+    """Motion of a tool's spherical tip at F instants, on an arm with n joints.
 
     Attributes:
-        step: s, time between instants. starts: (F,) bool, whether a stretch starts at the instant.
-        centre: (F, 3) m, centre of the tip. radius: m.
+        step: s, time between instants. starts: (F,) bool, whether a continuous motion starts at the instant.
+        centre: (F, 3) m, center of the tip. radius: m.
         axes, origins: (F, n, 3), joint axes and their origins in the base frame. dq: (F, n) rad/s.
-        play: m, tip motion that may be encoder noise only; it bends bristles elastically.
+        play: m, tip path that encoder noise alone may cause; a path up to `play` only bends bristles elastically.
     """
 
     step: float
@@ -82,8 +82,8 @@ def _contact(motion, settings, point, normal, law, tau, out):
     """Write joint torque into tau (F, n), and normal force, penetration depth and its rate into out (3, F).
 
     Friction is mu F z, where z is the deflection of the bristles (Dahl 1968 in two dimensions): dz = (dx - |dx| z) /
-    bristle along the path x of the deepest point over the surface. Noise would lengthen the path of a resting tip and
-    so relax z. Hence a path shorter than `play` only bends bristles elastically.
+    bristle along the path x of the deepest point over the surface. Encoder noise would lengthen the path of a resting
+    tip and let bristles relax. Therefore they only bend elastically along a path shorter than `play`.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play = settings

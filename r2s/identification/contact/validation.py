@@ -1,4 +1,4 @@
-"""Compare the normal force that an identified surface predicts for presses with that from joint torques."""
+"""Compare the normal force that an identified surface predicts for presses with the force from joint torques."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from r2s.identification.contact.problem import ContactProblem
 
 PAUSE_S = 1.0  # s without contact that separates two presses; a slide may lose contact for a moment
 GUARD_S = 0.2  # s added before and after a press, longer than a window
-KNOWN = 0.05  # largest standard error of a force from torques, of the largest force (1 N of a Panda's 20 N)
+KNOWN = 0.05  # largest standard error of a force from torques, relative to the largest force (1 N of a Panda's 20 N)
 
 
 @dataclass(frozen=True)
 class Press:
-    """Normal force predicted by the surface and measured by joint torques, at M moments when joints slide.
+    """Normal force at M moments when joints slide: predicted by the surface, and estimated from joint torques.
 
     Attributes:
-        t: (M,) s. force: (M,) N, predicted by the surface. seen: (M,) N, measured by joint torques.
+        t: (M,) s. force: (M,) N, predicted normal force. seen: (M,) N, normal force estimated from joint torques.
         depth, rate: (M,) m, m/s, penetration depth and its rate.
         error: (M,) N, standard error of `seen`. row_s: s, time between moments.
     """
@@ -55,8 +55,8 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
     """Return the forces predicted by a surface u (8,) and those from joint torques, at the moments in `parts`.
 
-    The force from torques is the predicted force times a factor, which weighted least squares fits to the torques of
-    the sliding joints. So its direction is the predicted one.
+    Joint torques determine only the size of the force; its direction is the predicted one. Weighted least squares
+    fits a factor on the predicted force to the torques of the sliding joints.
     """
     motion = problem.motion
     tau, force, depth, rate = problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))

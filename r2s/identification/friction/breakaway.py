@@ -1,21 +1,21 @@
 """Estimate the breakaway torque of each joint from recorded ramps (the paper's Table II).
 
-A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). By then the joint has
-accelerated for 10 to 150 ms while the command kept rising. A real joint also creeps before its release: its bristles
-bend by millirads, ever faster. Neither a threshold nor a parabola through the first motion separates creep from
-release. So r2s fits a motion with creep and release to the positions; the release command U is one parameter:
+A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). At the end of a ramp, the
+joint has accelerated for 10 to 150 ms and the command has risen further. A real joint also creeps before its release:
+its bristles bend by millirads, ever faster. Neither a threshold nor a parabola can separate creep from release. So
+r2s fits the motion x of a joint that creeps, and slides once its command u exceeds U:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
-u is the command at the joint in the ramp's direction, and kappa is the inverse inertia. Up to U, stiction balances u
-while its bristles stretch over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976).
-After release, friction is less than U (in eq. 6 of the paper it is 0, and z = 0): `jump` is the difference, as an
-acceleration. This free fit needs no model of the arm.
+u is the command at the joint in the ramp's direction, and kappa is the inverse inertia. Below the command U, stiction
+balances u, and bristles bend over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976).
+At release, friction falls from U to a lower value (0 in eq. 6 of the paper, which has z = 0); `jump` is this fall
+times kappa. A fit of all these values, the free fit, needs no model of the arm.
 
-If friction falls over a range of velocities (Stribeck), motion begins slowly, and a fit with a sudden `jump` puts the
-release too late: by 4 to 22 mNm on an arm of known truth. `Slide`, the sliding motion of an identified arm, has
-jump (1 - exp(-(v / fall)^2)) instead, with U as the main unknown; on that arm U was then within 0.2 mNm. r2s uses
-this second fit if it explains the motion as well as the free fit.
+If friction falls over a range of velocities (Stribeck), motion begins slowly, and the free fit with its sudden `jump`
+overestimates U, by 4 to 22 mNm on an arm with known U. A second fit has jump (1 - exp(-(v / fall)^2)) instead, with
+the parameters `Slide` of an identified arm; its error of U was below 0.2 mNm on the same arm. r2s uses the second fit
+if it explains the motion as well as the free fit.
 """
 
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ SIDES = "negative", "positive"
 KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
 WORSE = 1.01  # ratio of misfits, above which an identified slide describes a ramp worse than the free fit
 BACK = 0.0, 0.03, 0.1  # starts of U below the last command, as shares of the ramp
-DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, as the motion may be too short to determine it
+DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, which a short motion does not determine
 STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # free fits start at: creep length, rad; share of guessed slide time
 
 
@@ -52,14 +52,14 @@ class Breakaway:
 
     Attributes:
         command: (n, 2) Nm, mean command at release in negative and positive direction; NaN without a release. The
-            breakaway torque is `command` plus offset; ramps determine the dead zone's width, but not its centre.
+            breakaway torque is `command` plus the joint's offset, which ramps do not determine.
         spread: (n, 2) Nm, standard deviation over ramps; NaN for fewer than two ramps.
         count: (n, 2), number of ramps with a release. ramped: (n, 2), number of all ramps.
         held: (n, 2) Nm, the largest command without motion if no ramp released the joint; 0 otherwise.
         resolution: (n, 2) Nm, accuracy of the fit to one ramp: `RELEASE_S` times the ramp's rate.
         value: (K,) Nm, release command of each ramp; NaN without a release.
-        misfit: (K,) rad RMS between positions and fit. A value well above the encoder noise (or 5e-5 for real
-            stick-slip) indicates another kind of motion.
+        misfit: (K,) rad, RMS difference between positions and fit. If the misfit is well above the encoder noise (or
+            5e-5 rad for real stick-slip), the joint did not move as the fit assumes.
         joint, sign, pose: (K,), see `Ramps`.
     """
 
@@ -88,14 +88,14 @@ class Breakaway:
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """Motion after release in K ramps, in each ramp's direction, as parameters that an identified arm supplies.
+    """Parameters of the motion after release in K ramps, in each ramp's direction, from an identified arm.
 
     Attributes:
         kappa: (K,) rad/s^2 per Nm, inverse inertia of the joint while the other joints rest.
         level: (K,) Nm, command that sustains slow sliding above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad, viscous friction.
         fall: (K,) rad/s, velocity over which friction falls from breakaway to `level`, as exp(-(v / fall)^2).
-        misfit: (K,) rad RMS of the previous fit to each ramp (`Breakaway.misfit`), for comparison.
+        misfit: (K,) rad, RMS misfit of an earlier fit to each ramp (`Breakaway.misfit`), for comparison.
     """
 
     kappa: np.ndarray
@@ -113,10 +113,10 @@ def estimate_breakaway(
     The command is NaN if the joint does not move by MOVED in the ramp's direction, or moves before the command rises.
 
     Args:
-        ramps: commands that rise (fall for sign -1) from rest, at any rate. The error is the rate times 0.5 to 3 ms
-            for an encoder noise of 2e-5 rad; it is largest for the largest inertia.
-        delay, lag: s, latency of the command in addition to its hold; each shifts the result.
-        slide: sliding after release, from an identified arm; None: only the free fit.
+        ramps: commands that rise (fall for sign -1) from rest, at any rate. With an encoder noise of 2e-5 rad, the
+            estimate's error is the rate times 0.5 to 3 ms, the most for the largest inertia.
+        delay, lag: s, latency of the command in addition to its hold; the estimate accounts for both.
+        slide: parameters of the motion after release; None: only the free fit is made.
 
     Raises:
         UserError: delay or lag out of range.
@@ -251,7 +251,7 @@ def _parts(x: np.ndarray) -> tuple[int, slice]:
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Return x (T,) of the motion in this module's docstring; u is linear between samples; fall = 0: sudden jump.
+    """Return positions x (T,) of the motion that the module's docstring defines; fall = 0: sudden jump.
 
     Steps are implicit in velocity, so that integration is stable even for creep lengths far below the encoder noise.
     """

@@ -1,7 +1,7 @@
 """Estimate the presliding distance, over which the bristles of friction with memory bend after a reversal.
 
-Torque rows begin where bristles are already bent, so they contain no information on bending. Replays of short windows
-show it at every reversal. So replays determine the presliding distance, and the torque fit all other parameters.
+Torque rows exclude moments at which bristles bend. Replays of short windows include these moments, at reversals, so
+replays determine the presliding distance. The torque fit determines all other parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
-WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, as friction reverses within about 50 ms
+WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, because friction reverses within about 50 ms
 ROUNDS, STEPS, FTOL = 2, 4, 1e-3  # reweighted fits; per fit, most steps and least relative gain
 MIN_SIGMA = 1e-3  # lower limit of the logarithm's standard deviation
 
@@ -57,7 +57,7 @@ def estimate_presliding(
 
 
 class Presliding:
-    """Deviation of log presliding from the result of `estimate_presliding`, as a residual in standard deviations."""
+    """Residual of the log presliding distance about the result of `estimate_presliding`, in standard deviations."""
 
     def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
         self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)

@@ -1,10 +1,10 @@
 """Compute the standard error of breakaway commands from repeated ramps.
 
 Friction scatters from ramp to ramp, with posture, load and cable. Two ramps per joint and direction hardly determine
-a variance (for Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors). So each variance
-is averaged with that of joints of the same size, which has the weight of `PRIOR_REPEATS` repeats (Smyth, Stat. Appl.
-Genet. Mol. Biol. 3(1), 2004). The weight is small, because even joints of the same size differ in scatter, on twins
-by factors of 3 and more. If no ramp was repeated, r2s assumes the scatter `REPEATS`.
+a variance, because a 95 % interval by Student's t with one degree of freedom is +-12.7 standard errors. So r2s
+averages a joint's variance with the variance among joints of the same size, weighted like `PRIOR_REPEATS` repeats
+(Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). This weight is small, because joints of the same size may differ in
+scatter, on twins by factors of 3 and more. If no ramp was repeated, r2s assumes the scatter `REPEATS`.
 """
 
 from typing import NamedTuple
@@ -14,20 +14,20 @@ import numpy as np
 from r2s.identification.friction.breakaway import Breakaway
 
 PRIOR_REPEATS = 2.0  # weight of the scatter of joints of the same size, in repeats
-REPEATS = 1e-3  # of tau_max, standard deviation between repeated ramps; 0.8e-3 to 1e-3 on twins
+REPEATS = 1e-3  # standard deviation between repeated ramps, relative to tau_max; 0.8e-3 to 1e-3 on twins
 
 
 class Certainty(NamedTuple):
-    """Standard error `sigma` (n, 2) Nm of mean commands (NaN without a release), and Student's degrees of freedom."""
+    """Standard error `sigma` (n, 2) Nm of mean release commands (NaN without a release), and degrees of freedom."""
 
     sigma: np.ndarray
     freedom: np.ndarray
 
 
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
-    """Return the certainty of the mean commands; joints with equal torque limit tau_max (n,) Nm share a scatter.
+    """Return the certainty of the mean commands; joints with equal torque limit tau_max (n,) Nm are of one size.
 
-    If no joint with this limit has a repeat, the scatter of all other joints is used, in proportion to tau_max.
+    If no joint of one size has repeated ramps, the scatter of all other joints is used, in proportion to tau_max.
     """
     more = np.maximum(found.count - 1, 0)
     square = np.nan_to_num(found.spread, nan=0.0) ** 2 / tau_max[:, None] ** 2

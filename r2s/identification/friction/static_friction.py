@@ -1,4 +1,4 @@
-"""Friction at the onset of sliding, from breakaway ramps, as extra residual rows of a fit."""
+"""Residual rows that fit friction at the onset of sliding to breakaway ramps."""
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from r2s.recordings.ramps import Ramps
 
 # relative standard deviation between breakaway command and friction at standstill, due to creep and onset
 SIGMA = 0.03
-LEAST = 1e-3  # of tau_max; for smaller commands the standard deviation does not shrink further
+LEAST = 1e-3  # relative to tau_max; all smaller commands have the same standard deviation
 
 
 class StaticFriction:
-    """Residual of K ramps with a release: friction at the onset against the net torque at release.
+    """Residual of K ramps with a release: net torque at release minus the model's friction at the onset of sliding.
 
     Stribeck friction rises towards standstill, where recordings of motion contain little information.
     """
@@ -43,7 +43,7 @@ class StaticFriction:
         return self.command + pull - left
 
     def slide(self, d: Dynamics) -> Slide:
-        """Return the sliding after each ramp's release (NaN without one), for a family with a Stribeck rise."""
+        """Return the motion after each ramp's release (NaN without a release), for a family with Stribeck effect."""
         phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
         sign = np.where(self.side, 1.0, -1.0)
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
@@ -56,14 +56,14 @@ class StaticFriction:
         return Slide(kappa, level, viscous, fall, self._misfit)
 
     def breakaway(self, d: Dynamics) -> np.ndarray:
-        """Return breakaway torques (n, 2) Nm: the mean net torque at release, or without a ramp the value in d."""
+        """Return breakaway torques (n, 2) Nm: the mean net torques at release, or without a ramp the values of d."""
         net, out = self.net_torque(d), d.breakaway.copy()
         for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
             out[j, side] = net[(self.joint == j) & (self.side == side)].mean()
         return np.stack([np.minimum(out[:, 0], 0.0), np.maximum(out[:, 1], 0.0)], -1)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return net torque minus friction at the onset (C, K), in standard deviations, for candidates x (C, P)."""
+        """Return the residual (C, K), in standard deviations, of candidates x (C, P)."""
         d = space.dynamics(x)
         sign, still = np.where(self.side, 1.0, -1.0), np.zeros(d.phi.shape[:-1])
         sides = np.stack([d.friction(still, still - 1.0), d.friction(still, still + 1.0)], -1)

@@ -1,6 +1,6 @@
 """Choose the stiction model of joints at rest and, if no ramps were recorded, the breakaway torques.
 
-r2s scans over both, because the replay error has no useful gradient with respect to them.
+r2s scans over models and torques, because the replay error has no useful gradient with respect to either.
 """
 
 from dataclasses import replace
@@ -18,8 +18,8 @@ from r2s.recordings.recording import Recording
 
 HORIZON, WINDOWS = 0.5, 60  # length (s, enough for stops) and number of the replays that choose a model
 SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # in `scan_breakaway`: windows, passes, and how many passes are coarse
-LEAST = 5e-4  # of tau_max, least friction to which the scan range is proportional
-POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points of a coarse pass; per side of a fine one; its step's shrinkage
+LEAST = 5e-4  # least friction to which the scan range is proportional, relative to tau_max
+POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points in a coarse pass; per side in a fine pass; divisor of its step
 
 
 def choose_stiction(
@@ -35,8 +35,8 @@ def choose_stiction(
 ) -> dict[str, np.ndarray | float]:
     """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm} that replay stops best.
 
-    largest: upper limit of the scan for breakaway torques, relative to the identified friction; None: no scan,
-    because they come from ramps. If no trajectory is as long as a window, the present model is returned.
+    largest: upper limit of scanned breakaway torques, relative to the identified friction; None: ramps determine
+    them, without a scan. If no trajectory is as long as a window, the values of `dynamics` are returned.
     """
     windows = windows_or_none(recording, HORIZON, WINDOWS)
     scanned = largest is None or windows_or_none(recording, window_s, 1) is not None
@@ -70,11 +70,11 @@ def scan_breakaway(
     nthread: int,
     report: Report,
 ) -> np.ndarray:
-    """Return the breakaway torques (n, 2) Nm that replay the recording best; other values are those of `dynamics`.
+    """Return the breakaway torques (n, 2) Nm with which `dynamics` replays the recording best.
 
-    A scan is needed, as the error jumps when a joint is released one step sooner. Each pass varies one torque at a
-    time and minimizes the error of its joint: in coarse passes over [0, largest], (n,) Nm, then about the best value
-    with ever finer steps. Two passes are coarse, because wrong torques of other joints disturb the first pass.
+    A gradient search would fail: the error jumps when a joint is released one step sooner. Each pass varies one
+    torque at a time and minimizes its joint's error. Coarse passes scan [0, largest], (n,) Nm; fine passes scan about
+    the best value. Two passes are coarse, because other joints' torques are still wrong in the first pass.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

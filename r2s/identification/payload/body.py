@@ -1,4 +1,4 @@
-"""Coordinates of a rigid body, with a prior for bodies that arms carry; any positive mass is a possible body."""
+"""Coordinates of a rigid body with positive mass, all physically possible, and a prior for bodies that arms carry."""
 
 from dataclasses import dataclass
 
@@ -8,23 +8,23 @@ from r2s.physics.payload import WATER
 from r2s.physics.rigid_body import LinkInertia
 
 NAMES = ("mass", "x", "y", "z", "d1", "d2", "d3", "s12", "s13", "s23")
-# standard deviations of the prior: of the logarithm of a body's size along an axis, relative to a ball of water of
-# the same mass (a steel block is half as large, an empty box of 2 kg three times as large); of its shear
+# prior standard deviations: SIZE, of the logarithm of a body's size along an axis, relative to a ball of water of the
+# same mass (a steel block is half as large, an empty box of 2 kg three times as large); SHEAR, of its shear
 SIZE, SHEAR = 0.7, 0.5
 HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: mass over rated mass; distance and shape over their prior sigma
-STEP = 1e-6  # finite-difference step, of the width of the bounds
+STEP = 1e-6  # finite-difference step, relative to the width of the bounds
 
 
 @dataclass(frozen=True)
 class BodySpace:
-    """Coordinates z (10,) of a body in the end effector's frame: mass, centre of mass, shape of the second moment.
+    """Coordinates z (10,) of a body in the end effector's frame: mass, center of mass, shape of the second moment.
 
-    The second moment about the centre is mass gyration^2 V V^T, V = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]]
-    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). So every z with positive mass is physically possible.
+    The second moment about the center is mass gyration^2 V V^T, V = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]]
+    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). So every z with positive mass is a possible body.
 
     Attributes:
-        heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the centre's coordinates.
-        gyration: m, size parameter: that of a ball of water with about the body's mass.
+        heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the center's coordinates.
+        gyration: m, radius / sqrt(5) of a ball of water with about the body's mass.
     """
 
     heaviest: float
@@ -44,12 +44,12 @@ class BodySpace:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(10,), (10,) lowest and highest coordinates."""
+        """Lowest and highest coordinates, each (10,)."""
         reach = np.array([0.0, *[FARTHEST * self.far] * 3, *[WIDEST * SIZE] * 3, *[WIDEST * SHEAR] * 3])
         return -reach, reach + HEAVIEST * self.heaviest * np.eye(10)[0]
 
     def body(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mass (...) kg, centre (..., 3) m and tensor about the centre (..., 3, 3) kg m^2 for z (..., 10)."""
+        """Return mass (...) kg, center (..., 3) m and tensor about the center (..., 3, 3) kg m^2 for z (..., 10)."""
         v = np.zeros((*z.shape[:-1], 3, 3))
         for i in range(3):
             v[..., i, i] = np.exp(z[..., 4 + i])

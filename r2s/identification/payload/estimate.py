@@ -1,4 +1,4 @@
-"""Identify the payload of a loaded arm: mass, centre of mass and inertia tensor, with intervals."""
+"""Identify the payload of a loaded arm: mass, center of mass and inertia tensor, with intervals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from r2s.physics.rigid_body import tensor_elements
 from r2s.recordings.recording import Recording
 
 ROUNDS = 5  # number of fits, each with weights from the residual of the previous one
-LEAST_SHARE = 0.02  # of the rated mass: least mass of the prior's ball of water
+LEAST_SHARE = 0.02  # least mass of the prior's ball of water, relative to the rated mass
 COVERED = 2.5, 97.5  # %, percentiles of a 95 % interval
 ELEMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
@@ -27,7 +27,7 @@ class PayloadEstimate:
     """An identified payload, in the end effector's frame.
 
     Attributes:
-        mass: kg. centre: (3,) m. tensor: (3, 3) kg m^2 about the centre, physically consistent.
+        mass: kg. centre: (3,) m. tensor: (3, 3) kg m^2 about the center, physically consistent.
         draws: posterior draws {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)}; inertia in the order of ELEMENTS.
         identifiable: {name: bool, or one bool per element}, whether the recording determines the value.
         t: (T,) s. measured: (T, n) Nm, filtered recorded torque. without, predicted: (T, n) Nm, torque of the
@@ -51,12 +51,12 @@ class PayloadEstimate:
         return {"mass": np.array(self.mass), "centre": self.centre, "inertia": tensor_elements(self.tensor)}
 
     def interval(self, name: str) -> np.ndarray:
-        """Return (2, ...), the 95 % interval of mass, centre or inertia."""
+        """Return (2, ...), the 95 % interval of mass, center or inertia."""
         return np.percentile(self.draws[name], COVERED, axis=0)
 
     @property
     def payload(self) -> Payload:
-        """The payload as an object that a simulated arm can carry."""
+        """The payload as the `Payload` of a simulated arm."""
         return Payload(np.array(self.mass), self.centre, self.tensor)
 
     def rmse(self, predicted: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ class PayloadEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _Linearized:
-    """A payload problem linearized at its fit, for `posterior`; its u contains body z and arm uncertainty w."""
+    """Payload problem linearized at its fit, for `posterior`. u: body z and arm errors w, on the unit cube."""
 
     rows: Rows
     space: BodySpace
@@ -110,7 +110,7 @@ def identify_payload(
     Args:
         arm: the arm identified without payload, from the same kind of torque; its uncertainty widens the intervals.
         recording: motion of the arm with the payload.
-        declared: payload that gravity compensation assumed (commanded torque).
+        declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: seed of the posterior's draws.
         report: function that is called with the share of finished work and the name of the next task.
 

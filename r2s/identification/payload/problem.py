@@ -35,11 +35,11 @@ class LoadedSpace(ParameterSpace):
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Residual rows of a loaded recording, in standard deviations: error + body phi + arm w.
+    """Residual of a loaded recording, in standard deviations: error + body @ phi + arm @ w.
 
     Attributes:
-        error: (R,), rows without payload. body: (R, 10), slope for the payload's standard parameters phi about the
-            end effector. arm: (R, r), slope for standard normal w, the arm's uncertainty. clusters: (R,), blocks.
+        error: (R,), residual without payload. body: (R, 10), slope for the payload's standard parameters phi about
+            the end effector. arm: (R, r), slope for the arm's errors w ~ N(0, I). clusters: (R,), block of each row.
     """
 
     error: np.ndarray
@@ -49,14 +49,14 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10) and constant (r,); the w that fits a payload phi best is gain @ phi + constant."""
+        """Gain (r, 10) and constant (r,): for a payload phi, the best w is gain @ phi + constant."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,); sum((slope @ phi + constant)^2) is the cost at best w, up to a number."""
+        """Slope (K, 10) and constant (K,): at best w, the cost is sum((slope @ phi + constant)^2) plus a number."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -77,7 +77,7 @@ class LoadedTorque:
 
     Args:
         arm: the arm identified without payload. recording: loaded recording of the same kind of torque.
-        declared: payload that gravity compensation assumed (commanded torque).
+        declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque.
     """
 
@@ -97,15 +97,15 @@ class LoadedTorque:
         self._sign = m.filtered(sliding_sign(self.torque))
 
     def with_payload(self, payload: Payload | None, unexplained: np.ndarray | float = 0.0) -> TorqueResidual:
-        """Return the residual of the arm with a payload, reweighted by the residual's error.
+        """Return the residual of the arm with a payload, with weights from this residual itself.
 
-        unexplained: (T, n) Nm, torque that the arm's uncertainty explains; it is subtracted from this error.
+        unexplained: (T, n) Nm, torque due to the arm's errors, which is subtracted from the residual.
         """
         own = self.torque.on(replace(self._space, payload=payload)).with_external(self._declared + unexplained)
         return own.reweighted(self.arm.x, fitted=True)
 
     def body_torque(self, torque: TorqueResidual, payload: Payload | None) -> np.ndarray:
-        """Return torque (T, n, 10) Nm per standard parameter of a body at the end effector, added to `payload`."""
+        """Return torque (T, n, 10) Nm per unit of each standard parameter of a body that is added to `payload`."""
         d, robot = self.arm.space.dynamics(self.arm.x), self.arm.robot
         d = dynamics_with_payload(robot, d, payload)
         # ten bodies of 1 kg whose standard parameters are linearly independent
@@ -128,7 +128,7 @@ class LoadedTorque:
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Return the rows, linearized and weighted at a payload (standard parameters phi (10,)) and at arm w (r,)."""
+        """Return the rows linearized at `payload` with parameters phi (10,); arm errors w (r,) affect the weights."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

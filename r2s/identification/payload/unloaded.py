@@ -16,10 +16,10 @@ def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff
     """Return the recording with the payload's torque subtracted from tau.
 
     Rigid-body torque is linear in the inertial parameters of a payload. Measured and motor torque contain the weight
-    of the payload. Commands do not: gravity compensation, to which the payload was declared, carries the weight.
+    of the payload. Commands do not contain a declared payload's weight, because gravity compensation carries it.
 
     Args:
-        payload: see `payload_of`. cutoff_hz: cutoff of the identification; accelerations here have a higher one.
+        payload: see `payload_of`. cutoff_hz: cutoff of the identification; accelerations have a higher cutoff.
     """
     grid = recording.resample(SIM_DT)
     smooth = grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 * recording.rate_hz))

@@ -1,9 +1,9 @@
 """Average a recording, with weights, over short windows in which a joint slides in one direction.
 
-Friction at standstill and at a reversal is not a function of velocity, and a low-pass spreads such moments over a
-tenth of a second. So each row of a joint is a weighted mean over a window that ends before the joint stops or
-reverses (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command get the same
-weights. Close reversals make windows shorter and rows noisier; r2s computes this noise from the encoder noise.
+When a joint rests or reverses, its friction is not a function of velocity, and a low-pass spreads this friction over
+a tenth of a second. So each row is a weighted mean over a window in which the joint neither rests nor reverses
+(modulating functions: Shinbrot, Trans. ASME 79, 1957). The same weights average rigid-body torque, friction and
+command. Windows between close reversals are short and make rows noisier; r2s computes the noise of a row.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,14 +34,14 @@ LAG_POINTS, LAG_WEIGHTS = np.polynomial.laguerre.laggauss(16)  # quadrature of a
 
 @dataclass(frozen=True)
 class SlidingMotion:
-    """A recording sampled at F instants, and windows centred at T moments.
+    """A recording sampled at F instants, and windows centered at T moments.
 
     Attributes:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2. bristle: (F, n), the presliding state.
         means: for each piece of the recording, n sparse matrices (moments, instants) of the piece: the window weights
             of each joint; rows without a window are empty.
-        seen: (T, n) bool, whether the moment has a window in which the joint slides in one direction.
-        noise: (T, n) 1/s^2, standard deviation of the mean acceleration per rad of white encoder noise.
+        seen: (T, n) bool, whether a joint slides in one direction throughout a window about the moment.
+        noise: (T, n) 1/s^2, standard deviation of a window's mean acceleration for white encoder noise of 1 rad.
         encoder: (n,) rad, standard deviation of the encoder noise.
         delayed: (T, L, n) Nm, window means of the command with L delays: -1 ms, 0, 1 ms, ...
         instants: (F,) s. starts: (F,) bool, whether a trajectory starts at the instant.
@@ -68,11 +68,11 @@ class SlidingMotion:
         slid: float = 0.0,
         presliding_rad: np.ndarray | float = PRESLIDING,
     ) -> "SlidingMotion":
-        """Find windows, centred every 1 / `rate_hz` s, in which a joint is faster than `slowest` rad/s.
+        """Find windows, centered every 1 / `rate_hz` s, in which a joint is faster than `slowest` rad/s.
 
-        For a friction law with memory (`slid` > 0), a window starts only after the joint has slid `slid` rad since
-        its reversal, because bristles first bend over `presliding_rad`, a number or (n,). The velocity must also
-        be steady over PRESLIDING, because bristles remember the friction of earlier velocities.
+        For a friction law with memory (`slid` > 0), bristles bend over `presliding_rad` (a number or (n,)) after a
+        reversal. So a window starts only after the joint has slid by `slid` rad since a reversal. The velocity must
+        also be steady over PRESLIDING, because bristle friction depends on earlier velocities.
 
         Raises:
             UserError: no trajectory is long enough.
@@ -117,7 +117,7 @@ class SlidingMotion:
 
     @staticmethod
     def joined(parts: "Sequence[SlidingMotion]") -> "SlidingMotion":
-        """Join consecutive parts of a recording; the parts lose their arrays."""
+        """Join consecutive parts of a recording, and delete the arrays of the parts to save memory."""
         if len(parts) == 1:
             return parts[0]
         names = [f.name for f in fields(SlidingMotion) if f.name not in ("means", "encoder")]
@@ -152,7 +152,7 @@ class SlidingMotion:
     def command(self, delay: float, lag: float) -> np.ndarray:
         """Return window means (T, n) Nm of the command that acts after the hold, `delay` and `lag`, both in s.
 
-        This is the mean of u(t - delay - hold - x), with hold uniform over a step and x exponential with mean lag.
+        At t acts the mean of u(t - delay - hold - x), with hold uniform over a step and x exponential with mean lag.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
@@ -186,16 +186,16 @@ def _weights(half: int) -> np.ndarray:
 def _noise(half: int) -> float:
     """Return the standard deviation of the mean acceleration, 1/s^2, for white angle noise of 1 rad.
 
-    Integration by parts moves both derivatives to the weights. Each instant represents 1 / (RATE_HZ SIM_DT) rows.
+    Integration by parts moves both time derivatives to the weights. An instant represents 1 / (RATE_HZ SIM_DT) rows.
     """
     second = np.diff(np.pad(_weights(half), 2), 2) * RATE_HZ**2
     return float(np.linalg.norm(second) * np.sqrt(SIM_DT * RATE_HZ))
 
 
 def _windows(q: np.ndarray, way: np.ndarray, at: np.ndarray, slid: float) -> tuple[csr_array, np.ndarray]:
-    """Return the weights (T, F) of one joint's windows centred at the instants `at` (T,), and half their widths (T,).
+    """Return the weights (T, F) of one joint's windows centered at instants `at` (T,), and half their widths (T,).
 
-    way (F,) is the sliding direction, 0 where the joint may stick. A width of 0 marks a moment without a window.
+    `way` (F,) is the sliding direction, or 0 if the joint may stick. The width is 0 at a moment without a window.
     """
     first, last = np.zeros(len(q), dtype=int), np.full(len(q), -1)
     changes = np.flatnonzero(np.diff(way, prepend=np.nan) != 0)

@@ -24,12 +24,12 @@ BAYES_ROUNDS = 30  # fixed-point iterations of `_random_effects`
 
 
 class ReplayResidual:
-    """Replay residual, averaged over `stride` ms and whitened. Immutable: `reweighted` returns a copy.
+    """Whitened replay residual of angles averaged over `stride` ms. Immutable: `reweighted` returns a copy.
 
-    The error of a window is modelled as Z b + e. The vector b ~ N(0, diag(d)) contains, for each joint, the errors of
-    start angle and start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is
-    encoder noise. Generalized least squares whitens rows accordingly. Z comes from finite differences at a candidate,
-    d and s first from the recording, later from the residual. `clusters` (R,) are blocks, at first the windows.
+    A window's error is modeled as Z b + e. For each joint, b ~ N(0, diag(d)) contains the errors of start angle and
+    start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise. The
+    covariance of this model whitens the error. Z follows from finite differences. First values of d and s follow from
+    the recording, later values from the residual. `clusters` (R,) are blocks, before a fit one per window.
 
     Args:
         space: the parameters. recording, windows: the data, see `cut_windows`.
@@ -96,7 +96,7 @@ class ReplayResidual:
         return parts.mean(-2)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "ReplayResidual":
-        """Return this residual whitened at x (P,); if x was `fitted`, d and s are estimated from its errors."""
+        """Return this residual with Z at x (P,). If x was `fitted`, d and s are estimated from the errors at x."""
         other = copy(self)
         other._reweigh(x, fitted)
         return other
@@ -162,9 +162,9 @@ def _random_effects(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e that maximize the evidence.
 
-    The fixed-point iteration of MacKay, Neural Computation 4(3), 1992, from `sigma` and `noise`: the variance of b is
-    sum(mean^2) / (number of well-determined b). A mean of b over all windows comes from a wrong parameter, mostly an
-    offset; it is not treated as noise, so the next fit can correct it. `min_sigma` (K,) limits b's sigma from below.
+    MacKay's fixed-point iteration, Neural Computation 4(3), 1992, starts at `sigma` and `noise`: the variance of b is
+    sum(mean^2) / (number of well-determined b). It excludes the mean of b over all windows, due to a wrong parameter
+    (mostly an offset) that the next fit can correct. The standard deviation of b is at least `min_sigma` (K,).
     """
     _, rows, k = z.shape
     n = len(noise)

@@ -1,4 +1,4 @@
-"""Compute rigid-body torque at a torque residual's moments, linear in the links' standard inertial parameters."""
+"""Compute rigid-body torque and its regressor for the links' inertial parameters, at a torque residual's moments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -58,5 +58,5 @@ class RigidBodyRows:
 
     @staticmethod
     def joined(parts: "Sequence[RigidBodyRows]") -> "RigidBodyRows":
-        """Join consecutive parts of a recording; the parts lose their arrays."""
+        """Join consecutive parts of a recording, and delete the arrays of the parts to save memory."""
         return RigidBodyRows(**joined_arrays(parts, [f.name for f in fields(RigidBodyRows)]))

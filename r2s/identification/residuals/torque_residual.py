@@ -1,7 +1,7 @@
 """Torque residual (equation error): torque predicted at the measured motion minus recorded torque.
 
-It is the only residual of link-side and motor torque, because these are not commands and cannot be replayed. For
-commanded torque it is a fast start of a fit. Each row is divided by its standard deviation, see `reweighted`.
+Link-side and motor torque have no other residual, because only commands can be replayed. For commanded torque, a fit
+of the torque residual is a fast first step. Each row is divided by its standard deviation, see `reweighted`.
 """
 
 from collections.abc import Iterator
@@ -38,15 +38,15 @@ FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
 class TorqueResidual:
     """Torque residual of a zero-phase filtered recording, immutable: `on` and `reweighted` return copies.
 
-    The rigid-body torque is linear in a regressor that is computed once. Friction is evaluated at velocities with a
-    higher cutoff and then filtered like the torque, because the filter rounds friction's step at a reversal.
+    The regressor of the rigid-body torque is computed once. Friction is computed from velocities with a higher cutoff
+    and then filtered like the recorded torque, because this filter smooths the step of friction at a reversal.
 
     Args:
         space: the parameters. recording: the data, or a planned motion, which is not filtered.
         cutoff_hz: cutoff of the zero-phase filter. rate_hz: rows per second.
         presliding_rad: distance over which bristles bend, a number or (n,).
-        slowest: rad/s. If positive, rows are means over windows in which a joint is faster and does not reverse
-            (modulating_functions.py); a row's weight then includes the encoder noise in the window.
+        slowest: rad/s. If positive, rows are means over windows in which a joint is faster than `slowest` and does
+            not reverse (modulating_functions.py), and a row's weight includes the encoder noise in its window.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class TorqueResidual:
         return self._with(motion=m, _sign=sign, _mean_sign=mean, block=block).on(self.space)
 
     def within(self, kept: np.ndarray) -> "TorqueResidual":
-        """Return this residual with only those moments for which `kept` (T,) is true."""
+        """Return this residual restricted to the moments at which `kept` (T,) is true."""
         return self._with(seen=self.seen & kept[:, None])
 
     def with_external(self, tau: np.ndarray) -> "TorqueResidual":
@@ -139,7 +139,7 @@ class TorqueResidual:
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: parts of a prediction for a similar arm; parts with equal parameters are reused.
+        known: parts of a prediction for a similar arm; a part is reused if its parameters are equal.
         """
         d, own = dynamics, self._known(dynamics, known)
         # a link-side sensor's gain does not scale friction
@@ -152,7 +152,7 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None) -> "_Known":
-        """Return the expensive parts of a prediction; parts of `like` with equal parameters are reused."""
+        """Return the slow parts of a prediction; a part of `like` is reused if its parameters are equal."""
         m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
         if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
             torque, compensation = like.rigid, like.compensation
@@ -169,8 +169,8 @@ class TorqueResidual:
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
         """Return friction before filtering, Nm, in `rows` of the F instants.
 
-        A simulator with implicit friction evaluates friction at the velocity `lead_s` earlier (the previous step). It
-        then corrects the result if friction rises with speed.
+        A simulator with implicit friction evaluates friction at the velocity `lead_s` earlier (the previous step).
+        The simulator then corrects this friction if friction rises with speed.
         """
         dq, sign = self.motion.friction_dq[rows], self._sign[d.family.has_memory][rows]
         if not self.lead_s:
@@ -181,7 +181,7 @@ class TorqueResidual:
         return d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(ddq)
 
     def error(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
-        """Return predicted minus recorded torque (T, n) Nm; a command is shifted to the time at which it acts."""
+        """Return predicted minus recorded torque (T, n) Nm; commands are first delayed by hold, delay and lag."""
         m, free = self.motion, self.predict(dynamics, known) - self._external
         if self.commanded:
             return free - m.command(float(dynamics.delay), float(dynamics.lag))
@@ -205,7 +205,7 @@ class TorqueResidual:
         return np.concatenate([j for _, j in self.linearize(u)])
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield residual (r,) and Jacobian (r, P) at u (P,) on the unit cube, for successive parts of the rows."""
+        """Yield residual (r,) and Jacobian (r, P) at u (P,) on the unit cube for one part of the rows at a time."""
         h = np.where(u > 0.5, -STEP, STEP)
         x, stepped = self.space.from_unit(u), self.space.from_unit(u + h)
         r, changes = self(x[None])[0], self._changes(x, stepped)
@@ -218,9 +218,9 @@ class TorqueResidual:
         return self._assembled(self._changes(x, stepped), slice(None), len(x))
 
     def _changes(self, x: np.ndarray, stepped: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return (block, indices in x, change): of torque (T, n), or of parameters (n, 10 n, L) for L link values.
+        """Return [(block, indices in x, change)], with changes of torque (T, n) or of L link values (n, 10 n, L).
 
-        A dozen evaluations suffice: friction acts on its own joint only, and torque is linear in standard parameters.
+        One evaluation per block suffices: friction affects only its joint; torque is linear in standard parameters.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -258,18 +258,18 @@ class TorqueResidual:
         return (out * weight).reshape(-1, count)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
-        """Return this residual in standard deviations of an independent row, estimated from the error at x (P,).
+        """Return this residual with rows divided by their standard deviation, estimated from the error at x (P,).
 
-        The standard deviation of each joint is the RMS if x was `fitted`, else half the RMS, times the square root of
-        the correlation length. In sliding windows, the RMS consists of encoder noise (larger in short windows) and
-        a constant. If x was `fitted`, the error also sets the length of independent blocks.
+        A joint's standard deviation is the RMS error if x was `fitted`, else half of it, times the root of the
+        correlation length. In sliding windows, the standard deviation combines a constant with encoder noise, which
+        is larger in short windows. If x was `fitted`, the error's correlation also sets the length of blocks.
         """
         r = self._seen_errors(x)
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
         return self._with(_weights=self._weights_at(r, fitted), **own)
 
     def rigid_body_of_last_link(self) -> np.ndarray:
-        """Return torque (T, n, 10) per standard parameter of an additional, undeclared body on the last link."""
+        """Return torque (T, n, 10) per unit of each standard parameter of an undeclared body on the last link."""
         y, weight = self._rigid.y[..., -10:], self._rigid.compensation[..., -10:]
         return y + weight if self.commanded else y
 
@@ -293,7 +293,7 @@ class TorqueResidual:
 
 
 class _Known(NamedTuple):
-    """Parts of a prediction: rigid, compensation and friction (T, n) Nm, with the parameters that produced them."""
+    """Parts of a predicted torque: rigid, compensation and friction (T, n) Nm, and the parameters used for them."""
 
     standard: np.ndarray
     armature: np.ndarray
@@ -304,7 +304,7 @@ class _Known(NamedTuple):
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
-    """Return the motion that `of` computes from a recording piece by piece, and the motion's rigid-body torque."""
+    """Apply `of` to a recording piece by piece; return the joined motion and its rigid-body torque."""
     motions = [of(piece) for piece in _pieces(recording, of)]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     joined = type(motions[0]).joined(motions)

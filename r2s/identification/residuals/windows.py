@@ -1,7 +1,7 @@
-"""Cut a commanded recording into short windows, and replay them from measured states: eq. (8) of the paper.
+"""Cut a recording of commanded torque into windows, and replay each from its measured start state (paper, eq. (8)).
 
-Windows are short because a simulated arm without feedback drifts: after some seconds the error shows drift rather
-than wrong parameters.
+A simulated arm without feedback drifts. Windows are short, because after some seconds drift dominates the error and
+hides the effect of wrong parameters.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from r2s.recordings.recording import Recording
 
 STATE_SAMPLES = 31  # ms, length of the local fit for a window's start state
 HALF = STATE_SAMPLES // 2
-SHORTEST = 0.25  # least share of the full window length: shorter windows cost more than they contribute
+SHORTEST = 0.25  # least share of the full window length; even shorter windows add less information than they cost
 MOVED = 0.02  # rad, least range of motion of a moving joint
-# scatter of breakaway commands between postures, of the largest tau_max (0.1 Nm for a Panda's 87 Nm)
+# scatter of breakaway commands between postures, relative to the largest tau_max (a Panda: 0.1 Nm of 87 Nm)
 SCATTER = 0.1 / 87.0
 MAX_LATENCY_STEPS = 11  # ms, odd: longest latency of a command
-HISTORY = 40  # ms of commands before a window, which delay and lag shift into the window
+HISTORY = 40  # ms, length of the commands before a window; delay and lag shift them into the window
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Windows:
     """W windows of a recording: start states, commands and the joint angles that followed.
 
     Attributes:
-        t: (W,) s, start. q0, dq0: (W, n) rad, rad/s, at the start. tau: (W, S, n) Nm, commands, one row per 1 ms.
+        t: (W,) s, start time. q0, dq0: (W, n) rad, rad/s, start state. tau: (W, S, n) Nm, commands, one per ms.
         before: (W, HISTORY, n) Nm, commands before the start. bristle: (W, n), presliding state at the start.
         q: (W, S, n) rad, recorded angles after each step.
-        length: (W,) number of steps in the window; later rows are padding.
+        length: (W,) number of steps per window; `tau` and `q` have padding after this number of rows.
     """
 
     t: np.ndarray
@@ -66,15 +66,14 @@ def cut_windows(
     """Cut a commanded recording into consecutive windows of at most `seconds`, each within one trajectory.
 
     Args:
-        limit: largest number of windows; if there are more, evenly spread windows are selected.
-        slowest: rad/s. A window ends when a joint becomes slower, and the next window starts when all joints are
-            faster again, because the least change of a parameter can shift the release of a resting joint by a step,
-            which disturbs all joints. Joints that never move are ignored.
-        edges: (n, 2) Nm, commands at which resting joints break away, widened by their scatter. A joint is
-            slow only while its command lies between these.
+        limit: largest number of windows; a longer recording yields `limit` evenly spaced windows.
+        slowest: rad/s, least speed of a joint in a window; a slower joint ends it. A tiny parameter change can shift
+            the breakaway of a resting joint by a step, which disturbs all joints. Joints that never move are ignored.
+        edges: (n, 2) Nm, each joint's lower and upper breakaway command, widened by their scatter. A slow joint ends
+            a window only while its command lies between its two breakaway commands.
 
     Raises:
-        UserError: no trajectory is as long as a window, or all joints hardly ever move at the same time.
+        UserError: no trajectory is as long as a window, or the joints hardly ever move all at the same time.
     """
     grid = recording.resample(SIM_DT)
     steps = round(seconds / SIM_DT)
@@ -123,10 +122,10 @@ def cut_windows(
 
 
 def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, int]]:
-    """Return (start, length) of windows of at most `steps` rows between the `slow` rows of a stretch of `count`."""
+    """Split `count` rows at the `slow` rows into windows of at most `steps` rows; return each (start, length)."""
     out = []
     for a, b in pairwise([-1, *slow.tolist(), count - 1]):
-        run = b - a - 2 - HALF  # start states are fitted to rows without slow joints
+        run = b - a - 2 - HALF  # the fit of a start state uses only rows without slow joints
         if run < SHORTEST * steps:
             continue
         parts = -(-run // steps)
@@ -136,10 +135,10 @@ def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, 
 
 @dataclass(frozen=True)
 class StartState:
-    """Start state of a replay, from a cubic fitted to 31 ms of measured angles and velocities, weighted by noise.
+    """Estimate a replay's start state: fit a cubic to 31 ms of measured angles and velocities, weighted by noise.
 
-    Logged velocities are late, by half a step in a simulator or by a filter on an arm. This lateness is estimated
-    for each joint from the derivative of the angles.
+    Logged velocities lag behind the angles: by half a step in a simulator, by a filter's delay on an arm. The fit
+    estimates this lateness for each joint, from the derivative of the angles, and corrects it.
 
     Attributes:
         noise: (n,) rad, robust estimate of angle noise. kernel: (n, 2, 2 STATE_SAMPLES), matrix from measured angles
@@ -152,7 +151,7 @@ class StartState:
 
     @staticmethod
     def of(grid: Recording) -> "StartState":
-        """Return the start-state fit for a recording at 1 kHz."""
+        """Return the estimator of start states for a recording `grid` that is sampled at 1 kHz."""
         n = grid.n_joints
         seen = [s for s in grid.stretches if s.stop - s.start > STATE_SAMPLES]
 
@@ -172,12 +171,12 @@ class StartState:
         angles = np.broadcast_to(t**k, (n, STATE_SAMPLES, 4))
         both = np.concatenate([angles, speeds - late[:, None, None] * accelerations], 1) / size[..., None]
         cubic = np.linalg.pinv(both) / size[:, None]
-        # MuJoCo moves by the velocity at the end of a step: q(t) = q0 + v t + a t^2 / 2 starts from v - a h / 2
+        # MuJoCo integrates q with dq at the end of a step, so for q(t) = q0 + v t + a t^2 / 2, dq0 is v - a h / 2
         kernel = np.stack([cubic[:, 0], cubic[:, 1] - SIM_DT * cubic[:, 2]], 1)
         return StartState(noise, kernel, np.sqrt(((kernel * size[:, None]) ** 2).sum(-1)).T)
 
     def __call__(self, grid: Recording, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return q, dq (W, n) rad, rad/s at rows `at` (W,), which must be HALF or more rows from a stretch's ends."""
+        """Return q, dq (W, n) rad, rad/s at the rows `at` (W,), each at least HALF rows inside its trajectory."""
         rows = at[:, None] + np.arange(STATE_SAMPLES) - HALF
         seen = np.concatenate([grid.q[rows], grid.dq[rows]], 1)
         q, dq = np.einsum("nks,wsn->kwn", self.kernel, seen)
@@ -185,7 +184,7 @@ class StartState:
 
 
 def windows_or_none(recording: Recording, seconds: float, limit: int | None = None) -> Windows | None:
-    """Return the result of `cut_windows`, or None if no trajectory is long enough, as in short blocks."""
+    """Return the result of `cut_windows`, or None if no trajectory is as long as a window."""
     try:
         return cut_windows(recording, seconds, limit)
     except UserError:
@@ -193,7 +192,7 @@ def windows_or_none(recording: Recording, seconds: float, limit: int | None = No
 
 
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
-    """Return the angles q (W, S, n) rad of an arm with `dynamics`, simulated over each window."""
+    """Simulate an arm with `dynamics` over each window, and return its angles q (W, S, n) rad."""
     sim = Simulator(robot, dynamics, len(windows.q0), nthread)
     sim.reset(windows.q0, windows.dq0, bristle=windows.bristle)
     return sim.rollout(windows.delayed(dynamics.delay, dynamics.lag))["qpos"]

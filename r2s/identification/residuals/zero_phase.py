@@ -1,4 +1,4 @@
-"""Low-pass a recording with zero phase for differentiation; friction passes through the same filter."""
+"""Low-pass a recording without phase shift before differentiation, and pass friction through the same filter."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from r2s.recordings.parts import joined_arrays
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
-HOLD_STEPS = 0.5  # mean latency of a command that is held for one step, in steps
-FRICTION_CUTOFF = 4.0  # cutoff of the friction law's velocity over that of torque, for sharp reversals
+HOLD_STEPS = 0.5  # in steps, mean latency of a command that is constant over a step
+FRICTION_CUTOFF = 4.0  # cutoff of the friction law's velocity, relative to that of torque; high for sharp reversals
 SHIFT = 0.05  # step between stored time shifts, in cutoff periods; cubic interpolation then errs by 2e-4
 SHIFTS = -0.03, 0.05  # s, range of the stored time shifts of torque
-MOST_SHIFT = 20  # ms, largest such step, with which SHIFTS contains the four shifts for interpolation
-AT_ONCE = 1024  # moments that are filtered at once, to limit memory
-EDGE_S = 0.05  # s, dropped at both ends of a trajectory, where the filter has transients
+MOST_SHIFT = 20  # ms, largest step between shifts; interpolation needs four shifts within SHIFTS
+AT_ONCE = 1024  # number of rows filtered at once, to limit memory
+EDGE_S = 0.05  # s, length removed from both ends of a trajectory, where the filter has transients
 
 
 @dataclass(frozen=True)
 class SmoothMotion:
-    """A low-pass filtered recording at T moments.
+    """A low-pass filtered recording, sampled at T times.
 
     Attributes:
-        t: (T,) s. q, dq, ddq, tau: (T, n), low-passed forward and backward.
-        friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), presliding state. Both are
-            padded with their end values at both ends of a trajectory, by half the kernel.
-        kernel: (K,), weights of `filtered`. spans: for runs of moments, the first of the K rows per moment.
-        delayed: (T, L, n) Nm, tau with L time shifts over the range SHIFTS, `shift_s` s apart.
+        t: (T,) s, sample times. q, dq, ddq, tau: (T, n), filtered forward and backward.
+        friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), presliding state. At the
+            ends of each trajectory, friction_dq and bristle are padded by half a kernel of constant rows.
+        kernel: (K,), weights of the low-pass. spans: for each of the T samples, in batches, the kernel's first F row.
+        delayed: (T, L, n) Nm, tau at L time shifts in the range SHIFTS, `shift_s` s apart.
     """
 
     t: np.ndarray
@@ -56,9 +56,9 @@ class SmoothMotion:
         presliding_rad: np.ndarray | float = PRESLIDING,
         late: Lateness | None = None,
     ) -> "SmoothMotion":
-        """Resample to 1 kHz, low-pass forward and backward, differentiate; keep rows at `rate_hz` without the edges.
+        """Resample to 1 kHz, filter forward and backward, differentiate, remove the ends, and sample at `rate_hz`.
 
-        rate_hz: at most FRICTION_HZ. late: lateness of the logged dq, which is corrected; None: no correction.
+        rate_hz: at most FRICTION_HZ. late: lateness of the logged dq, to correct; None: no correction.
 
         Raises:
             UserError: no trajectory is long enough.
@@ -97,7 +97,7 @@ class SmoothMotion:
 
     @staticmethod
     def joined(parts: "Sequence[SmoothMotion]") -> "SmoothMotion":
-        """Join consecutive parts of a recording; the parts lose their arrays."""
+        """Join consecutive parts of a recording, and delete the arrays of the parts to save memory."""
         if len(parts) == 1:
             return parts[0]
         names = ("t", "q", "dq", "ddq", "tau", "friction_dq", "bristle", "delayed")
@@ -107,9 +107,9 @@ class SmoothMotion:
         return SmoothMotion(kernel=parts[0].kernel, spans=tuple(spans), shift_s=parts[0].shift_s, **arrays)
 
     def filtered(self, x: "np.ndarray | Callable[[slice], np.ndarray]") -> np.ndarray:
-        """Return x low-passed at the moments, (T, n); x is (F, n) or a function from a slice of the F rows to values.
+        """Low-pass x (F, n), and return its values (T, n) at the sample times.
 
-        A function is evaluated span by span, which is faster than storing all rows of an hour in memory first.
+        If x is a function that returns a slice of rows, filtering is faster, because not all rows are in memory.
         """
         parts = []
         for s in self.spans:
@@ -119,15 +119,15 @@ class SmoothMotion:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def rows(self, x: np.ndarray) -> np.ndarray:
-        """Return x (T, n, ...) unchanged: it is a function of q, dq and ddq, which are already filtered."""
+        """Return x (T, n, ...) unchanged: x is computed from q, dq and ddq, which are already filtered."""
         return x
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the command (T, n) Nm that acts at the joints; below the cutoff a lag acts like a delay."""
+        """Return the commanded torque (T, n) Nm after a delay and a lag, which acts like a second delay."""
         return self.earlier(delay + lag + HOLD_STEPS * SIM_DT)
 
     def earlier(self, seconds: float) -> np.ndarray:
-        """Return tau (T, n) Nm at `seconds` before each moment, or after each moment if negative."""
+        """Return tau (T, n) Nm from `seconds` before each sample time; from a later time if `seconds` is negative."""
         at = (seconds - SHIFTS[0]) / self.shift_s
         k = int(np.clip(at, 1, self.delayed.shape[1] - 3))
         weights = cubic(min(max(at - k, -1.0), 2.0))
@@ -135,7 +135,7 @@ class SmoothMotion:
 
 
 def too_short(recording: Recording) -> UserError:
-    """Return the error for a recording whose trajectories are all shorter than the two dropped edges."""
+    """Return the error for a recording that has no rows left after both ends of every trajectory are removed."""
     return UserError(f"no trajectory is longer than {2 * EDGE_S:g} s; the recording lasts {recording.duration:g} s")
 
 

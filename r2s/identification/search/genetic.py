@@ -1,7 +1,7 @@
 """The paper's genetic algorithm (Alg. 1: select, mutate, update until convergence or G_max), with pymoo's GA.
 
-The population starts around the nominal model. With default operators, a population that starts uniformly in the
-bounds loses its diversity long before the friction curves are right.
+The population starts around the nominal model. A population that starts uniformly in the bounds, with pymoo's default
+operators, loses its diversity long before its friction curves are right.
 """
 
 import time
@@ -24,8 +24,8 @@ class Genetic:
     Attributes:
         population: number of individuals, all simulated at once.
         generations: largest number of generations, G_max. minutes: time limit.
-        spread: standard deviation of the first population about the start, on the unit cube; limited to the prior's.
-        patience, tolerance: the search ends if the best cost improved by less than `tolerance` (relative) over
+        spread: standard deviation of the first population about the start, on the unit cube; at most the prior's.
+        patience, tolerance: the search ends if the best cost improves by less than the share `tolerance` over
             `patience` generations.
         seed: seed of all random draws.
     """

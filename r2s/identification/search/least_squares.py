@@ -1,4 +1,4 @@
-"""Search for the least-squares solution on replays or on torque (solver: levenberg_marquardt.py)."""
+"""Fit parameters to replays or to torque by least squares (solver: levenberg_marquardt.py)."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from r2s.identification.problem import Problem, Report
 from r2s.identification.search.levenberg_marquardt import minimize
 
-ROUNDS = 4  # reweighted fits on torque; the first weights come from the nominal arm's residual
+ROUNDS = 4  # number of reweighted torque fits; the first weights come from the nominal arm's residual
 
 
 @dataclass(frozen=True)
@@ -15,8 +15,8 @@ class LeastSquares:
     """The least-squares search.
 
     Attributes:
-        max_evaluations: most Jacobians. ftol: least relative gain for another step. minutes: time limit.
-        level: "residual" to fit the problem's data, or "torque" to fit its torque residual, which takes seconds.
+        max_evaluations: limit on Jacobians. ftol: the search ends at a lower relative gain. minutes: time limit.
+        level: "residual" fits the problem's data; "torque" fits the problem's torque residual within seconds.
     """
 
     max_evaluations: int = 40
@@ -31,7 +31,7 @@ class LeastSquares:
         if self.level != "torque":
             return minimize(problem.residual, problem.linearize, start, *limits)
         problem = problem.on_torque
-        for _ in range(ROUNDS):  # iteratively reweighted
+        for _ in range(ROUNDS):  # iteratively reweighted least squares
             start = minimize(problem.residual, problem.linearize, start, *limits, "torque")
             problem = problem.reweighted(start, fitted=True)
         return start

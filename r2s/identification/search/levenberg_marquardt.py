@@ -1,7 +1,7 @@
-"""Solve bounded least squares on the unit cube by Levenberg-Marquardt, trying several damping factors in one batch.
+"""Solve bounded least squares on the unit cube by Levenberg-Marquardt, with several damping factors tried in a batch.
 
-scipy's trust-region solver factors the whole Jacobian (14,000 rows, 110 columns) by SVD at every step, which costs
-more than the physics, and tries one step at a time.
+scipy's trust-region solver would be slower: it tries one step at a time, and at every step it factors the whole
+Jacobian (14,000 rows, 110 columns) by SVD, which takes longer than the physics.
 """
 
 import time
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 DAMPING = 1e-3  # first damping factor, relative to the diagonal of J^T J (Marquardt's scaling)
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # limits with the effect of a pure Gauss-Newton step, and of no step
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # limits: the least allows a pure Gauss-Newton step, the most no step at all
 TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful one
 RETRIES = 3  # batches of trials per Jacobian
 
@@ -28,9 +28,9 @@ def minimize(
     """Return a local minimum u (P,) of the sum of squares in the unit cube, near `start` (P,).
 
     Args:
-        residual: maps (C, P) to (C, R). linearize: maps (P,) to parts of residual and Jacobian, (r,) and (r, P).
-        start, max_evaluations, ftol, minutes: see r2s/identification/search/least_squares.py.
-        report: function that receives a row of progress after every step. name: name of the search in these rows.
+        residual: maps C points (C, P) to residuals (C, R). linearize: maps a point to (residual, Jacobian) pairs.
+        start, max_evaluations, ftol, minutes: see least_squares.py. name: name of the search in progress rows.
+        report: function that receives a row of progress after every step.
     """
     u, damping, began = np.clip(start, 0.0, 1.0), DAMPING, time.perf_counter()
     r = residual(u[None])[0]
@@ -58,7 +58,7 @@ def minimize(
 
 
 def normal_equations(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return J^T r (P,) and J^T J (P, P), each summed over the parts (r, J)."""
+    """Sum J^T r (P,) and J^T J (P, P) over the parts (residual r, Jacobian J), and return both sums."""
     gradient, hessian = 0.0, 0.0
     for r, j in parts:
         gradient, hessian = gradient + j.T @ r, hessian + j.T @ j
@@ -66,7 +66,7 @@ def normal_equations(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np
 
 
 def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
-    """Return u (P,) after a damped Gauss-Newton step in the `free` coordinates, clipped to the cube."""
+    """Take a damped Gauss-Newton step from u (P,) in the `free` coordinates; return u clipped to the unit cube."""
     h = hessian[np.ix_(free, free)]
     diagonal = np.diag(h)
     h = h + np.diag(damping * diagonal + 1e-12 * max(diagonal.max(initial=0.0), 1e-30))

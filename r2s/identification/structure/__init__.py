@@ -1,1 +1,1 @@
-"""Selection of the model structure by cross-validation: friction family, and terms besides it."""
+"""Selection of the model structure by cross-validation: the friction family, and the terms besides friction."""

@@ -1,7 +1,7 @@
-"""Backward elimination: remove a term if held-out torque is predicted equally well without it.
+"""Backward elimination: remove a term if the model predicts held-out torque equally well without it.
 
-Gravity hardly distinguishes link masses from a payload, and fewer parameters generalize better. An arm whose
-published link parameters are correct needs only a payload term; an arm without payload needs only link terms.
+Fewer parameters generalize better, and gravity hardly distinguishes link masses from a payload. An arm with correct
+published link parameters needs no link terms; an arm without payload needs no payload term.
 """
 
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from r2s.identification.terms import blocks_of
 
 
 def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequence[str]) -> dict[str, list[bool]]:
-    """Return {"needed": [whether prediction needs the term, for each of `terms`]}; only `prunable` terms are tried.
+    """Return {"needed": [whether prediction needs the term, for each of `terms`]}; only `prunable` terms are tested.
 
-    The term with the most parameters is tried first. A term is removed unless the model without it predicts clearly
-    worse than the best model so far.
+    The term with the most parameters is tested first. A term is removed unless the model without this term predicts
+    clearly worse than the best model so far.
     """
     base = cv.space(terms)
     folds = list(cv.split(base))
     done = 0
 
     def score(some: Sequence[str]) -> np.ndarray:
-        """Return the mean square error (blocks, n) Nm^2 of held-out torque with these terms."""
+        """Return the mean square error (blocks, n) Nm^2 of held-out torque for a model with the terms `some`."""
         nonlocal done
         space = cv.space(some)
         squares = np.concatenate([fold.score(space, cv.prior) for fold in folds])

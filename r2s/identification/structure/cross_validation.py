@@ -1,4 +1,4 @@
-"""Cross-validate within a recording by holding out whole blocks of time, or of phase if motion repeats."""
+"""Cross-validate within a recording: hold out blocks of time or, if the motion repeats, of its phase."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,12 +17,12 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-RATE_HZ = 50.0  # rows per second for comparing structures: half as many as in a fit
+RATE_HZ = 50.0  # rows per second for comparing model structures: half as many as in a fit
 GUARD_S = 0.1  # s, gap between fitted rows and a held-out block, as the low-pass spreads motion over this time
 
 
 def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
-    """Return (fitted part, held-out part) for each fold; a fold holds out `blocks` blocks with gaps of GUARD_S."""
+    """Return (fitted part, held-out part) per fold; a fold holds out `blocks` blocks, between gaps of GUARD_S."""
     period = recording.period or np.inf
     clock = recording.t % period if recording.period else recording.t
     edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
@@ -32,20 +32,20 @@ def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Re
         for low, high in edges[k::folds]:
             inside = (clock >= low) & (clock <= high)
             out |= inside
-            # distance on the circle of phases; without a period its circumference is infinite
+            # distance in phase, which is periodic; without a period this is the distance in time
             near |= inside | ((low - clock) % period < GUARD_S) | ((clock - high) % period < GUARD_S)
         pairs.append((recording.select(~near), recording.select(out)))
     return pairs
 
 
 class Fold(NamedTuple):
-    """One fold: the torque residuals of the fitted and of the held-out motion."""
+    """A fold of the cross-validation: the torque residuals of fitted and of held-out motion."""
 
     fit: TorqueResidual
     test: TorqueResidual
 
     def score(self, space: ParameterSpace, prior: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Fit, and return the mean square error (blocks, n) Nm^2 of held-out torque in blocks of half a second."""
+        """Fit, and return the mean square error (blocks, n) Nm^2 of held-out torque in each half-second block."""
         own, test = self.fit.on(space), self.test
         u, _ = fit_torque(Problem.of(own, own, prior))
         square = test.seen * test.error(space.dynamics(space.from_unit(u)[None]).one(0)) ** 2
@@ -56,7 +56,7 @@ class Fold(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Data and settings for selecting family and terms by cross-validation.
+    """Data and settings of the cross-validation that selects the friction family and the terms.
 
     Attributes:
         robot, nominal: the arm, and the dynamics at which every fit starts.
@@ -64,7 +64,7 @@ class CrossValidation:
         bounds, prior: see `search_space` and `Problem.of`.
         folds: number of folds.
         cutoff_hz: cutoff of the zero-phase filter.
-        report: function that receives rows of progress. stated: user's statements; only fixed values are used.
+        report: function that receives progress rows. stated: the user's values, of which only fixed ones are used.
     """
 
     robot: Robot
@@ -78,11 +78,11 @@ class CrossValidation:
     stated: Stated = field(default_factory=dict)
 
     def space(self, terms: Sequence[str], nominal: Dynamics | None = None) -> ParameterSpace:
-        """Return the parameter space of the friction family and `terms`, about `nominal` or the usual nominal arm."""
+        """Return the parameter space of `terms` and of the friction family of `nominal` (None: of the arm)."""
         return search_space(self.robot, nominal or self.nominal, self.bounds, terms, self.recording, self.stated)
 
     def split(self, space: ParameterSpace, *, blocks: int = 1, slowest: float = 0.0) -> Iterator[Fold]:
-        """Yield the folds; for the arguments see `held_out` and `TorqueResidual`."""
+        """Yield the folds; for `blocks`, see `held_out`, for `slowest`, see `TorqueResidual`."""
         for pair in held_out(self.recording, self.folds, blocks):
             fit, test = (
                 TorqueResidual(space, part, cutoff_hz=self.cutoff_hz, rate_hz=RATE_HZ, slowest=slowest)
@@ -92,16 +92,16 @@ class CrossValidation:
 
 
 def per_joint(squares: np.ndarray) -> np.ndarray:
-    """Return factors (n,) that weight joints with mean square errors `squares` (n,) equally.
+    """Return the joints' weights (n,) 1 / `squares`, so that all joints contribute equally to a squared error.
 
-    A joint whose error is 0 has no held-out rows, because it never slides faster than `slowest`; its factor is 0.
+    squares: (n,) mean square errors; 0 marks a joint without held-out rows, whose weight is 0.
     """
     return np.divide(1.0, squares, out=np.zeros_like(squares), where=squares > 0)
 
 
 def clearly_worse(more: np.ndarray) -> bool:
-    """Return whether the mean of an increase in error, `more` (blocks,), exceeds its standard error.
+    """Return whether the error increases clearly: whether the mean of `more` (blocks,) exceeds its standard error.
 
-    This is the one-standard-error rule of Breiman et al., Classification and Regression Trees, 1984.
+    This one-standard-error rule is from Breiman et al., Classification and Regression Trees, 1984.
     """
     return bool(more.mean() > more.std() / np.sqrt(len(more)))

@@ -10,18 +10,18 @@ from r2s.identification.structure.cross_validation import CrossValidation, clear
 from r2s.physics.dynamics import with_family
 from r2s.physics.friction import FAMILIES, Family
 
-# largest ratio of a simpler family's error to the least, in sliding windows. On simulated arms (independent_arms.py,
-# seeds 1 to 31) it was 1.00 to 1.20 for true Coulomb friction, 1.86 to 6.8 if friction fell with velocity
+# largest ratio of a simpler family's error to the least error, in sliding windows. On simulated arms
+# (independent_arms.py, seeds 1 to 31) it was 1.00 to 1.20 for Coulomb friction, 1.86 to 6.8 for falling friction
 CLOSE = 1.45
 
 
 def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float = 0.0) -> dict[str, Any]:
     """Return {"error": (F,) held-out torque error over the least error, "best": index} for the F friction families.
 
-    A family with more parameters is chosen only if it predicts clearly better. Slow sliding shows whether friction
-    falls with velocity, but a filter spreads stops and reversals over slow rows, which no family explains. So if
-    `slowest` > 0, rad/s, families without memory are compared again on windows of faster sliding
-    (modulating_functions.py), and this comparison sets their "error". Families with memory need other windows.
+    A family with more parameters is chosen only if it predicts clearly better. Slow sliding would show whether
+    friction falls with velocity, but the low-pass spreads stops and reversals over the slow rows. So if `slowest` > 0
+    (rad/s), r2s compares the families without memory again, on windows of sliding faster than `slowest`
+    (modulating_functions.py), and returns the new errors. Families with memory would need other sliding windows.
 
     Raises:
         UserError: the recording is too short to hold out motion.
@@ -41,9 +41,9 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
 def _compare(
     cv: CrossValidation, families: Sequence[Family], terms: Sequence[str], slowest: float = 0.0, close: float = 1.0
 ) -> tuple[np.ndarray, int] | None:
-    """Return errors (F,) over the least error, and the first family within `close` of it or not clearly worse.
+    """Return the families' errors (F,) over the least error, and the index of the selected family; None without data.
 
-    Return None if no joint has a held-out row, for example with `slowest` in a recording of a few seconds.
+    Select the first family whose relative error is at most `close` or which is not clearly worse than the best.
     """
     spaces = [cv.space(terms, with_family(cv.nominal, f.name)) for f in families]
     scores: list[list[np.ndarray]] = [[] for _ in spaces]

@@ -1,7 +1,7 @@
 """Forward selection: add terms that clearly improve the prediction of held-out torque.
 
-Terms are correlated (an offset with cable drag, a mass with a centre of mass). So a fit assigns a value even to a
-term that the arm lacks, and distorts the other values. A term is therefore added only if it improves prediction.
+Terms are correlated (an offset with cable drag, a mass with a center of mass). So a term that the arm lacks distorts
+the fitted values of other terms. Forward selection therefore adds a term only if it improves the prediction.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from r2s.identification.terms import blocks_of, scaled_bounds
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
-BLOCKS = 4  # held-out blocks per fold, so that held-out motion is fast and slow like the fitted motion
+BLOCKS = 4  # held-out blocks per fold; with several, held-out motion is as fast and as slow as fitted motion
 CLEARLY = 2.0  # least mean improvement in standard errors, about 95 % confidence
 
 
@@ -24,9 +24,9 @@ def select_terms(
 ) -> dict[str, list[bool]]:
     """Return {"entered": [whether each of the `candidates` is added to a model with `terms`]}.
 
-    The best candidate is added if it lowers the error by more than CLEARLY standard errors over half-second blocks;
-    then the remaining candidates are tried. Torque is linear in most parameters, so each fold is fitted once without
-    candidates, and a trial with candidates is one Gauss-Newton step from this fit.
+    Each round adds the best candidate, until none lowers the mean error over half-second blocks by more than CLEARLY
+    standard errors. Torque is linear in most parameters, so each fold is fitted once without candidates, and one
+    Gauss-Newton step from this fit evaluates a set of candidates.
     """
     space, folds = cv.space(terms), []
     for k, fold in enumerate(cv.split(space, blocks=BLOCKS, slowest=slowest)):
@@ -36,7 +36,7 @@ def select_terms(
     alike = per_joint(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
 
     def score(chosen: Sequence[str]) -> np.ndarray:
-        """Return the squared errors (blocks,) with the `chosen` candidates, summed over joints with equal weight."""
+        """Return each block's squared error (blocks,) with the `chosen` candidates; all joints have equal weight."""
         return np.concatenate([f.squares(chosen) for f in folds]) @ alike
 
     chosen: list[str] = []
@@ -53,7 +53,7 @@ def select_terms(
 
 
 class _LinearizedFold:
-    """The fit to a fold, linearized in the fitted parameters and in the parameters of the candidate terms."""
+    """A fold's fit and held-out errors, linearized in the parameters of the model and of all candidate terms."""
 
     def __init__(self, cv: CrossValidation, fold: Fold, candidates: Sequence[str]):
         fit, test = fold

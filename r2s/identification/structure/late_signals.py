@@ -1,10 +1,10 @@
-"""Choose whether an identification corrects the lateness of link-side torque and of the logged dq.
+"""Decide whether an identification corrects the lateness of link-side torque and of the logged dq.
 
-The lateness of dq relative to q follows from the log alone (r2s/recordings/lateness.py); that of torque needs a fit.
-An arm may filter both in the same way, and then correcting only one does harm. On a physical Panda, dq is 5.3 ms late
-and torque about 2 ± 0.5 ms. Correcting dq but not these uncertain 2 ms raised the error of motion held out within the
-training part, while the training residual did not show it. If both are equally late, no correction is needed:
-inertial torque and friction then refer to one time.
+A log alone determines the lateness of dq relative to q (r2s/recordings/lateness.py); the lateness of torque needs a
+fit. If an arm filters torque and dq alike, both are equally late and need no correction, because inertial torque and
+friction then refer to the same time. A correction of dq alone would then do harm. On a physical Panda, dq is 5.3 ms
+late and torque about 2 ± 0.5 ms. A correction of only the Panda's dq raised the error on held-out motion of the
+training part, although the training residual did not reveal it.
 """
 
 from collections.abc import Sequence
@@ -21,15 +21,15 @@ from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
 SURE = 4.0  # standard deviations: 3, plus a third, as 95 % intervals covered only 85 % under model error
-BLOCKS = 4  # held-out blocks per fold, so that held-out motion is fast and slow like the fitted motion
+BLOCKS = 4  # held-out blocks per fold; with several, held-out motion is as fast and as slow as fitted motion
 
 
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether torque is clearly late, "alike": whether to treat torque and dq as equally late}.
 
-    1. Correct dq and fit the delay of torque; if this delay is clearly not 0, correct both signals.
-    2. Otherwise correct only dq if this improves the prediction of held-out torque by more than a standard error; if
-       it does not, treat both as equally late and use them as logged.
+    1. Correct dq and fit the delay of torque. If this delay is clearly not 0, correct torque and dq.
+    2. Otherwise correct only dq, if this improves the prediction of held-out torque by more than a standard error.
+    3. Otherwise treat torque and dq as equally late: use both as logged.
     """
     if DELAY in terms and torque_is_late(cv, terms):
         return {"delayed": True, "alike": False}
@@ -47,7 +47,7 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
 
 
 def torque_is_late(cv: CrossValidation, terms: Sequence[str]) -> bool:
-    """Return whether a fit whose `terms` include the torque's delay finds a delay that is clearly not 0."""
+    """Fit `terms`, which include the delay of torque, and return whether this delay is clearly not 0."""
     space = cv.space(terms)
     recording = cv.recording if cv.recording.period else cv.recording.in_phase()  # repetitions are one block
     data = TorqueResidual(space, recording, cutoff_hz=cv.cutoff_hz, rate_hz=RATE_HZ)

@@ -1,7 +1,7 @@
 """Compare adapters by transfers of one policy, in a row per adapter and a column per condition of the arm.
 
-Means are over arms and episodes. The bootstrap is paired: it draws arms, and episodes of each drawn arm. All rows of
-a condition share these draws.
+Means are over arms and episodes. The bootstrap is paired: it draws arms, and then episodes of each drawn arm, the
+same for all rows of a condition.
 """
 
 import os
@@ -28,13 +28,13 @@ class AdapterComparison:
 
     Attributes:
         measures: {key: Measure}, the compared measures. headline: the measure that summarizes a row.
-        scores: a line per measure, condition and row: `mean` with 95 % interval `low` to `high`; `difference` from
-            the row `reference` (None: no reference); `worse_low` to `worse_high`, 95 % interval of how much worse the
-            row is; numbers of stopped, requested (`asked`) and averaged (`episodes`) episodes, and of arms.
-        losses: a line per condition and row: `value`, mean of the headline measure, and `nominal`, its mean over the
-            same arms and episodes in the nominal condition.
-        costs: a line per row: `us`, computing time of the adapter per cycle, microseconds.
-        runs: {row: its transfers}. key: lines that explain policy names. left_out: lines about left-out episodes.
+        scores: a line per measure, condition and row. `mean` has the 95 % interval `low` to `high`. `difference` is
+            `mean` minus the `mean` of row `reference`. `worse_low` to `worse_high` is the 95 % interval of the row's
+            loss against `reference`. `asked` is the number of requested episodes, `episodes` of averaged ones.
+        losses: a line per condition and row. `value` is the mean of the headline measure; `nominal` is its mean over
+            the same arms and episodes in the nominal condition.
+        costs: a line per row; `us` is the computing time of the adapter per cycle, microseconds.
+        runs: {row: its transfers}. key: lines that explain policy names. left_out: lines about omitted episodes.
     """
 
     measures: Mapping[str, Measure]
@@ -48,7 +48,7 @@ class AdapterComparison:
 
 
 def compare_adapters(found: Sequence[Transferred]) -> AdapterComparison:
-    """Return the comparison of the transfers that `comparable` selected."""
+    """Compare the adapters in transfers that `comparable` selected."""
     runs, key = rows_of(found)
     reference = {name: _reference(name, runs) for name in runs}
     frame = pd.concat(
@@ -81,7 +81,7 @@ def compare_adapters(found: Sequence[Transferred]) -> AdapterComparison:
 
 
 def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """Return the arms and episodes that all rows of a condition have, and lines about left-out arms and episodes."""
+    """Return the episodes that all rows of a condition have in common, and lines about omitted arms and episodes."""
     count = part["row"].nunique()
     of_all = part.groupby(["arm", "goal"], sort=False)["row"].transform("nunique") == count
     shared, words = part[of_all], []
@@ -96,7 +96,7 @@ def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return `AdapterComparison.losses`; shared: outputs of `in_common` for all conditions in one table."""
+    """Return the table `AdapterComparison.losses`; `shared` is the output of `in_common` for all conditions."""
     key = ["row", "arm", "goal"]
     values = shared.rename(columns={measure: "value"})
     nominal = values.loc[values["condition"] == NOMINAL, [*key, "value"]].rename(columns={"value": "nominal"})
@@ -105,17 +105,17 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
-    """Return the lines of `AdapterComparison.scores` for one measure and one condition.
+    """Return the part of the table `AdapterComparison.scores` for one measure and one condition.
 
-    An episode without a value in one row (a stopped episode has no RMSE, no gap and an infinite distance) is omitted
-    in all rows. Rows without any value have no effect on this. A mean over a single episode has no interval.
+    If an episode has no value in one row, it is omitted in all rows: a stopped episode has no RMSE, no gap and an
+    infinite distance. A row without any value omits no episode. A mean over a single episode has no interval.
 
     Args:
-        shared: output of `in_common`. measure: measure to compare. reference: {row: row to compare with}.
+        shared: output of `in_common`. measure: the compared measure. reference: {row: its reference row or None}.
         seed: seed of the bootstrap.
     """
     wide = shared.pivot(index=["arm", "goal"], columns="row", values=measure.key)[list(shared["row"].unique())]
-    wide = wide.replace([np.inf, -np.inf], np.nan)  # a stopped episode has no distance, some tasks make it infinite
+    wide = wide.replace([np.inf, -np.inf], np.nan)  # a stopped episode has no distance; some tasks report inf
     stopped = shared.groupby("row", sort=False)["arm_stopped"].sum()
     power = 2 if measure.root_mean_square else 1
     kept = wide.dropna(axis=1, how="all").dropna()
@@ -143,10 +143,10 @@ def _interval(draws: np.ndarray, count: int) -> tuple[float, float]:
 
 
 def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]], list[str]]:
-    """Return {row name: transfers}, with the shortest distinct names, and lines that explain the names.
+    """Return {row name: transfers}, with the shortest distinct names, and lines that explain names of policies.
 
     A row is an adapter or, if an arm ran several policies, an adapter with a policy. If each arm ran only one policy,
-    rows do not distinguish policies.
+    a row contains all policies of its adapter.
     """
     of_arm: dict[str, set[str]] = {}
     for r in found:
@@ -172,7 +172,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return {path: its last parts}, with the smallest number of parts that distinguishes all paths."""
+    """Return {path: short path}; a short path has as many last parts of its path as distinguish all paths."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -181,7 +181,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the reference row: adapt=none with a policy of row `name`, else the only row of adapt=none, or None."""
+    """Return the reference of row `name`: the adapt=none row with the same policy, else the only adapt=none row."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]
@@ -189,7 +189,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Return a line about a row: the headline measure in the worst condition, and where the reference is better."""
+    """Return a line about a row: its headline measure in the worst condition, and where the reference is better."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:

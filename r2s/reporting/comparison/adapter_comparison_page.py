@@ -25,7 +25,7 @@ ABOUT = (
 
 
 def tables(found: AdapterComparison) -> dict[str, pd.DataFrame]:
-    """Return {title: table of strings}: one per measure, one of stopped episodes if there are any, one of costs."""
+    """Return {title: table of strings}: a table per measure, one of costs and, if needed, one of stopped episodes."""
     s = found.scores
     out = {m.heading: _cells(s[s["measure"] == key], m) for key, m in found.measures.items() if len(s)}
     first = s[s["measure"] == found.headline.key]
@@ -48,14 +48,14 @@ def _cells(scores: pd.DataFrame, m: Measure) -> pd.DataFrame:
 
 
 def _square(scores: pd.DataFrame) -> pd.DataFrame:
-    """Return the column `cell` as a table with a line per row and a column per condition, in order of occurrence."""
+    """Rearrange the column `cell` into a table of rows over conditions, both in order of occurrence."""
     wide = scores.pivot(index="row", columns="condition", values="cell").fillna("-")
     wide = wide.loc[list(scores["row"].unique()), list(scores["condition"].unique())]
     return wide.rename_axis("adapter").rename_axis(None, axis=1)
 
 
 def lines(found: AdapterComparison) -> list[str]:
-    """Return lines about the tables: a verdict per row, names of policies, and episodes that the means omit."""
+    """Return lines about the tables: a verdict per row, the names of policies, and the episodes not in the means."""
     s = found.scores
     out = [verdict(found, row) for row in found.runs]
     if len(s) and not s["stopped"].any():
@@ -76,7 +76,7 @@ def write(
     """Write adapter_comparison.csv, costs.csv, report.md, a figure and recording.rrd; return the tables of strings.
 
     Args:
-        run: run folder of the comparison. robot: the arm. found: scores. apart: {run: why it is not comparable}.
+        run: run folder to write to. robot: the arm. found: the comparison. apart: {run: why it is not comparable}.
         others: {folder: why it is no finished transfer}.
     """
     shown = tables(found)

@@ -15,10 +15,10 @@ SETTINGS: dict[str, tuple[Any, str]] = {  # keys of conf/arm that set a conditio
 
 
 def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, Any]:
-    """Return the settings of conf/arm that differ from nominal: {"payload": 1.0}.
+    """Return the settings of conf/arm that differ from their nominal values, such as {"payload": 1.0}.
 
     Args:
-        arm: config of the arm. typed: overrides such as "arm.live"; their keys are settings, too.
+        arm: config of the arm. typed: overridden keys; those of the arm, such as "arm.live", are settings, too.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
@@ -36,14 +36,14 @@ def in_words(settings: Mapping[str, Any]) -> str:
 
 
 def order(settings: Mapping[str, Any]) -> tuple:
-    """Return the sort key of a `condition`: number of settings (so nominal is first), then setting and size."""
+    """Return the sort key of a `condition`: number of settings (nominal: 0), then name and size of each setting."""
     keys = list(SETTINGS)
     each = [(keys.index(k) if k in keys else len(keys), k, _size(v), str(v)) for k, v in settings.items()]
     return len(each), each
 
 
 def _plain(value: Any) -> Any:
-    """Return a setting in its simplest form: 1 and {"mass": 1} become 1.0, because they are the same condition."""
+    """Return a setting in its simplest form: 1.0 for 1 and for {"mass": 1}, which mean the same payload."""
     if isinstance(value, Mapping) and set(value) == {"mass"}:
         value = value["mass"]
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value

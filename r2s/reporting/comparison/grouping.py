@@ -15,7 +15,7 @@ class Groups:
     """Runs by their settings.
 
     Attributes:
-        members: {"tqc, dr=paper": [a run per seed ...]}; no label is longer than `LONGEST` letters.
+        members: {label: runs, one per seed}; a label such as "tqc, dr=paper" has at most `LONGEST` letters.
         key: {"tqc #1": "tqc, calibration=..., dr=identified"}, full names of the numbered labels.
     """
 
@@ -27,7 +27,7 @@ def group(runs: Sequence[Trained]) -> Groups:
     """Return the runs grouped by settings: the runs of a group differ only in their seeds.
 
     A group's label is the algorithm and the overrides of the settings that differ among groups; all other settings
-    are default. A label that is too long for figures is replaced by a number, which `Groups.key` explains.
+    are default. A label longer than LONGEST is replaced by a numbered one, such as "tqc #1"; see `Groups.key`.
     """
     sets: dict[str, list[Trained]] = {}
     for run in runs:
@@ -45,7 +45,7 @@ def group(runs: Sequence[Trained]) -> Groups:
 
 
 def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
-    """Return a name for each set of seeds, as `group` describes."""
+    """Return a name for each set of runs that differ only in their seeds; `group` describes these names."""
     varied = _varied(sets)
     typed = [{k: v for run in seeds for k, v in run.typed.items()} for seeds in sets]
     parts = []
@@ -61,7 +61,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
     names = [_joined(seeds[0].algo, p) for seeds, p in zip(sets, parts, strict=True)]
     for name in list(names):
         twins = [k for k, other in enumerate(names) if other == name]
-        if len(twins) > 1:  # they differ in settings without an override, as in an experiment's file
+        if len(twins) > 1:  # settings that differ without an override: from an experiment's file
             changed = differing([sets[k][0].settings for k in twins])
             for k in twins:
                 more = {_short(s): sets[k][0].settings[s] for s in changed if s in sets[k][0].settings}
@@ -70,7 +70,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: settings that differ}: settings of algo= among its runs, other settings among all runs."""
+    """Return {algorithm: settings that differ}: settings of algo= among its runs, all others among all runs."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}
@@ -81,7 +81,7 @@ def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys whose values differ or that some settings lack."""
+    """Return the keys whose values differ between the settings, or that are missing in some of them."""
     keys = dict.fromkeys(k for s in settings for k in s)
     return [k for k in keys if len({repr(s.get(k)) for s in settings}) > 1]
 

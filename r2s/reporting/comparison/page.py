@@ -42,11 +42,11 @@ def comparison_page(
     """Write tables (CSV), figures, report.md and recording.rrd of a comparison of trainings.
 
     Args:
-        run: run of the comparison. robot: the arm. grouped: trainings. apart: {run: why it is not comparable}.
+        run: run folder to write to. robot: the arm. grouped: the groups. apart: {run: why it is not comparable}.
         others: {folder: why it is no finished training}.
 
     Returns:
-        {"scores", "improvement", "sensitivity"}: tables of scores.py.
+        {name: table} with the names scores, improvement and sensitivity; scores.py describes the tables.
     """
     groups, measures = grouped.members, measures_in(grouped.members)
     tables = {"scores": summary_table(groups), "improvement": improvement_table(groups)}
@@ -96,15 +96,15 @@ def _sections(
 
 
 def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]:
-    """Return a report section for each heading in {heading: {run: reason}}; headings without runs are left out."""
+    """Return a report section of reasons for each heading in {heading: {run: reason}}; omit headings without runs."""
     return {heading: [[f"{k}: {v}" for k, v in why.items()]] for heading, why in parts.items() if why}
 
 
 def bands_figure(path: Path, groups: Groups) -> Path:
-    """Draw interquartile mean and range of the seeds over env steps, updates and minutes, one row per measure.
+    """Draw learning curves over env steps, updates and minutes: interquartile mean and range of the seeds.
 
-    If there are more groups than colours, only the groups with the best last evaluation are drawn. A model-based
-    controller is drawn as a dotted line.
+    Each measure has a row of panels. If there are more groups than colors, only the groups with the best last
+    evaluation are drawn. A dotted line stands for a model-based controller.
     """
     grouped, table = groups.members, measures_in(groups.members)
     by = table[table.selection[-1]]

@@ -1,4 +1,4 @@
-"""Score groups of trainings by their last evaluation; a group has all seeds of one setting."""
+"""Score groups of trainings by their last evaluation; the trainings of a group differ only in their seeds."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,7 +19,7 @@ def measures_in(grouped: Grouped) -> MeasureTable:
 
 
 def scores(group: Sequence[Trained], measure: str) -> np.ndarray:
-    """Return a measure (S,) in the last evaluation of each of S seeds."""
+    """Return the values (S,) of a measure in the last evaluations of S seeds."""
     return np.array([r.last[measure] for r in group])
 
 
@@ -50,15 +50,15 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
-    """Return per algorithm how much a measure depends on its settings; empty if no algorithm has two settings.
+    """Return, per algorithm with two or more settings, how much a measure depends on the choice of the setting.
 
-    Columns: best, median and worst of the settings' interquartile means. best is optimistic, because the same seeds
-    choose and score the setting. held_out: each seed scores the setting that the other seeds choose; mean over seeds.
-    spread: held_out minus the median setting at the same seed, with a 95 % interval over seeds; nan if the settings
-    share fewer than two seeds. A small spread means little need for tuning.
+    `best`, `median` and `worst` are over the settings' interquartile means. `best` is optimistic, because the same
+    seeds select and score the setting. For `held_out`, each seed scores the setting that is best at the other seeds;
+    the scores are averaged. `spread` (with 95 % interval over seeds) is `held_out` minus the score of the median
+    setting; nan for fewer than two common seeds. An algorithm with a small `spread` needs little tuning.
 
     Args:
-        grouped: trainings. measure: key; None: the last of `MeasureTable.selection`.
+        grouped: groups of trainings. measure: key of the measure; None: the last of `MeasureTable.selection`.
     """
     table = measures_in(grouped)
     rows, measure = [], measure or table.selection[-1]
@@ -79,11 +79,11 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return two scores (S,) per held-out seed: of the setting that is best at the other seeds, and the median.
+    """Return per held-out seed (S,) the score of the setting that is best at the other seeds, and the median score.
 
     Args:
-        settings: {seed: score} per setting; larger is better. Only seeds that all settings have are used; the result
-            is None if fewer than two seeds remain.
+        settings: {seed: score} of each setting; larger is better. Only seeds that all settings have in common are
+            used; the result is None if there are fewer than two.
     """
     seeds = sorted(set.intersection(*(set(s) for s in settings)))
     if len(seeds) < 2:
@@ -94,7 +94,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line per setting of algo= or reward= whose best value is at an end of three or more tried values."""
+    """Return a line per setting of algo= or reward= whose best value is the smallest or largest of three or more."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -108,7 +108,7 @@ def at_edges(grouped: Grouped) -> list[str]:
 
 
 def edge(what: str, key: str, value: float, largest: bool) -> str:
-    """Return a line about a best value that is the largest or the smallest of the tried values."""
+    """Return a line which states that the best value of a setting is the largest or the smallest tried value."""
     return f"{what}: {key}={value:g} is the {'largest' if largest else 'smallest'} tried; a better one may lie beyond"
 
 
@@ -118,7 +118,7 @@ def is_number(value: object) -> bool:
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return one measure of an `improvement_table` as strings: probability that the row beats the numbered column."""
+    """Return one measure of an `improvement_table` as strings: the probability that a row is better than a column."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}

@@ -14,7 +14,7 @@ DRAWS = 2000  # number of draws of a bootstrap, as in Agarwal et al.
 def interquartile_mean(x: np.ndarray) -> np.ndarray:
     """Return the mean over the last axis of x (..., S) without the lowest and the highest quarter.
 
-    A quarter is S / 4 rounded down, as in rliable; so with fewer than four values the result is the mean.
+    A quarter is S / 4 rounded down, as in rliable: of fewer than four values, none is left out.
     """
     return np.asarray(trim_mean(x, 0.25, axis=-1))
 
@@ -25,8 +25,8 @@ def interval(
     """Return the 95 % interval of a statistic by a stratified bootstrap; nan if a stratum has only one score.
 
     Args:
-        strata: an array (S,) per stratum, with a score per seed. seed: random seed of the bootstrap.
-        statistic: function that maps a list of draws (D, S), one array per stratum, to (D,).
+        strata: one array (S,) per stratum, the scores of S seeds. seed: random seed of the bootstrap.
+        statistic: function that computes D values (D,) from D draws of each stratum, a list of arrays (D, S).
     """
     if min(map(len, strata)) < 2:
         return np.nan, np.nan
@@ -41,10 +41,10 @@ def interval(
 
 
 def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return bootstrap means (DRAWS, A) of A rows. A draw takes arms, and episodes of each arm, alike for all rows.
+    """Return bootstrap means (DRAWS, A) of A rows; a draw resamples arms and their episodes, the same for all rows.
 
     Args:
-        each: an array (E, A) per arm: values of E episodes in A rows of a comparison. rng: random generator.
+        each: one array (E, A) per arm, the values of E episodes in A rows of a comparison. rng: random generator.
     """
     draws = []
     for _ in range(DRAWS):
@@ -54,7 +54,7 @@ def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
 
 
 def improvement(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the probability (...) that a value of x (..., S) exceeds a value of y (..., T); a tie adds one half."""
+    """Return the probability (...) that a value of x (..., S) exceeds a value of y (..., T); ties have weight 0.5."""
     above = x[..., :, None] > y[..., None, :]
     same = x[..., :, None] == y[..., None, :]
     return (above + 0.5 * same).mean((-1, -2))

@@ -38,10 +38,10 @@ class Trained:
         settings: config values that the run read: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
         alike: config values that are equal in comparable runs: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
         origin: commit, machine, threads and device, None where meta.json has none; for a controller only the commit.
-        typed: overrides of these settings, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
+        typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether the run used +experiment=toy, which is too short to learn.
         minutes: budget of the run in minutes; None if the budget is in env_steps.
-        measures: measures of the task. curve: evaluations.csv, on the goals that selected the best policy.
+        measures: measures of the task. curve: table evaluations.csv, on the goals that select the best policy.
         last: measures of the last policy, from summary.json, on goals that were not used for selection.
     """
 
@@ -65,7 +65,7 @@ class Trained:
 
 
 def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
-    """Return the finished trainings among run folders, and {name: reason} of the other folders.
+    """Read the finished trainings in run folders; return them, and {folder: reason} for all other folders.
 
     Raises:
         UserError: there is no finished training.
@@ -78,7 +78,7 @@ def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[s
 
 
 def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
-    """Return the same as `read_trainings`, but an empty list instead of an error."""
+    """Return the output of `read_trainings`, with an empty list instead of an error."""
     trained, others = [], {}
     for folder in map(Path, folders):
         if why := why_not(folder, "train", FILES):
@@ -92,7 +92,7 @@ def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[
 
 
 def why_not(folder: Path, stage: str, files: Iterable[str]) -> str:
-    """Return why a folder is not a finished run of `stage` with these files; "" for such a run."""
+    """Return the reason why a folder is not a finished run of `stage` with all `files`, or "" if it is."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
         seen, status = meta.get("stage", "train"), meta["status"]
@@ -156,7 +156,7 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 
 def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, Any]:
-    """Return the values in some groups of a config, {"dr.phi_relative": 0.1, ...}, without `_target_`."""
+    """Return the settings in `groups` of a config as {"dr.phi_relative": 0.1, ...}, without keys `_target_`."""
     own = flat({group: node for group, node in config.items() if group in groups})
     return {key: value for key, value in own if not key.endswith("_target_")}
 
@@ -164,10 +164,10 @@ def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, 
 def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, dict[str, float]]:
     """Return evaluations.csv and the last policy's measures; a missing value becomes infinite if lower is better.
 
-    A value is missing (null in summary.json) if the arm was stopped in all episodes.
+    If the arm was stopped in all episodes, a measure has no value: null in summary.json.
 
     Raises:
-        ValueError: a value of another measure is missing, or there is no evaluation.
+        ValueError: there is no evaluation, or a measure for which higher is better has no value.
     """
     curve = pd.read_csv(folder / "evaluations.csv")
     if curve.empty:
@@ -185,11 +185,11 @@ def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, di
 
 
 def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
-    """Return the largest set of comparable runs, and {name: reason} of the others.
+    """Return the largest set of comparable runs, and {run: reason} for the runs left out.
 
     Runs are comparable if robot, task, evaluation, commit and machine agree and budgets differ by at most the factor
-    `MOST_BUDGETS`. Of sets of equal size, one without +experiment=toy is preferred, then one with more env steps. Of
-    two runs with equal settings and seed, only the first is used, because the second adds no evidence.
+    `MOST_BUDGETS`. Among sets of equal size, one without +experiment=toy has priority, then one with more env steps.
+    Of two runs with equal settings and seed, only the first is used, because the second adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -208,7 +208,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why a run is not comparable with `first`, the run with the least budget in a set; "" if comparable."""
+    """Return why a run is not comparable with `first`, the run of the set with the smallest budget; "" if it is."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]
@@ -230,7 +230,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """Format {name: reason} as ["a, b (failed)", "c (unfinished)"]: `most` names per reason, names cut to `width`."""
+    """Group names by reason, ["a, b (failed)", "c (unfinished)"], up to `most` names each, cut to `width` letters."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

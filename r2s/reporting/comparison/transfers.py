@@ -29,11 +29,11 @@ class Transferred:
 
     Attributes:
         folder: run folder. start: start time, from meta.json. policy: absolute path of the policy's run folder.
-        adapter: name in conf/adapt. settings: settings of the adapter: {"filter_s": 0.087}.
-        arm: "twin, rigid, seed 0". condition: output of `condition`. robot: config of the robot in training.
+        adapter: name in conf/adapt. settings: the adapter's settings, such as {"filter_s": 0.087}.
+        arm: name such as "twin, rigid, seed 0". condition: output of `condition`. robot: robot config in training.
         measures: measures of the task. length: episode length, policy rate: "4 s at 100 Hz". goals: number of goals.
-        us: median time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
-        episodes: a row per episode, indexed by goal: `MeasureTable.transfer`, the gap, and arm_stopped (0 or 1).
+        us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
+        episodes: a row per episode, indexed by goal: measures `MeasureTable.transfer`, gap and arm_stopped (0 or 1).
     """
 
     folder: Path
@@ -52,7 +52,7 @@ class Transferred:
 
 
 def read_transfers(folders: Sequence[str | Path]) -> tuple[list[Transferred], dict[str, str]]:
-    """Return the finished transfers to an arm among run folders, and {name: reason} of the other folders."""
+    """Read the finished transfers to an arm in run folders; return them, and {folder: reason} for other folders."""
     found, others = [], {}
     for folder in map(Path, folders):
         why = why_not(folder, "transfer", FILES)
@@ -103,9 +103,9 @@ def _cost(path: Path) -> float:
 
 
 def _names(goals: np.ndarray) -> Iterator[str]:
-    """Yield a name per goal, the same in all transfers; equal goals are numbered.
+    """Yield a name for each goal, the same in all transfers; a number distinguishes goals at the same place.
 
-    Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometres.
+    Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometers.
     """
     seen: Counter[bytes] = Counter()
     for goal in goals:
@@ -115,10 +115,10 @@ def _names(goals: np.ndarray) -> Iterator[str]:
 
 
 def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[str, str]]:
-    """Return the largest set of comparable transfers, and {name: reason} of the others.
+    """Return the largest set of comparable transfers, and {run: reason} for the transfers left out.
 
-    Transfers are comparable if robot, task and goals agree. Of several runs with equal policy, adapter, arm and
-    condition, only the last is used.
+    Transfers are comparable if robot and task agree and they share goals. Of several runs with equal policy, adapter,
+    arm and condition, only the last is used.
     """
     first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
     apart = {r.folder.name: why for r in found if (why := _difference(r, first))}

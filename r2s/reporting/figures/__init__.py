@@ -1,1 +1,1 @@
-"""Draw figures (PNG): panels and colours, learning curves, episodes."""
+"""Draw figures (PNG): panels and colors, learning curves, episodes."""

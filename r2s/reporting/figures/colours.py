@@ -1,9 +1,9 @@
-"""Assign each label a colour, the same in figures and in the viewer."""
+"""Assign each label a color, the same in figures and in the viewer."""
 
 from collections.abc import Iterable
 
 KNOWN = {"measured": "#9aa0a6", "nominal": "#f28e2b", "identified": "#3b8fe0"}
-# twelve colours far apart in OKLab; their WCAG contrast to black and to white is at least 2.4
+# twelve colors far apart in OKLab; their WCAG contrast to black and to white is at least 2.4
 OTHERS = (
     "#3daa6d", "#d65f9e", "#9b7ede", "#c9a227", "#784800", "#005484",
     "#cc0018", "#5400f0", "#007800", "#d800fc", "#607878", "#900c90",
@@ -13,8 +13,8 @@ OTHERS = (
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
-    The first label with the word "measured", "nominal" or "identified" ("twin, nominal") gets that word's colour.
-    The other labels get the twelve colours of OTHERS in order, repeated after the twelfth.
+    The first label that contains the word "measured", "nominal" or "identified" has that word's color in KNOWN. The
+    other labels have the twelve colors of OTHERS in order, repeated after the twelfth.
     """
     found: dict[str, str] = {}
     others = 0

@@ -1,4 +1,4 @@
-"""Reduce the rows of long logs for figures, and shorten the pauses of their clocks."""
+"""Reduce the number of rows of long logs for figures, and shorten the pauses in these logs."""
 
 import numpy as np
 
@@ -18,9 +18,9 @@ def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
 
 
 def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a clock (T,) s from zero in which each pause of t (T,) s lasts `PAUSE`, and the first row after each.
+    """Shorten each pause of the clock t (T,) s to `PAUSE`; return a clock from 0, and the first row after each pause.
 
-    A pause is a step of more than five median steps, or a step back (a log that restarts its clock).
+    A pause is a time step longer than five median steps, or a backward step at a clock restart.
     """
     steps = np.diff(t)
     usual = float(np.median(steps)) if len(steps) else 0.0

@@ -23,7 +23,7 @@ TITLE, AGAIN = 0.9, 0.2  # inches added to the heights of the rows: once, and fo
 def panels(
     path: Path, count: int, columns: int, title: str, height: float = 2.3, key: str | None = None
 ) -> Iterator[list[Axes]]:
-    """Yield `count` axes in a grid, then save the figure to `path`, with one legend headed by `key`.
+    """Yield `count` axes in a grid, then save the figure to `path`, with one legend; `key` is its title.
 
     `height` is the height of a row of panels in inches.
     """
@@ -60,14 +60,14 @@ def joint_panels(path: Path, n: int, title: str) -> AbstractContextManager[list[
 
 
 def label_axis(axis: Axes, m: Measure) -> None:
-    """Set the title of a measure's panel; a percentage gets its whole range as the y axis."""
+    """Set the title of a measure's panel; for a percentage, the y axis covers 0 to 100 %."""
     axis.set_title(m.heading, loc="left")
     if m.unit == "%":
         axis.set_ylim(-3, 103)
 
 
 def log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Make y logarithmic, with plain numbers at these `ticks` of each decade."""
+    """Make the y axis logarithmic, with ticks at the multiples `ticks` of each power of ten, without exponents."""
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(subs=ticks))
     axis.yaxis.set_major_formatter("{x:g}")

@@ -38,7 +38,7 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def press_table(found: ContactEstimate) -> pd.DataFrame:
-    """Return the RMS error of the surface's normal force, against joint torques, in fitted and held-out presses."""
+    """Return the RMS error of the modeled normal force, relative to joint torques, in fitted and held-out presses."""
     parts = {"fitted presses": found.training, "held-out press": found.validation}
     cells = {
         name: [f"{part.summary()['seconds']:.1f}", *(number(part.rmse(side), "{:.2f}") for side in (0.0, 1.0, -1.0))]

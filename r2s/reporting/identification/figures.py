@@ -29,13 +29,13 @@ def torque_figure(
 ) -> Path:
     """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s (figure 4 of the paper).
 
-    The figure shows the first `LONGEST` seconds, with pauses cut short; the RMSE in its titles is over all rows.
+    The figure shows the first `LONGEST` seconds, with shortened pauses. The RMSE in the titles is that of all rows.
     """
     colour, (clock, pauses) = colours(["measured", *predicted]), without_pauses(t)
     rows = np.flatnonzero(clock <= LONGEST)
     title += f" (the first {LONGEST:g} s of {clock[-1]:.0f} s)" if len(rows) < len(t) else ""
     rows = rows[thin(len(rows))]
-    breaks = np.searchsorted(rows, pauses[pauses <= rows[-1]])  # a nan there interrupts the line
+    breaks = np.searchsorted(rows, pauses[pauses <= rows[-1]])  # nan at a pause interrupts the line
 
     def line(values: np.ndarray) -> np.ndarray:
         return np.insert(values[rows], breaks, np.nan)
@@ -57,9 +57,9 @@ def torque_figure(
 def position_figure(
     path: Path, windows_q: np.ndarray, predicted: Mapping[str, np.ndarray], dt: float = SIM_DT
 ) -> Path:
-    """Draw the open-loop error of predicted {label: (W, S, n)} against windows_q (W, S, n), rad, rows `dt` s apart.
+    """Draw the open-loop error: the difference of predicted {label: (W, S, n)} and measured windows_q (W, S, n), rad.
 
-    Lines are medians over the W windows; bands contain 90 % of the windows.
+    `dt` is the time step of the S rows, s. Lines are medians over the W windows; bands contain 90 % of the windows.
     """
     colour, t = colours(predicted), dt * np.arange(1, windows_q.shape[1] + 1)
     title = f"open-loop error over {len(windows_q)} windows: median and 90 % band"
@@ -92,7 +92,7 @@ def friction_figure(
     Args:
         path: path of the PNG. dynamics: {label: model}. dq_max: range of the speed axis.
         data: speed (T, n) rad/s and friction torque (T, n) Nm of a recording.
-        draws: (S, n, K) posterior draws of the last model's parameters, for its 95 % band.
+        draws: (S, n, K) posterior draws of the friction parameters of the last model, for the 95 % band.
     """
     colour = colours(dynamics)
     grid = np.linspace(-1, 1, 401)
@@ -138,7 +138,7 @@ def _band(
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
     """Draw the cost of each search over seconds, relative to its start; steps without a cost are shaded.
 
-    Costs are comparable within one search only, because residuals are reweighted between searches.
+    Costs are comparable only within one search, because the next search weights the residuals anew.
     """
     history = history.assign(seconds=_running(history["seconds"].to_numpy(float)))
     name = history["search"].astype(str)
@@ -171,6 +171,6 @@ def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
 
 
 def _running(seconds: np.ndarray) -> np.ndarray:
-    """Return seconds (K,) that increase throughout, although a resumed run restarted them at zero."""
+    """Return seconds (K,) that always increase; the input restarts at zero where a run was resumed."""
     steps = np.diff(seconds, prepend=0.0)
     return np.cumsum(np.where(steps < 0, seconds, steps))

@@ -1,4 +1,4 @@
-"""Report the limits of an identification: parameters and combinations that its data do not constrain."""
+"""Report the limits of an identification: parameters and combinations that the data do not constrain."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,7 +6,7 @@ from r2s.identification.link_inertia import LINK
 from r2s.identification.result import SHARPER, IdentificationResult
 from r2s.reporting.document import Item
 
-MOST_LINES = 10  # most null directions that are listed
+MOST_LINES = 10  # largest number of listed null directions
 
 
 def identifiability(found: IdentificationResult) -> list[Item]:
@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """List the combinations that the prior determines; for those of parameters kept nominal, only their number."""
+    """List the combinations that only the prior determines; for parameters kept nominal, state only the number."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}
@@ -53,14 +53,14 @@ def _null_directions(found: IdentificationResult) -> list[Item]:
 
 
 def _place(name: str) -> tuple[str, str, str]:
-    """Split a name such as phi1[3] into block, kind ("joint" or "link") and number; whole arm: kind, number ""."""
+    """Split a name such as phi1[3] into block, kind ("joint" or "link", "" for the whole arm) and number (or "")."""
     block, _, number = name.rstrip("]").partition("[")
     kind = "link" if block in LINK or block == "inertia_scale" else "joint"
     return block.removeprefix("link_"), kind if number else "", number
 
 
 def _grouped(names: Sequence[str], n: int = 0) -> str:
-    """Return "phi3 of joints 1, 4; alpha of all links" for names such as phi3[1]; n is the number of joints."""
+    """Return names such as phi3[1] as "phi3 of joints 1, 4; alpha of all links"; n is the number of joints."""
     groups: dict[tuple[str, str], list[str]] = {}
     for name in names:
         block, kind, at = _place(name)
@@ -73,7 +73,7 @@ def _grouped(names: Sequence[str], n: int = 0) -> str:
 
 
 def _combination(parts: Mapping[str, float]) -> str:
-    """Return "0.81 d1 of link 3 - 0.57 d2 of link 3"; a direction has no sign, so the first part is positive."""
+    """Return a direction as "0.81 d1 of link 3 - 0.57 d2 of link 3", with its arbitrary sign such that 0.81 > 0."""
     flip = -1.0 if next(iter(parts.values())) < 0 else 1.0
     terms = [f"{'-' if flip * part < 0 else '+'} {abs(part):.2f} {_grouped([name])}" for name, part in parts.items()]
     return " ".join(terms).removeprefix("+ ")

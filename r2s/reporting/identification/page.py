@@ -52,7 +52,7 @@ FIGURE_WINDOW_S = 0.5  # s, shortest open-loop window in the position figure, un
 
 
 class Evidence(NamedTuple):
-    """Figures and tables of the page that `IdentificationResult` does not contain.
+    """Figures and tables of an identification's page, besides those of `IdentificationResult`.
 
     Attributes:
         pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, highest speeds of the validation motion.
@@ -79,7 +79,7 @@ def identification_page(
     cutoff_hz: float,
     more: Mapping[str, Sequence[Item]] | None = None,
 ) -> None:
-    """Write figures, report.md, report.html, base_parameters.csv, torque.npz and recording.rrd, on validation motion.
+    """Write the report (Markdown, HTML), figures, base_parameters.csv, torque.npz and recording.rrd.
 
     Args:
         run: run of the identification. nominal: nominal model. found: result. validation: held-out motion.
@@ -132,7 +132,7 @@ def identification_sections(
     summary: Mapping,
     evidence: Evidence,
 ) -> dict[str, Sequence[Item]]:
-    """Return {heading: paragraphs, bullets, tables, figures}; arguments as in `identification_page`."""
+    """Return the page as {heading: paragraphs, bullets, tables, figures}; see `identification_page` for arguments."""
     commanded = validation.torque == "commanded"
 
     def shown(*names: str) -> list[Item]:

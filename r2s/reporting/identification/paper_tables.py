@@ -27,7 +27,7 @@ BREAKAWAY = "Torque (command plus offset, Nm) at which a resting joint starts to
 
 
 def _listed(rows: Sequence[Value]) -> dict[str, list[str]]:
-    """Return the columns "old", "new" and "95 % interval"."""
+    """Return a table's columns "old" (nominal), "new" (identified) and "95 % interval"."""
     return {
         "old": [number(v.old) for v in rows],
         "new": [number(v.old) if v.kept else v.found for v in rows],
@@ -89,7 +89,7 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
 
 
 def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
-    """Return the base parameters, a row per link; a combination is in the column of its first parameter."""
+    """Return a table of base parameters: rows are links; the column states the combination's first parameter."""
     columns: dict[str, list[str]] = {}
     rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
     for first, row in zip(base["parameter"], rows.tolist(), strict=True):
@@ -103,7 +103,7 @@ def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
 
 
 def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return Table III: link tensors and, with the full parametrisation, mass and centre of mass."""
+    """Return Table III: link tensors and, with the full parametrization, mass and center of mass."""
     space, d = found.space, found.dynamics
     full = bool(set(LINK) & set(space.blocks))
     if not full and "inertia_scale" not in space.blocks:
@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return a column with `get` per link; a value is identifiable if all its parameters in `blocks` are."""
+        """Return the cell of `get` for each link; a value is identifiable if all its parameters in `blocks` are."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]
@@ -129,7 +129,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     if full:
         columns = {"mass, kg": cells(lambda x: x.mass, LINK[:1])}
         for k, axis in enumerate("xyz"):
-            # the factor is upper triangular: coordinate k of the centre depends on t_k and later translations
+            # the factor is upper triangular: coordinate k of the center depends on t_k and later translations
             columns[f"centre {axis}, mm"] = cells(partial(_centre, k), LINK[7 + k :])
         words = (
             "Mass and centre of mass in the link's frame, old → new. A value is identifiable (no ?) if all its "
@@ -159,7 +159,7 @@ def _consistency(d: Dynamics) -> str:
 
 
 def friction_table(robot: Robot, nominal: Dynamics, found: IdentificationResult, fastest: np.ndarray) -> list[Item]:
-    """Return Table IV for the identified family, with the friction level at `fastest` (n,) rad/s."""
+    """Return Table IV for the identified friction family, with its friction level at speeds `fastest` (n,) rad/s."""
     space, d = found.space, found.dynamics
     own = [b for b in d.family.names if b in space.blocks]
     columns = {named(b): [v.cell for v in values(space, found.found, b, found.unseen)] for b in own}
@@ -181,7 +181,7 @@ def friction_table(robot: Robot, nominal: Dynamics, found: IdentificationResult,
 
 
 def other_terms(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return up to two tables: parameters of the whole arm; armature, load, drag and gain per joint."""
+    """Return a table of the parameters of the whole arm, and one of armature, load, drag and gain per joint."""
     space = found.space
     items: list[Item] = []
     if arm := of_whole_arm(space, found.found, found.unseen):

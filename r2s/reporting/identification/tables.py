@@ -41,9 +41,9 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
 
 
 def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
-    """Return the heading of a parameter's row and a cell per joint: value, ± half of its interval, nominal value.
+    """Return a parameter's row heading and a cell per joint: value, ± half the interval's width, and nominal value.
 
-    If the nominal value of all joints is the same, only the heading shows it.
+    If all joints have the same nominal value, it is in the heading instead of the cells.
     """
     unit = units()[block]
     if unit == "rad":
@@ -66,7 +66,7 @@ def _breakaway(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
 
 
 def _links(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
-    """Return a row per link: mass, shift of the centre of mass, trace of the inertia relative to nominal."""
+    """Return a row per link: mass, shift of the center of mass, trace of the inertia relative to nominal."""
     space = identified.space
     before, after, draws = (space.dynamics(x) for x in (space.start, identified.x, identified.found.samples))
 
@@ -109,13 +109,13 @@ def error_tables(robot: Robot, summary: Mapping) -> dict[str, pd.DataFrame]:
 
 
 def _pair(errors: Mapping, key: str) -> tuple[list[float], ...]:
-    """Return the errors of the nominal and of the identified model, each with its mean appended."""
+    """Return the errors of the nominal model and of the identified model; append the mean to each list."""
     before, after = errors.get(f"nominal_{key}", [np.nan] * len(errors[key])), errors[key]
     return [*before, float(np.mean(before))], [*after, float(np.mean(after))]
 
 
 def _before_after(columns: Mapping[str, Sequence[Sequence[float]]], index: pd.Index) -> pd.DataFrame:
-    """Return the columns nominal, identified and ratio, for training and validation motion."""
+    """Return a table with the columns nominal, identified and ratio, for training and for validation motion."""
     table = {}
     for side, (before, after) in columns.items():
         ratios = [a / b if b else np.nan for b, a in zip(before, after, strict=True)]

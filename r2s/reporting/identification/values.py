@@ -36,19 +36,19 @@ class Value(NamedTuple):
 
     @property
     def cell(self) -> str:
-        """Cell with two lines: "old → new" and "[low, high]"."""
+        """Table cell with two lines: "old → new" and "[low, high]"."""
         if self.kept or self.fixed:
             return f"{number(self.old)}\n{KEPT if self.kept else FIXED}"
         return f"{number(self.old)} → {self.found}\n{self.interval}"
 
     @property
     def found(self) -> str:
-        """The new value, with "?" if it is not identifiable."""
+        """The identified value, followed by "?" if the parameter is not identifiable."""
         return number(self.new) + ("" if self.identifiable or self.fixed else " ?")
 
     @property
     def short(self) -> str:
-        """Cell with two lines: "new" and "± half of the interval"."""
+        """Table cell with two lines: the identified value, and "±" with half the width of the 95 % interval."""
         half = 0.5 * (self.high - self.low)
         if self.kept or self.fixed:
             return f"{number(self.old)}\n{'kept' if self.kept else FIXED}"
@@ -62,7 +62,7 @@ class Value(NamedTuple):
 
 
 def values(space: ParameterSpace, found: ParameterEstimate, block: str, kept: Sequence[str] = ()) -> list[Value]:
-    """Return a block's values, one per joint or link or one for the whole arm. kept: parameters kept nominal."""
+    """Return the values of a parameter `block`, one per joint, per link or per arm; `kept`: nominal parameters."""
     marks = (np.isin(space.names, list(names)) for names in (kept, space.fixed))
     parts = (space.start, found.x, found.low, found.high, found.identifiable, *marks)
     return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]

@@ -17,7 +17,7 @@ LEGEND = f"?: wider than {2 / SHARPER:g} standard deviations of the prior; prior
 
 
 class Widths(Protocol):
-    """Expected interval widths of P parameters: `ExpectedWidths` of a recording or `PlannedWidths` of a motion."""
+    """Interface for expected interval widths of P parameters; see `ExpectedWidths` and `PlannedWidths`."""
 
     @property
     def space(self) -> ParameterSpace: ...  # noqa: D102
@@ -51,7 +51,7 @@ def width_table(expected: Widths, n: int) -> pd.DataFrame:
 
 
 def print_verdict(console: Console, robot: Robot, verdict: Verdict, title: str) -> None:
-    """Print the checks and, if the verdict has them, the expected widths."""
+    """Print the table of checks and, if the verdict contains them, the expected widths of the intervals."""
     print_table(console, verdict_table(verdict), title, sentences=True)
     if verdict.expected is not None:
         print_table(console, width_table(verdict.expected, robot.n), WIDTHS, LEGEND)

@@ -1,4 +1,4 @@
-"""Test the whiteness of the torque residual: compare it with white noise that passed the same filter."""
+"""Test the whiteness of the torque residual: compare the residual with equally filtered white noise."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -72,9 +72,9 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lags up to `LAGS_S`, s, autocorrelation of filtered white noise, half width of its 95 % band, (L,) each.
+    """Return lags (L,) s, the autocorrelation of filtered white noise (L,), and the half width of its 95 % band (L,).
 
-    The filter is `Recording.smooth`. The band follows Bartlett for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
+    The filter is `Recording.smooth`. The band is Bartlett's for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
     """
     step = float(np.median(np.diff(t)))
     edges = np.array([0, *without_pauses(t)[1], len(t)])

@@ -1,1 +1,1 @@
-"""Show a run in other tools while it is running: async_tracker.py calls a tracker for each tool."""
+"""Show a running stage in other tools: async_tracker.py calls one tracker per tool."""

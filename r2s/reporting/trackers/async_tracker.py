@@ -1,6 +1,6 @@
 """Run each tracker in a thread of its own, so that no tracker can delay or end a run.
 
-If a tracker fails, r2s prints one warning and does not call it again.
+If a tracker fails, r2s prints one warning and does not call the tracker again.
 """
 
 import math
@@ -20,7 +20,7 @@ FILES = ("recording.rrd", "report.html", "report.md", "parameters.yaml", "policy
 
 
 class AsyncTracker:
-    """A tracker and the thread that calls it; `send` returns at once."""
+    """A tracker with its own thread, which executes the calls queued by `send`."""
 
     def __init__(self, name: str, tracker: Tracker):
         self._name, self._tracker, self._works = name, tracker, True
@@ -76,7 +76,7 @@ class Trackers:
         self._send(lambda tracker: tracker.log(table, numbers, step))
 
     def summary(self, document: Mapping[str, Any]) -> None:
-        """Send the numbers of summary.json."""
+        """Send the finite numbers in summary.json to all trackers."""
         numbers = finite(dict(flat(document, between="/")))
         self._send(lambda tracker: tracker.summary(numbers))
 

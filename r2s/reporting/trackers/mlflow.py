@@ -1,7 +1,7 @@
 """Implement tracker=mlflow: write to an SQLite store next to the run folders, or to a server.
 
-`mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows the store. This command needs the complete MLflow; the
-extra r2s[trackers] installs only the part that writes.
+`mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows the store. This command needs the package mlflow; the
+extra r2s[trackers] installs only mlflow-skinny, which can write the store.
 """
 
 import logging
@@ -23,7 +23,7 @@ BATCH = 100  # parameters per call: MLflow's limit
 
 
 class Logger(MLFlowLogger):
-    """TorchRL's logger with arguments for mlflow.start_run, because the original always begins a new run."""
+    """TorchRL's logger, changed to continue a run: it passes the arguments `start` to mlflow.start_run."""
 
     def __init__(self, *args: Any, start: dict[str, Any], **kwargs: Any):
         self._start = start
@@ -53,7 +53,7 @@ class Mlflow(LoggerTracker):
         self._uri, self._experiment = uri, experiment
 
     def start(self, run: Tracked) -> None:
-        """Begin a run, or continue the one stored in the run folder."""
+        """Begin an MLflow run, or continue the run whose id is stored in the run folder."""
         tags = {"stage": run.stage, "folder": str(run.folder.absolute()), "mlflow.source.type": "LOCAL"}
         tags |= {"group": run.group} if run.group else {}
         tags |= {"mlflow.source.git.commit": commit} if (commit := run.meta["git"]["commit"]) else {}

@@ -10,7 +10,7 @@ from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Tensorboard(LoggerTracker):
-    """A run as scalars, settings and figures; event files cannot store other files, so these are only listed."""
+    """A run in event files: scalars, settings, figures, and a list of other files, which event files cannot store."""
 
     def __init__(self) -> None:
         optional_import("tensorboard", "tracker=tensorboard", "trackers")
@@ -24,7 +24,7 @@ class Tensorboard(LoggerTracker):
         self._logger.flush()
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
-        """Show a row of <table>.csv."""
+        """Log a row of <table>.csv."""
         if self._resumes:
             self._resumes = False
             self._hide_from(step)
@@ -35,7 +35,7 @@ class Tensorboard(LoggerTracker):
         self._logger.flush()  # otherwise a killed run loses two minutes of rows
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
-        """Show the figures and list the files."""
+        """Log the figures, the paths of the files, and the status."""
         import numpy as np
         from PIL import Image
 
@@ -48,7 +48,7 @@ class Tensorboard(LoggerTracker):
         self._logger.shutdown()
 
     def _settings(self) -> None:
-        """Write the settings and the measure by which runs are compared; add_hparams would begin another run."""
+        """Log the settings, and the measure that compares runs, without add_hparams, which would begin a new run."""
         from torch.utils.tensorboard.summary import hparams
 
         metric = {f"summary/best/{self._run.measures.selection[0]}": 0}
@@ -56,7 +56,7 @@ class Tensorboard(LoggerTracker):
             self._logger.experiment.file_writer.add_summary(summary)
 
     def _hide_from(self, step: int) -> None:
-        """Hide the stopped run's rows from `step` on, because the resumed run writes these rows again."""
+        """Hide the rows of the stopped run from `step` on, because the resumed run logs these rows again."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         begin = Event(step=step, session_log=SessionLog(status=SessionLog.START))

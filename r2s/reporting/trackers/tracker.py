@@ -17,7 +17,7 @@ WRITING = Lock()  # each tracker runs in its thread, and all of them write FILE
 
 @dataclass(frozen=True)
 class Tracked:
-    """A run that trackers show.
+    """Information about a run for its trackers.
 
     Attributes:
         folder: runs/<stage>/<name>. stage: the run's stage. group: the run's sweep, or None.
@@ -39,14 +39,14 @@ class Tracked:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The flat config, {"algo.lr": 5e-4, ...}, and the git commit; values are numbers, strings and booleans."""
+        """The config as a flat dict {"algo.lr": 5e-4, ...} of scalars and strings, with the git commit."""
         git = self.meta["git"]
         plain = {k: v if isinstance(v, bool | int | float) else str(v) for k, v in flat(self.config)}
         return plain | {"git_commit": str(git["commit"]), "git_dirty": str(git["dirty"])}
 
     @property
     def measures(self) -> MeasureTable:
-        """Measures of the run's task; trainings and transfers write these to the folder before their first row."""
+        """Measures of the run's task, which trainings and transfers write to measures.json before their first row."""
         return measures_of(self.folder)
 
     def kept(self, key: str) -> str | None:
@@ -62,22 +62,22 @@ class Tracked:
 
 
 class Tracker(Protocol):
-    """Shows a run in another tool. Hydra creates a tracker before the run folder. One thread calls it, in order.
+    """Interface to a tool that shows runs. Hydra creates a tracker before the run folder; one thread makes all calls.
 
     After an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
     """
 
     def start(self, run: Tracked) -> None:
-        """Begin to show a run, or continue it if `run.resumed`."""
+        """Begin to log the run, or continue to log a stopped run if `run.resumed`."""
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
-        """Show a row of <table>.csv; `step` is its env_steps, else the row's number."""
+        """Log a row of <table>.csv; `step` is the row's env_steps, or else the row's number."""
 
     def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the numbers of summary.json, {"best/success_1cm": 0.93, ...}."""
+        """Log the numbers in summary.json as {"best/success_1cm": 0.93, ...}."""
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
-        """Store figures (PNG) and other files, and end the run with this status: done, stopped or failed."""
+        """Store figures (PNG) and other files, and end the run with `status`: done, stopped or failed."""
 
 
 class LoggerTracker:
@@ -86,11 +86,11 @@ class LoggerTracker:
     _logger: Any
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
-        """Show a row of <table>.csv."""
+        """Log a row of <table>.csv."""
         self._logger.log_metrics({f"{table}/{k}": v for k, v in numbers.items()}, step)
 
     def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the numbers of summary.json."""
+        """Log the numbers in summary.json."""
         self._logger.log_metrics({f"summary/{k}": v for k, v in numbers.items()}, 0)
 
 

@@ -25,7 +25,7 @@ class Trackio:
         self._project = project
 
     def start(self, run: Tracked) -> None:
-        """Begin a run, or continue the one stored in the run folder."""
+        """Begin a Trackio run, or continue the run whose name is stored in the run folder."""
         import trackio
 
         for module in (trackio, trackio.run, trackio.utils):
@@ -38,11 +38,11 @@ class Trackio:
         run.keep("trackio", run.name)
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
-        """Show a row of <table>.csv."""
+        """Log a row of <table>.csv."""
         self._logger.experiment.log({f"{table}/{k}": v for k, v in numbers.items()}, step=step)
 
     def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the numbers of summary.json."""
+        """Log the numbers in summary.json."""
         self._logger.experiment.log({f"summary/{k}": v for k, v in numbers.items()})
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:

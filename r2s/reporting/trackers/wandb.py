@@ -25,7 +25,7 @@ class Wandb(LoggerTracker):
         self._where, self._offline = {"project": project, "entity": entity}, offline
 
     def start(self, run: Tracked) -> None:
-        """Begin a run, or continue the one stored in the run folder."""
+        """Begin a W&B run, or continue the run whose id is stored in the run folder."""
         import wandb
 
         known = run.kept("wandb") if run.resumed else None
@@ -46,7 +46,7 @@ class Wandb(LoggerTracker):
         )
 
     def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the numbers of summary.json."""
+        """Log the numbers in summary.json."""
         self._logger.experiment.summary.update({f"summary/{k}": v for k, v in numbers.items()})
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:

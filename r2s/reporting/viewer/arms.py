@@ -22,7 +22,7 @@ WORST_M = 0.01  # m, the trail on a path is red from this error on
 
 
 class _Arm(NamedTuple):
-    """An arm in the rerun recording; `frames` are the logged rows, `starts` (s) the start times of the episodes."""
+    """An arm in the rerun recording; `frames`: logged rows per episode; `starts`: start times of the episodes, s."""
 
     stream: rr.RecordingStream
     base: str
@@ -123,7 +123,7 @@ def _boxes(arm: _Arm, up: np.ndarray) -> None:
 
 
 def _paths(arm: _Arm) -> None:
-    """Log each episode's path, the current goal on the path, and the end effector's trail, coloured by the error."""
+    """Log each episode's path, the current goal on the path, and the end effector's trail, colored by the error."""
     pairs = list(zip(arm.episodes, arm.frames, strict=True))
     grey = rr.LineStrips3D.from_fields(colors=[150, 150, 150], radii=0.0015)
     arm.send("path", grey, rr.LineStrips3D.columns(strips=[e.goal for e in arm.episodes]), per_episode=True)
@@ -146,7 +146,7 @@ def _paths(arm: _Arm) -> None:
 
 
 def _shades(error: np.ndarray) -> np.ndarray:
-    """Return (T, 3) colours of errors (T,) m: green at 0, yellow at WORST_M / 2, red from WORST_M."""
+    """Return colors (T, 3) of errors (T,) m: green at 0, yellow at WORST_M / 2, red from WORST_M on."""
     share = np.clip(error / WORST_M, 0.0, 1.0)[:, None]
     low, middle, high = np.array([[61, 170, 109], [235, 200, 60], [255, 60, 60]], dtype=float)
     warm = np.where(share < 0.5, low + 2 * share * (middle - low), middle + (2 * share - 1) * (high - middle))
@@ -168,7 +168,7 @@ def _link(base: str, model: mujoco.MjModel, body: int) -> str:
 
 
 def _height(model: mujoco.MjModel) -> float:
-    """Return a height above the base, m, at which the label is clear of the arm."""
+    """Return a height above the base, m, at which the label does not cover the arm."""
     return 0.85 * float(np.linalg.norm(model.body_pos[1:], axis=1).sum())
 
 
@@ -184,7 +184,7 @@ def _poses(model: mujoco.MjModel, q: np.ndarray) -> dict[int, tuple[np.ndarray, 
 
 
 def _shapes(stream: rr.RecordingStream, model: mujoco.MjModel, body: int, path: str, colour: str) -> None:
-    """Log the geoms of one link in the link's frame; dark geoms (joints) get the arm's colour."""
+    """Log the geoms of one link in the link's frame; dark geoms (joints) have the arm's color."""
     for geom in _shown_geoms(model)[model.geom_bodyid[_shown_geoms(model)] == body]:
         own = 255 * model.geom_rgba[geom, :3]
         own = rgb(colour) if own.mean() < 100 else own
@@ -204,7 +204,7 @@ def _shape(model: mujoco.MjModel, geom: int, colour: np.ndarray) -> rr.AsCompone
     solid: dict[str, Any] = {"colors": colour, "fill_mode": rr.components.FillMode.Solid}
     match int(model.geom_type[geom]):
         case kind.mjGEOM_CAPSULE:
-            below = [[0, 0, -half]]  # rerun's capsule starts at its frame, MuJoCo's is centred on it
+            below = [[0, 0, -half]]  # rerun's capsule starts at its frame, MuJoCo's is centered on it
             return rr.Capsules3D(lengths=2 * half, radii=radius, translations=below, **solid)
         case kind.mjGEOM_CYLINDER:
             return rr.Cylinders3D(lengths=2 * half, radii=radius, **solid)

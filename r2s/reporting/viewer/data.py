@@ -66,14 +66,14 @@ class Overlay:
 
 @dataclass(frozen=True)
 class Content:
-    """Content of a rerun recording; its layout has tabs only for the parts that are given.
+    """Content of a rerun recording; the viewer shows a tab only for content that is not empty.
 
     Attributes:
         measures: the task's measures, needed for `episodes` and `curves`.
-        episodes: {label: episodes}, one arm per label; the k-th episodes of all arms start together.
-        overlays: {label: Overlay}; each gets a tab of torque plots.
+        episodes: {label: episodes}, one arm per label; the k-th episodes of all arms start at the same time.
+        overlays: {label: Overlay}; each overlay has its own tab of torque plots.
         curves: {run: evaluations.csv}; all curves share one tab.
-        figures: {name: PNG}; each has a tab, except that "learning" is in the tab of the curves.
+        figures: {name: PNG}; each figure has its own tab, but the figure "learning" shares that of the curves.
         torque: (n,) Nm, limits that the plots of commanded torque show.
     """
 
@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """Measures that the task shows in learning curves or comparisons and that at least one run has."""
+        """The task's measures for learning curves and comparisons, as far as `curves` contain them."""
         table = self.measures
         if table is None:
             return []
@@ -95,7 +95,7 @@ class Content:
 
 
 def external_overlay(r: Recording) -> dict[str, Overlay]:
-    """Return an overlay of external torque and reported contact (0 or 1); {} if there is no external torque."""
+    """Return an overlay of external torque and reported contact (0 or 1), or {} without external torque."""
     torque = r.signals.get("tau_ext_hat_filtered")
     if torque is None or not torque.any():
         return {}
@@ -104,7 +104,7 @@ def external_overlay(r: Recording) -> dict[str, Overlay]:
 
 
 def first(e: "Episodes") -> list[Episode]:
-    """Return the first `SHOWN` episodes."""
+    """Return the first `SHOWN` of the episodes `e`, each as an `Episode`."""
     boxes = [None] * len(e.goal) if e.box is None else e.box
     return [Episode(e.t, e.q[i], e.ee[i], e.goal[i], e.tau[i], boxes[i]) for i in range(min(SHOWN, len(e.goal)))]
 

@@ -37,13 +37,13 @@ def log_series(
     colour: str,
     width: float = LINE,
 ) -> None:
-    """Log one line of a plot at `path`; nan interrupts it."""
+    """Log one line of a plot at the entity path `path`; a nan in `values` interrupts the line."""
     stream.log(path, rr.SeriesLines(names=name, colors=rgb(colour), widths=width), static=True)
     stream.send_columns(path, indexes=index, columns=rr.Scalars.columns(scalars=values))
 
 
 def starts_of(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
-    """Return times (K + 1,) s: the common start of all arms' k-th episodes, and the end of the last episode."""
+    """Return the start times of K episodes, which all arms share, and the end of the last episode, (K + 1,) s."""
     count = max((len(sequence) for sequence in episodes.values()), default=0)
     longest = [max(s[k].duration for s in episodes.values() if k < len(s)) + PAUSE for k in range(count)]
     return np.concatenate([[0.0], np.cumsum(longest)])
@@ -84,7 +84,7 @@ def _picture(name: str, title: str) -> rrb.View:
 
 
 def _learning_tab(curves: Iterable[Measure], pictured: bool) -> rrb.Container:
-    """Return a tab with the figure, if any, and the plots; on the timeline `time` the plots are empty."""
+    """Return a tab with learning curves, as a figure and as plots; on the timeline `time` the plots are empty."""
     plots = _plots({m.heading: entity(LEARNING, m.title) for m in curves}, rrb.Corner2D.RightBottom)
     live = rrb.Grid(*plots, grid_columns=3, name="plots: select the timeline env_steps or wall_clock below")
     return rrb.Tabs(*[_picture(LEARNING, "figure")] * pictured, live, active_tab=0, name="learning")
@@ -109,7 +109,7 @@ def _arms_tab(count: int, joints: Sequence[str], seconds: float, measures: Measu
 def _plots(
     origins: Mapping[str, str], corner: rrb.Corner2D = rrb.Corner2D.RightTop, until: float | None = None
 ) -> list[rrb.View]:
-    """Return a plot for each title and origin (an entity's path); only the first plot has a legend."""
+    """Return a plot for each {title: entity path}; only the first plot has a legend."""
     corners = [corner, *[None] * len(origins)]
     return [_plot(*origin, legend, until=until) for origin, legend in zip(origins.items(), corners, strict=False)]
 
@@ -122,7 +122,7 @@ def _plot(
     y: tuple[float, float] | None = None,
     until: float | None = None,
 ) -> rrb.View:
-    """Return a plot that opens on the first `until` seconds, or on the whole timeline if `until` is None."""
+    """Return a plot that first shows the time from 0 to `until` s, or all of the timeline if `until` is None."""
     edge = rrb.TimeRangeBoundary
     ends = (edge.infinite(), edge.infinite())
     if until is not None:

@@ -28,10 +28,10 @@ LOOPBACK = "127.0.0.1"
 def side_by_side(folder: Path, robot: Robot, runs: Mapping[str, Path]) -> list[Path]:
     """Write the episodes, torques and learning curves of {label: run folder} into one recording.rrd in `folder`.
 
-    The measures of the first run with learning curves or episodes apply to all runs.
+    All runs are shown with the measures of the first run that has learning curves or episodes.
 
     Returns:
-        Pictures (PNG) of the same data.
+        Paths of figures (PNG) of the same episodes, torques and learning curves.
 
     Raises:
         UserError: no run has anything to show.

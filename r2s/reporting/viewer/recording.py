@@ -1,7 +1,7 @@
 """Write the rerun recording (.rrd): arms side by side, torques, learning curves and figures.
 
-All content is in one file, because two rerun recordings share no timeline. Episodes and torque overlays are on the
-timeline `time`, learning curves on `env_steps` and `wall_clock`. `rerun FILE` opens the file and plays the episodes.
+All content is in one file, because two rerun recordings have no common timeline. Episodes and torque overlays use the
+timeline `time`, learning curves `env_steps` and `wall_clock`. `rerun FILE` opens the file and plays the episodes.
 """
 
 import os
@@ -57,7 +57,7 @@ def _limits(stream: rr.RecordingStream, torque: np.ndarray, seconds: float) -> N
 
 
 def _overlay(stream: rr.RecordingStream, label: str, overlay: Overlay) -> None:
-    """Log one plot per joint. The viewer draws lines in the order of paths; the broad measured line is first."""
+    """Log one plot per joint. The broad measured line has the first path, because lines are drawn in path order."""
     clock, _ = without_pauses(overlay.t)
     rows = at_rate(clock, OVERLAY_HZ)
     index = [rr.TimeColumn("time", duration=clock[rows])]
