@@ -1,8 +1,5 @@
 """One compiled cycle of the driver for m arms; `DriverBatch` (r2s/arm/driver.py) runs it once per millisecond."""
 
-from collections.abc import Callable
-from functools import cache
-from types import FunctionType
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +7,7 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.physics.actuation import condition
 from r2s.physics.contact_stop import LEAVES_S, OVER, stop_torque
-from r2s.physics.control_laws import BUILT_IN, chain, control_law
+from r2s.physics.control_laws import control_law
 from r2s.physics.fence import Fence, breached
 from r2s.physics.kinematics import POSE, link_frames
 from r2s.physics.newton_euler import WORK as DESK
@@ -212,7 +209,8 @@ def _brake(i, seen, arm, bounds, model, memory):
     memory.share[i] = max(needs, memory.share[i] - SIM_DT / BRAKE_S)
 
 
-def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
+@njit(cache=True)
+def drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
@@ -271,14 +269,3 @@ def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
                 out[i, j] = last[j] + min(max(-last[j], -limits[j, STEP]), limits[j, STEP])
         memory.sent[i] = out[i]
     return out
-
-
-drive_cycle = njit(cache=True)(_drive_cycle)
-
-
-@cache
-def compiled_cycle(laws: tuple[Callable, ...]) -> Callable:
-    """Return `drive_cycle` for these control laws; unless all are built in, each process compiles the cycle anew."""
-    if laws == BUILT_IN:
-        return drive_cycle
-    return njit(FunctionType(_drive_cycle.__code__, {**globals(), "control_law": chain(laws)}))

@@ -26,12 +26,12 @@ from r2s.arm.drive_cycle import (
     Given,
     Memory,
     Model,
-    compiled_cycle,
+    drive_cycle,
 )
 from r2s.arm.interface import ArmState
 from r2s.physics.actuation import low_pass_factor
 from r2s.physics.collision import CollisionCheck, empty_scene
-from r2s.physics.control_laws import BUILT_IN, ControlLaw, law_number, registered, torque_law
+from r2s.physics.control_laws import ControlLaw, law_number, torque_law
 from r2s.physics.fence import Fence
 from r2s.physics.newton_euler import links_of
 from r2s.physics.push_limit import HOLD, STOP, PushLimit
@@ -90,7 +90,6 @@ class DriverBatch:
         self._push = np.zeros(0) if push_limit is None else push_limit.columns(robot)
         number = law_number(torque_law if control is None else control.law)
         self._control = float(number), np.zeros(0) if control is None else control.parameters
-        self._drive = compiled_cycle(registered() if number >= len(BUILT_IN) else BUILT_IN)
         self._bounds = Bounds(
             torque=np.array(torque, dtype=float),
             added=ADDED * robot.tau_max,
@@ -179,7 +178,7 @@ class DriverBatch:
             own, new, q if added is None else added, adds,
             self._nothing if hold is None else hold, self._free if contact is None else contact,
         )  # fmt: skip
-        out = self._drive(q, dq, tau_J_d, given, self._control, self._bounds, self._model, memory)
+        out = drive_cycle(q, dq, tau_J_d, given, self._control, self._bounds, self._model, memory)
         if memory.why.any():
             for i in np.flatnonzero(memory.why):
                 if self.stopping[i] is None:

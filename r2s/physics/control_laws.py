@@ -14,14 +14,13 @@ The laws are in r2s/physics because MuJoCo's callback contains them and numba ca
 """
 
 from collections.abc import Callable
-from functools import cache
 from typing import Protocol
 
 import numpy as np
-from numba.extending import is_jitted
 
 from r2s.compiled import njit
 from r2s.physics.impedance_laws import cartesian_impedance_law, joint_impedance_law
+from r2s.physics.user_laws import call_control, control_address
 
 
 class ControlLaw(Protocol):
@@ -73,26 +72,11 @@ def computed_torque_law(q, dq, command, parameters, memory, out):
 
 
 BUILT_IN = (torque_law, computed_torque_law, joint_impedance_law, cartesian_impedance_law)
-_laws: list[Callable] = [*BUILT_IN]
 
 
 def law_number(law: Callable) -> int:
-    """Return the number by which `chain` calls a control law; a new law is first compiled and registered."""
-    law = law if is_jitted(law) else njit(law)
-    if law not in _laws:
-        _laws.append(law)
-    return _laws.index(law)
-
-
-def registered() -> tuple[Callable, ...]:
-    """Return all registered control laws, in the order of their numbers."""
-    return tuple(_laws)
-
-
-@njit(cache=True)
-def _no_law(number, q, dq, command, parameters, memory, out):
-    for j in range(len(q)):
-        out[j] = 0.0
+    """Return the number by which `control_law` calls a law; a user's law is compiled first, once per process."""
+    return BUILT_IN.index(law) if law in BUILT_IN else control_address(law)
 
 
 def _either(own_number: int, own: Callable, others: Callable) -> Callable:
@@ -106,16 +90,9 @@ def _either(own_number: int, own: Callable, others: Callable) -> Callable:
     return law
 
 
-@cache
-def chain(laws: tuple[Callable, ...]) -> Callable:
-    """Return a compiled function (number, q, dq, command, parameters, memory, out) that calls laws[number]."""
-    law: Callable = _no_law
-    for k in reversed(range(len(laws))):
-        law = _either(k, laws[k], law)
-    return law
-
-
-control_law = chain(BUILT_IN)
+control_law: Callable = call_control  # (number, q, dq, command, parameters, memory, out), see `law_number`
+for _k in reversed(range(len(BUILT_IN))):
+    control_law = _either(_k, BUILT_IN[_k], control_law)
 
 
 @njit(cache=True, error_model="numpy")

@@ -13,22 +13,18 @@ accurate to first order, and stable even for the steep friction of real wrists, 
 
 from collections.abc import Callable
 from functools import cache
-from types import FunctionType
 from typing import Any
 
 import mujoco
 import numpy as np
-from llvmlite import ir
 from numba import carray, types
-from numba.extending import intrinsic, is_jitted
 
 from r2s.compiled import cfunc, njit
 from r2s.physics.actuation import SLOTS, condition_joint, motor_torque
 from r2s.physics.contact import contact_velocity, near
 from r2s.physics.contact_layout import COLUMNS as CONTACT_COLUMNS
 from r2s.physics.contact_layout import ROWS as CONTACT_ROWS
-from r2s.physics.control_laws import BUILT_IN as BUILT_IN_CONTROL
-from r2s.physics.control_laws import chain, control_law, registered
+from r2s.physics.control_laws import control_law
 from r2s.physics.friction import BRISTLE as BRISTLE_FAMILY
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 from r2s.physics.linear_algebra import packed_element
@@ -38,6 +34,7 @@ from r2s.physics.push_limit import limit_pushes
 from r2s.physics.safety_filter import COLUMNS, TAU_MAX, WORK, JointDynamics, fade, limit_acceleration, limit_rate
 from r2s.physics.safety_filter import STEP as TAU_STEP
 from r2s.physics.stick_slip import TINY, JointForces, any_reversal, coming_velocity
+from r2s.physics.user_laws import as_doubles, call_friction, friction_address, stack
 
 # Columns of jnt_user. MARK identifies models of r2s: the callback is global in a process and must ignore all others.
 MARK, FAMILY, P1 = range(3)
@@ -65,29 +62,19 @@ BRISTLE, SENT, MOTOR, CYCLE, LIMITED, FILTERED, EFFORT, NOISE, LINE = range(9)
 KEPT = LINE + SLOTS
 USUAL = 7  # number of joints for which `_drive` is compiled; other arms run slower
 
-# the index of a law is its number in `jnt_user`
-_BUILT_IN = (*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None))
-_laws: list[Callable] = [*_BUILT_IN]
+# the index of a friction law is its number in `jnt_user`
+BUILT_IN = (*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None))
 BRISTLES, PRESLIDING = FAMILIES.index(BRISTLE_FAMILY), BRISTLE_FAMILY.names.index("presliding")
 
 
 def number(family: Family, hold: str) -> int:
-    """Return the number of a family's law in `jnt_user`; the callback is recompiled for a new law (seconds)."""
+    """Return the number of a family's law in `jnt_user`; a user's law is compiled first, once per process."""
     law = family.native if hold == "command" or family.sharp is None else family.sharp
-    if law not in _laws:
-        _laws.append(law)
-        install()
-    return _laws.index(law)
-
-
-def install() -> None:
-    """Register the callback, once per process; the callback ignores models without MARKER in `jnt_user`."""
-    _callback(tuple(_laws), registered())
+    return BUILT_IN.index(law) if law in BUILT_IN else friction_address(law)
 
 
 def _either(number: int, own: Callable, others: Callable) -> Callable:
     """Return a compiled function that calls `own` if its first argument is `number`, else `others`."""
-    own = own if is_jitted(own) else njit(own)
 
     @njit(inline="always")
     def law(asked, p, v, h, memory):
@@ -98,36 +85,9 @@ def _either(number: int, own: Callable, others: Callable) -> Callable:
     return law
 
 
-@njit
-def _no_law(asked, p, v, h, memory):
-    return 0.0, 0.0
-
-
-def _in_order(laws: tuple[Callable, ...]) -> Callable:
-    """Return a compiled function that calls one of the laws, selected by its index."""
-    law: Callable = _no_law
-    for k in reversed(range(len(laws))):
-        law = _either(k, laws[k], law)
-    return law
-
-
-_law = _in_order(_BUILT_IN)
-
-
-@intrinsic
-def _as_doubles(typingctx, address):
-    def codegen(context, builder, signature, args):
-        return builder.inttoptr(args[0], ir.DoubleType().as_pointer())
-
-    return types.CPointer(types.float64)(types.int64), codegen
-
-
-@intrinsic
-def _stack(typingctx, count):  # NumPy's own arrays would take a tenth of a step's time
-    def codegen(context, builder, signature, args):
-        return builder.alloca(ir.DoubleType(), args[0])
-
-    return types.CPointer(types.float64)(types.int64), codegen
+_law: Callable = call_friction
+for _k in reversed(range(len(BUILT_IN))):
+    _law = _either(_k, BUILT_IN[_k], _law)
 
 
 @njit(inline="always")
@@ -160,22 +120,16 @@ def _direction(v, net, z, user):
 
 
 @cache
-def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) -> Any:
-    """Compile the callback with these friction and control laws, in the order of their numbers, and install it."""
-    force = _force_at(struct_offsets(WIDTH, KEPT))
-    names = dict(globals())
-    if own := laws[len(_BUILT_IN) :]:
-        friction = FunctionType(_friction.py_func.__code__, {**globals(), "_law": _in_order(laws)})
-        names["_friction"] = njit(error_model="numpy", forceinline=True)(friction)
-    if own_control := control_laws[len(BUILT_IN_CONTROL) :]:
-        control = FunctionType(_control.py_func.__code__, {**globals(), "control_law": chain(control_laws)})
-        names["_control"] = njit(error_model="numpy")(control)
-    if own or own_control:
-        force = FunctionType(force.__code__, names, closure=force.__closure__)
+def install() -> Any:
+    """Register the callback, once per process; the callback ignores models without MARKER in `jnt_user`.
+
+    Returns:
+        The compiled function. The cache keeps it alive, because MuJoCo holds only the address.
+    """
     signature = types.void(types.CPointer(types.int64), types.CPointer(types.int64))
-    compiled = cfunc(signature, error_model="numpy", cache=not (own or own_control))(force)
+    compiled = cfunc(signature, error_model="numpy", cache=True)(_force_at(struct_offsets(WIDTH, KEPT)))
     mujoco.set_mjcb_control(compiled.ctypes)
-    return compiled  # kept alive by the cache: MuJoCo holds only the address
+    return compiled
 
 
 def _force_at(at: dict[str, int]) -> Callable:
@@ -195,7 +149,7 @@ def _force_at(at: dict[str, int]) -> Callable:
         if model[nuser_at] != WIDTH:
             return
         data, n = carray(data_ptr, (data_words,)), model[nv_at]
-        user = carray(_as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
+        user = carray(as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
         if user[0, LIMITS + TAU_MAX] > 0.0 and user[0, MARK] == MARKER:
             fields = data[q_at], data[dq_at], data[applied_at], data[bias_at], data[mass_at], data[memory_at]
             places = data[xpos_at], data[xmat_at], data[anchor_at], data[axis_at]
@@ -228,16 +182,16 @@ def _friction(sizes, user, q, dq, forces, places):
         forces, places: addresses of (damping, applied, passive, bias, M, userdata), (xpos, xmat, xanchor, xaxis).
     """
     n, nbody = sizes
-    q, dq = carray(_as_doubles(q), (n,)), carray(_as_doubles(dq), (n,))  # type: ignore[call-arg]
-    damping, applied = carray(_as_doubles(forces[0]), (n,)), carray(_as_doubles(forces[1]), (n,))
-    passive, bias = carray(_as_doubles(forces[2]), (n,)), carray(_as_doubles(forces[3]), (n,))
-    mass, memory = carray(_as_doubles(forces[4]), (n * (n + 1) // 2,)), carray(_as_doubles(forces[5]), (n,))
-    xpos, xmat = carray(_as_doubles(places[0]), (nbody, 3)), carray(_as_doubles(places[1]), (nbody, 9))
-    anchor, axis = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))
+    q, dq = carray(as_doubles(q), (n,)), carray(as_doubles(dq), (n,))  # type: ignore[call-arg]
+    damping, applied = carray(as_doubles(forces[0]), (n,)), carray(as_doubles(forces[1]), (n,))
+    passive, bias = carray(as_doubles(forces[2]), (n,)), carray(as_doubles(forces[3]), (n,))
+    mass, memory = carray(as_doubles(forces[4]), (n * (n + 1) // 2,)), carray(as_doubles(forces[5]), (n,))
+    xpos, xmat = carray(as_doubles(places[0]), (nbody, 3)), carray(as_doubles(places[1]), (nbody, 9))
+    anchor, axis = carray(as_doubles(places[2]), (n, 3)), carray(as_doubles(places[3]), (n, 3))
     net, slow = user[0, NET] != 0.0, False  # net: stick_slip.py is used, for all joints or none
     at = int(user[0, CONTACT])
     touch = at != 0
-    joint = carray(_stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
+    joint = carray(stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
     # mass and first moment of all links beyond a joint: errors of gravity compensation (e), nominal values (l)
     em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(n - 1, -1, -1):
@@ -272,9 +226,9 @@ def _friction(sizes, user, q, dq, forces, places):
             joint[FORCE, j] = passive[j] + applied[j] - bias[j]
             slow |= net and (abs(v) <= user[j, DQ_MIN] or v == 0.0)
     if net or touch:
-        work = carray(_stack(n * (2 * n + 6)), (2 * n + 6, n))  # type: ignore[call-arg]
-        jacobian = carray(_stack(CONTACT_ROWS * n), (CONTACT_ROWS, n))  # type: ignore[call-arg]
-        contact = carray(_as_doubles(forces[5]), (at + CONTACT_COLUMNS,))[at:]  # type: ignore[call-arg]
+        work = carray(stack(n * (2 * n + 6)), (2 * n + 6, n))  # type: ignore[call-arg]
+        jacobian = carray(stack(CONTACT_ROWS * n), (CONTACT_ROWS, n))  # type: ignore[call-arg]
+        contact = carray(as_doubles(forces[5]), (at + CONTACT_COLUMNS,))[at:]  # type: ignore[call-arg]
         if touch:
             body = int(user[n - 1, BODY])
             place = xpos[body], xmat[body]
@@ -290,12 +244,12 @@ def _friction(sizes, user, q, dq, forces, places):
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
     """Replace the applied torques by those of the control law; a variable n avoids a minute of compilation."""
-    user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
-    q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
-    applied, kept = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[5]), (KEPT, n))
+    user = carray(as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
+    q, dq = carray(as_doubles(fields[0]), (n,)), carray(as_doubles(fields[1]), (n,))
+    applied, kept = carray(as_doubles(fields[2]), (n,)), carray(as_doubles(fields[5]), (KEPT, n))
     c, k, p = int(user[0, COMMANDS]), int(user[0, MEMORIES]), int(user[0, PARAMETERS])
-    rest = carray(_as_doubles(fields[5]), (KEPT * n + c + k + p,))[KEPT * n :]
-    speed = carray(_stack(n), (n,))  # type: ignore[call-arg]
+    rest = carray(as_doubles(fields[5]), (KEPT * n + c + k + p,))[KEPT * n :]
+    speed = carray(stack(n), (n,))  # type: ignore[call-arg]
     for j in range(n):
         speed[j] = dq[j] + kept[NOISE, j]
     control_law(user[0, CONTROL], q, speed, rest[:c], rest[c + k :], rest[c : c + k], applied)
@@ -310,10 +264,10 @@ def _drive(n, user, fields, places):
     Args:
         n: number of joints. user, fields, places: addresses of MuJoCo's arrays.
     """
-    user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
-    q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
-    applied, bias = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[3]), (n,))
-    mass, kept = carray(_as_doubles(fields[4]), (n * (n + 1) // 2,)), carray(_as_doubles(fields[5]), (KEPT, n))
+    user = carray(as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
+    q, dq = carray(as_doubles(fields[0]), (n,)), carray(as_doubles(fields[1]), (n,))
+    applied, bias = carray(as_doubles(fields[2]), (n,)), carray(as_doubles(fields[3]), (n,))
+    mass, kept = carray(as_doubles(fields[4]), (n * (n + 1) // 2,)), carray(as_doubles(fields[5]), (KEPT, n))
     if user[0, CONTROL] != NO_CONTROL:
         for j in range(n):
             target = min(max(applied[j], -user[j, TARGET_MAX]), user[j, TARGET_MAX])
@@ -322,7 +276,7 @@ def _drive(n, user, fields, places):
                 user[j, LIMITS + TAU_MAX], user[j, LIMITS + TAU_STEP],
             )  # fmt: skip
             applied[j] = kept[EFFORT, j]
-    desk = carray(_stack((2 * n + WORK) * n), (2 * n + WORK, n))
+    desk = carray(stack((2 * n + WORK) * n), (2 * n + WORK, n))
     cycle = SLOTS + int(kept[CYCLE, 0])
     sent = kept[LINE + cycle % SLOTS]
     level, limits = user[:, LEVEL], user[:, LIMITS : LIMITS + COLUMNS]
@@ -332,7 +286,7 @@ def _drive(n, user, fields, places):
     if at == 0:
         changed |= limit_acceleration(arm, 1.0, level, limits, desk, sent)
     else:
-        limit = carray(_as_doubles(fields[5]), (at + PUSH_COLUMNS,))[at:]  # type: ignore[call-arg]
+        limit = carray(as_doubles(fields[5]), (at + PUSH_COLUMNS,))[at:]  # type: ignore[call-arg]
         changed |= _push(limit, arm, int(user[n - 1, BODY]), places, kept[SENT], (level, limits), sent)
     limit_rate(kept[SENT], limits, sent)
     kept[LIMITED, 0] += changed
@@ -345,8 +299,8 @@ def _drive(n, user, fields, places):
 def _push(limit, arm, body, places, last, bounds, sent):
     """Limit the push of the command `sent` (n,) Nm; places: addresses of xpos, xmat, xanchor, xaxis."""
     n = len(sent)
-    xpos, xmat = carray(_as_doubles(places[0]), (body + 1, 3)), carray(_as_doubles(places[1]), (body + 1, 9))  # type: ignore[call-arg]
-    anchor, axis = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))  # type: ignore[call-arg]
+    xpos, xmat = carray(as_doubles(places[0]), (body + 1, 3)), carray(as_doubles(places[1]), (body + 1, 9))  # type: ignore[call-arg]
+    anchor, axis = carray(as_doubles(places[2]), (n, 3)), carray(as_doubles(places[3]), (n, 3))  # type: ignore[call-arg]
     kinematics = xpos[body], xmat[body], anchor, axis
     return limit_pushes(limit, arm, kinematics, last, 1.0, bounds[0], bounds[1], sent)
 
