@@ -82,10 +82,8 @@ class TorqueResidual:
         self.seen: np.ndarray = m.seen if sliding else np.abs(m.dq) >= slowest * isinstance(m, PlannedMotion)
         self._noise: np.ndarray = self._rigid.encoder * (m.noise if sliding else 1.0)
         self._sin, self._cos = m.rows(np.sin(m.q)), m.rows(np.cos(m.q))
-        # sign of friction by family.has_memory; in sliding windows friction is full at any speed
-        dq = m.friction_dq
-        self._sign = {False: np.sign(dq) if slowest else np.tanh(dq / WIDTH_DQ), True: m.bristle}
-        self._mean_sign = {memory: m.filtered(sign) for memory, sign in self._sign.items()}
+        self._sharp = bool(slowest)
+        self._mean_sign = {memory: m.filtered(self._sign(memory, slice(None))) for memory in (False, True)}
         self.block = blocks_of(m.t, self._rigid.q, self._period)
         # blocks for held-out rows; rows at equal clock share a block, or else short trajectories would dominate
         self.half_second: np.ndarray = np.unique(np.floor(m.t / BLOCK_S), return_inverse=True)[1]
@@ -124,9 +122,8 @@ class TorqueResidual:
         bristle = np.concatenate([of(piece).bristle for piece in _pieces(recording, of)])
         give_back(recording)
         m = replace(self.motion, bristle=bristle)  # type: ignore[arg-type, type-var]
-        sign, mean = self._sign | {True: bristle}, self._mean_sign | {True: m.filtered(bristle)}
-        block = blocks_of(m.t, self._rigid.q, self._period)
-        return self._with(motion=m, _sign=sign, _mean_sign=mean, block=block).on(self.space)
+        mean, block = self._mean_sign | {True: m.filtered(bristle)}, blocks_of(m.t, self._rigid.q, self._period)
+        return self._with(motion=m, _mean_sign=mean, block=block).on(self.space)
 
     def within(self, kept: np.ndarray) -> "TorqueResidual":
         """Return this residual restricted to the moments at which `kept` (T,) is true."""
@@ -166,13 +163,20 @@ class TorqueResidual:
             friction = m.filtered(of(slice(None))) if isinstance(m, PlannedMotion) else m.filtered(of)
         return _Known(standard, d.armature, torque, compensation, d.phi, friction)
 
+    def _sign(self, memory: bool, rows: slice) -> np.ndarray:
+        """Return the sign of friction in `rows` of the F instants; memory: whether the family has a memory."""
+        if memory:
+            return self.motion.bristle[rows]
+        dq = self.motion.friction_dq[rows]  # in sliding windows friction is full at any speed
+        return np.sign(dq) if self._sharp else np.tanh(dq / WIDTH_DQ)
+
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
         """Return friction before filtering, Nm, in `rows` of the F instants.
 
         A simulator with implicit friction evaluates friction at the velocity `lead_s` earlier (the previous step).
         The simulator then corrects this friction if friction rises with speed.
         """
-        dq, sign = self.motion.friction_dq[rows], self._sign[d.family.has_memory][rows]
+        dq, sign = self.motion.friction_dq[rows], self._sign(d.family.has_memory, rows)
         if not self.lead_s:
             return d.friction(dq, sign)
         ddq, way = self.motion.ddq[rows], np.sign(dq)
