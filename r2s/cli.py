@@ -25,7 +25,7 @@ PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 MOST_SEED = 2**32 - 1  # largest seed that some generators of NumPy accept
 ABSENT = "not there"
-# keys that skip_completed does not compare: place of a run, its display, number of cores
+# keys that skip_completed does not compare: a run's folder, display and number of cores
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
 
 
@@ -166,7 +166,7 @@ def is_completed(cfg):
 
 
 def differing(saved, cfg, most=3, counts=lambda key: True):
-    """Return a line for each of the first `most` keys that differ from the saved config and satisfy `counts`."""
+    """Return a line for each of the first `most` keys that differ between `saved` and `cfg` and pass `counts`."""
     from omegaconf import OmegaConf
 
     from r2s.reporting.trackers.tracker import flat
@@ -223,7 +223,7 @@ def errors_in_one_line():
 
 
 def end_workers():
-    """End the worker processes of a parallel sweep, which joblib would keep alive for five minutes."""
+    """End the worker processes of a parallel sweep, because joblib would keep them alive for five minutes."""
     if "joblib" in sys.modules:
         from joblib.externals.loky import get_reusable_executor
 

@@ -1,4 +1,4 @@
-"""Run the commands of r2s that make no run folder.
+"""Run the commands of r2s that create no run folder.
 
 `r2s list`, `r2s look` and `r2s export` read run folders. `r2s convert` writes a recording for ROS 2 or LeRobot.
 `r2s check` checks a recording or an arm. `r2s engines` lists the physics engines.
@@ -20,15 +20,15 @@ TRUSTED = "modules that a run may execute beside r2s, with commas between, also 
 
 
 class Parser(ArgumentParser):
-    """A parser that raises UserError for a wrong argument."""
+    """Argument parser that raises UserError for a wrong argument."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise UserError with the message."""
+        """Raise UserError with the parser's message and a hint at --help."""
         raise UserError(f"{self.prog.removeprefix('r2s ')}: {message}; see {self.prog} --help")
 
 
 def run_command(words: Sequence[str]) -> None:
-    """Run the command whose name and arguments are `words`.
+    """Run the r2s command in `words`: the command's name, then its arguments.
 
     Raises:
         UserError: an argument or a run folder is wrong.
@@ -91,7 +91,7 @@ def list_runs(typed: Namespace) -> None:
 
 
 def look(typed: Namespace) -> None:
-    """Open the viewer on one or several runs; without a screen, print the paths of their figures."""
+    """Open the viewer on one or several runs; without a screen, print the paths of the runs' figures."""
     from r2s.reporting.viewer.look import has_screen, open_native, show_in_browser, side_by_side
 
     folders = [viewable(run) for run in typed.run]
@@ -230,7 +230,7 @@ def convert(typed: Namespace) -> None:
 
 
 def engines(typed: Namespace) -> None:
-    """Print a line for each physics engine: its version, or how to install it."""
+    """Print a line for each physics engine: the engine's version, or how to install the engine."""
     from r2s.engines.installed import installed
 
     for name, found, needs in installed():

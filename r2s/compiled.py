@@ -1,10 +1,10 @@
 """Provide numba's `njit` and `cfunc` with a compilation cache that notices changes in other modules.
 
-numba caches a compiled function and recompiles the function when its source file changes. But the cached code also
-contains all called functions, which may be in other files: after a change in physics/safety_filter.py, numba would
-run arm/driver.py with the old filter. With this module numba also recompiles a function after a change of a compiled
-module in the function's package, such as r2s/arm, or in r2s/physics, or of a module from which these import
-constants. Compiled code must not call functions of any other package.
+numba caches a compiled function and recompiles the function when its source file changes. But cached code also
+contains called functions from other files. After a change in physics/safety_filter.py, numba would therefore run
+arm/driver.py with the old filter. This module makes numba recompile the functions of a package, such as r2s/arm,
+after a change in a compiled module of this package or of r2s/physics, or in a module from which such a compiled
+module imports constants. Compiled code may call functions only in its own package and in r2s/physics.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ LONG_S = 2.0  # s, duration of a compilation after which the user gets a message
 
 @cache
 def _sources(room: Path) -> bytes:
-    """Return a hash of all modules on which compiled code in the package folder `room` may depend."""
+    """Return a hash of the source files on which the compiled code in the package folder `room` may depend."""
     if PACKAGE in room.parents:  # a subfolder belongs to its package
         names = room.relative_to(PACKAGE).parts[0], "physics"
         paths = {path for name in names for path in (PACKAGE / name).rglob("*.py")}
@@ -42,12 +42,12 @@ def _sources(room: Path) -> bytes:
 
 
 def _imports(path: Path) -> list[list[str]]:
-    """Return the r2s modules from which a file imports, as names split at the dots."""
+    """Return the r2s modules from which a file imports; each module is a list like ["r2s", "physics", "robot"]."""
     return [name.split(".") for name in re.findall(r"^from (r2s[\w.]+) import", path.read_text(), re.MULTILINE)]
 
 
 class _Sources:
-    """Mixin for numba's cache locators that adds the hash of `_sources` to the source stamp."""
+    """Mixin for numba's cache locators: include the hash of `_sources` in the stamp that numba compares."""
 
     _py_file: str
 
@@ -56,7 +56,7 @@ class _Sources:
 
 
 class Provided(_Sources, UserProvidedCacheLocator):
-    """Store compiled code in the folder of the environment variable NUMBA_CACHE_DIR."""
+    """Store compiled code in the folder that the environment variable NUMBA_CACHE_DIR names."""
 
 
 class Beside(_Sources, InTreeCacheLocator):
@@ -72,7 +72,7 @@ config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # 
 
 
 class _Announce(event.Listener):
-    """Listener that prints a message, once per process, if a compilation takes longer than LONG_S."""
+    """Print a message, once per process, if a compilation takes longer than LONG_S."""
 
     def __init__(self):
         self._printed = False

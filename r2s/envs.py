@@ -1,7 +1,7 @@
 """Make environments for Gymnasium (`gymnasium.make("r2s/PandaReach-v0", calibration=RUN)`) and TorchRL.
 
-If Gymnasium is installed, importing this module registers r2s/PandaReach-v0, r2s/PandaTrack-v0, and so on for Press,
-Wipe and Push. `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports this module automatically.
+If Gymnasium is installed, importing this module registers r2s/PandaReach-v0 and likewise PandaTrack, PandaPress,
+PandaWipe and PandaPush. `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports this module automatically.
 """
 
 from collections.abc import Iterator, Sequence
@@ -98,7 +98,7 @@ def _composed(words: list[str]) -> Any:
 
 @contextmanager
 def _aside() -> Iterator[None]:
-    """Hide the Hydra state of the calling program, which may itself be a Hydra job, while the block runs."""
+    """Hide the calling program's Hydra state inside the `with` block; the program may itself be a Hydra job."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
     from hydra.core.utils import JobRuntime

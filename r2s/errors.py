@@ -16,7 +16,7 @@ class UserError(ValueError):
 
 
 class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
-    """The arm stopped, and the operator did not resume the run, which ends with its results and status `stopped`."""
+    """The arm stopped, and the operator did not resume; the run saves its results and has the status `stopped`."""
 
 
 def nearest(name: object, allowed: Iterable[str]) -> str:
@@ -26,7 +26,7 @@ def nearest(name: object, allowed: Iterable[str]) -> str:
 
 
 def nearest_file(path: Path, pattern: str = "*") -> str:
-    """Return the suggestion of `nearest` for a file name among the files of its folder that match `pattern`."""
+    """Return the suggestion of `nearest` for a missing file, from the files in its folder that match `pattern`."""
     return nearest(path.name, (p.name for p in path.parent.glob(pattern)))
 
 
@@ -44,7 +44,7 @@ def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
     """Import a module that only an extra of r2s installs (docs/how_to/install.md).
 
     Args:
-        module: name such as "panda_py". needed_by: option or file that needs it. extra: name of the extra.
+        module: name such as "panda_py". needed_by: option or file that needs the module. extra: the extra's name.
 
     Raises:
         UserError: the module, or a module that it imports, is not installed.
@@ -60,9 +60,9 @@ def import_failure(error: ImportError, package: str, install: str) -> str:
     """Return why an import failed: the package, a package that it needs, or a shared library is missing.
 
     Args:
-        error: exception of the import. ModuleNotFoundError: a package is missing. ImportError with the name of an
-            extension module: a shared library such as libGL is missing.
-        install: argument of `pip install` that installs the packages.
+        error: exception that the import raised: ModuleNotFoundError if a package is missing, ImportError with the
+            name of an extension module if a shared library such as libGL is missing.
+        install: argument of `pip install` that installs the package.
     """
     if not isinstance(error, ModuleNotFoundError):
         return f"which does not import ({error})"
@@ -77,7 +77,7 @@ def check_number(name: str, value: object, interval: str, whole: bool = False) -
     Args:
         name, value: name and value of the setting.
         interval: allowed interval, such as "(0, 1]".
-        whole: whether the value must be an integer.
+        whole: whether `value` must be an integer.
 
     Raises:
         UserError: the value is not a number, or is outside the interval.

@@ -13,7 +13,7 @@ from typing import Any
 
 from r2s.errors import UserError, nearest_file
 
-# Exceptions that NumPy, pandas, h5py and zipfile raise if a file is truncated, altered or of another format.
+# Exceptions that NumPy, pandas, h5py and zipfile raise if a file is truncated, altered or of a wrong format.
 DAMAGED = (
     KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
     SyntaxError, TokenError,  # NumPy parses an array's header as a Python literal
@@ -22,16 +22,16 @@ OWN = "r2s:"  # prefix of paths inside the package
 
 
 def located(path: str | os.PathLike) -> Path:
-    """Return the path of a file. The prefix `r2s:`, as in r2s:models/panda.xml, stands for the package's folder."""
+    """Return a path in which the package's folder replaces the prefix `r2s:`, as in r2s:models/panda.xml."""
     name = os.fspath(path)
     return Path(__file__).parent / name.removeprefix(OWN) if name.startswith(OWN) else Path(name)
 
 
 @contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary path; at the end of the block, rename that file to `path`.
+    """Yield the path of a temporary file; at the end of the `with` block, rename this file to `path`.
 
-    If the block raises or the process is killed, the file at `path` does not change.
+    If the `with` block raises an exception or the process is killed, the file at `path` does not change.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.part{path.suffix}")  # some libraries choose the format by the suffix
@@ -43,7 +43,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def run_file(folder: str | Path, name: str, option: str) -> Path:
-    """Return the path of the file `name` in a run folder, or `folder` if it is a file; errors begin with `option`.
+    """Return the path of `name` in a run folder, or `folder` if `folder` is a file; errors begin with `option`.
 
     Raises:
         UserError: the file does not exist.

@@ -17,7 +17,7 @@ def r2s(*words: str) -> Path:
     """Run the command `r2s WORDS`, print its output, and return its run folder.
 
     Raises:
-        UserError: the command fails; the message is the command's last line on stderr.
+        UserError: the command fails; the error message is the last line that the command writes to stderr.
     """
     command = [sys.executable, "-m", "r2s", *words]
     env = os.environ | {
@@ -37,8 +37,8 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
     """Show a run in the notebook: in the rerun viewer, or as figures if rerun-notebook is not installed.
 
     Args:
-        folder: run folder. figures: names such as "torque"; without names, all figures.
-        width, height: size of the viewer in pixels; figures also have this width.
+        folder: run folder. figures: names of the figures to show, such as "torque"; no names: all figures.
+        width, height: size of the viewer, pixels; `width` is also the width of the figures.
     """
     from IPython.display import Image, display
 
@@ -58,7 +58,7 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
 
 
 def _small(path: Path, width: int) -> bytes:
-    """Return a figure as a PNG with `width` and 64 colors, which is small enough to store in a notebook file."""
+    """Return a figure as a PNG of `width` pixels and 64 colors, small enough for a notebook file."""
     from PIL import Image
 
     with Image.open(path) as picture:

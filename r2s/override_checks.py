@@ -45,7 +45,7 @@ SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweep
 
 
 def extended(words: Sequence[str]) -> list[str]:
-    """Add ++ to overrides that state a prior (`identify.prior.*`), because no file in conf/ contains their keys."""
+    """Add ++ to overrides of a prior (`identify.prior.*`), because no file in conf/ contains the keys of priors."""
     return [f"++{w}" if STATED.match(w) else w for w in words]
 
 
@@ -56,7 +56,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
         words: overrides KEY=VALUE and GROUP=OPTION. config_dir: folder of --config-dir. multirun: whether -m is set.
 
     Raises:
-        UserError: an option is unknown, no job reads an option, a sweep lacks -m, or a folder is missing.
+        UserError: an option is unknown or unused, -m is missing for a sweep, or a folder is missing.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -75,7 +75,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             return [o for o in loader.repository.get_group_options(group) if o != NO_OPTION]  # type: ignore[attr-defined]
 
         groups = {g: options(g) for g in loader.list_groups("") if g != "hydra"}
-        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # one may select a launcher
+        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # may select a launcher
         of_groups = {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")}
         if of_hydra:
             _check_hydra(of_hydra, [*own, *experiments], of_groups)
@@ -93,7 +93,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
 def _check_configs(
     configs: Sequence[Any], jobs: Sequence[list[str]], names: Sequence[str], groups: Mapping[str, Any]
 ) -> None:
-    """Check the jobs' configs: a known stage, a valid root, correct booleans, and a job that reads each option."""
+    """Check that configs have a known stage, a valid root and correct booleans, and that jobs read each option."""
     from hydra import compose
     from omegaconf import OmegaConf
 
@@ -116,9 +116,9 @@ def _check_configs(
 
 
 def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> None:
-    """Raise UserError for an option of Hydra in `words` that Hydra refuses or that r2s does not support.
+    """Raise UserError if `words` contains a Hydra option that Hydra refuses or r2s does not support.
 
-    own: overrides to apply first. If Hydra refuses an override in `own`, do nothing; a later check reports it.
+    own: overrides to apply before `words`; if Hydra refuses one of these overrides, a later check reports the error.
     """
     from hydra import compose
     from hydra.errors import HydraException
@@ -145,7 +145,7 @@ def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[st
 
 
 class UnknownOption(Exception):  # noqa: N818 (its message is made where the options are known)
-    """Error for an override that adds a new key, which no stage reads."""
+    """Error for an override with a new key, because no stage reads new keys."""
 
 
 def _jobs(
@@ -154,8 +154,8 @@ def _jobs(
     """Return the keys and groups in `words`, and a few jobs that together contain every value of each sweep.
 
     Raises:
-        UserError: a sweep lacks -m, or the value of a group is wrong.
-        UnknownOption, HydraException: an override is wrong in another way; `_first_mistake` explains it to the user.
+        UserError: -m is missing for a sweep, or the value of a group is wrong.
+        UnknownOption, HydraException: an override is refused; `_first_mistake` explains the error to the user.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
@@ -198,7 +198,7 @@ def check_option(group: str, value: Any, options: Sequence[str]) -> None:
 
 
 def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]], multirun: bool) -> UserError:
-    """Add the overrides one by one, and return the error for the first that Hydra refuses."""
+    """Return the error for the first override that Hydra refuses, by adding the overrides one by one."""
     from hydra import compose
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -221,7 +221,7 @@ def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[
 
 
 def renamed(override: str) -> str | None:
-    """Return a message with the new name of an override's key or value; None if its name is not an old one."""
+    """Return a message with the new name of a renamed key or value; None if the override contains no old name."""
     word = override.lstrip("+~")
     if word in RENAMED:
         return f"{word} is now {RENAMED[word]}"
@@ -242,7 +242,7 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
-    """Return the user's message for the override `word`, which Hydra refuses with `error`."""
+    """Return the `UserError` for the override `word`, which Hydra refuses with `error`."""
     if "=" not in word:
         return UserError(f"'{word}' is not KEY=VALUE{nearest(word, [*groups, *COMMANDS])}")
     key, value = word.split("=", 1)

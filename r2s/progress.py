@@ -12,9 +12,9 @@ from rich.table import Column
 
 
 class Progress:
-    """A progress bar on a terminal; without a terminal, a line of text every `every_s` seconds.
+    """Show a progress bar on a terminal; without a terminal, print a line every `every_s` seconds.
 
-    in_cycle: whether a control cycle calls the object; if so, a thread writes, so that no cycle waits for a terminal.
+    in_cycle: whether a control cycle calls this object; a thread then prints, so that no cycle waits for output.
     """
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
@@ -92,5 +92,5 @@ class Progress:
 
 
 def clock(seconds: float) -> str:
-    """Return a duration as text, m:ss."""
+    """Return a duration as text in minutes and seconds, m:ss."""
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

@@ -1,7 +1,7 @@
-"""Make, resume and read run folders, runs/<stage>/<name>/: config, provenance, growing tables and the summary.
+"""Make, resume and read run folders runs/<stage>/<name>/ with config, provenance, tables and summary.
 
-The status in meta.json is `running` from the start, and remains `running` if the process is killed. A folder receives
-its final name when its first files are complete. A process that writes in the folder locks overrides.yaml.
+The status in meta.json is `running` from the start, and remains `running` if the process is killed. A run folder
+receives its final name when its first files are complete. A process that writes in a run folder locks overrides.yaml.
 """
 
 import csv
@@ -28,18 +28,18 @@ from r2s.provenance import git, machine, packages, sha256
 
 # keys of meta.json for each part of a run; every resume begins a new part
 PART = ("start", "wall_clock_s", "status", "process", "threads", "device", "git", "packages", "machine")
-NOTE_S = 30.0  # s, time between updates of the wall clock in meta.json, so that it is known after a kill
+NOTE_S = 30.0  # s between updates of the wall clock in meta.json, which records the duration even of a killed run
 
 
 @dataclass(frozen=True)
 class Job:
-    """Description of a job, which is stored in the job's run folder.
+    """Description of a job, stored in the job's run folder.
 
     Attributes:
-        stage, name: the folder is runs/<stage>/<name>, numbered if it exists. If name is None: `default_name`.
+        stage, name: run folder runs/<stage>/<name>; an existing name gets a number, and None means `default_name`.
         config: composed config as YAML text. overrides: overrides as the user typed them.
-        seed: seed of the run. threads: requested number, 0: all cores. device: device of the learner.
-        inputs: files that the run reads; the folder records their SHA-256. parents: run folders that the run uses.
+        seed: seed of the run. threads: number of threads; 0: one per core. device: device of the learner.
+        inputs: files that the run reads; meta.json records their SHA-256. parents: run folders that the run uses.
     """
 
     stage: str
@@ -54,11 +54,11 @@ class Job:
 
 
 class Run:
-    """A run folder, open while its stage runs: `with Run(...) as run`.
+    """A run folder that is open during the block `with Run(...) as run`.
 
     Attributes:
-        folder: path of the folder. tracker: r2s.reporting.trackers.async_tracker.Trackers, whose methods neither
-            raise errors nor wait, or None.
+        folder: path of the folder. tracker: None, or r2s.reporting.trackers.async_tracker.Trackers; the methods of
+            Trackers neither raise errors nor block.
 
     Args:
         root: folder of all runs. job: see `Job`. exact_name: whether to raise an error if the name exists.
@@ -165,7 +165,7 @@ class Run:
     def memo(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Return the arrays that `make` computes; if checkpoints/<name>.npz exists, read the arrays from it instead.
 
-        A resumed run therefore continues after the last complete step.
+        A resumed run skips computations whose results are saved.
 
         Raises:
             UserError: the file is damaged.
@@ -187,7 +187,7 @@ class Run:
     def log(self, table: str, row: Mapping[str, Any]) -> dict[str, Any]:
         """Append a row to <table>.csv and return the row, rounded as in the file; the first row defines the columns.
 
-        Base decisions on the rounded row, because a resumed run reads this row from the file (`rewind`).
+        Callers must base decisions on the returned row, because a resumed run reads that row from the file.
         """
         rounded = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in row.items()}
         if table not in self._tables:
@@ -209,9 +209,9 @@ class Run:
             self.tracker.log(table, row)
 
     def rewind(self, table: str, column: str, most: float) -> list[dict[str, float]]:
-        """Truncate <table>.csv to the rows with `column` <= most, and return these; `log` then appends to the file.
+        """Truncate <table>.csv to the rows with `column` <= most; return these rows, and open the file for `log`.
 
-        An incomplete last row is removed. The text of all other rows does not change.
+        Truncation also removes an incomplete last row. The text of the remaining rows does not change.
         """
         path = self.folder / f"{table}.csv"
         if not path.is_file():
@@ -226,7 +226,7 @@ class Run:
         try:
             rows = [[float(v) if v else math.nan for v in row] for row in csv.reader(lines[1:])]
             kept = [dict(zip(head, row, strict=True)) for row in rows if row[head.index(column)] <= most]
-            # a finished run ends with two evaluations at the same step: drop the last one, which will be repeated
+            # a finished run ends with two evaluations at the same step: drop the second, which a resumed run repeats
             last = next((k for k, row in enumerate(kept) if row[column] == most), len(kept))
             del kept[last + 1 :]
         except ValueError as error:
@@ -334,11 +334,11 @@ def is_locked(folder: Path) -> bool:
 def _lock(folder: Path) -> int:
     """Lock a run folder for this process; return the file descriptor of the lock.
 
-    The system releases the lock when the process ends. On a network file system without support for locks, every
+    The operating system releases the lock when the process ends. On a network file system without locks, every
     attempt to lock succeeds.
 
     Raises:
-        UserError: another process holds the lock.
+        UserError: another process has locked the folder.
     """
     path = folder / "overrides.yaml"
     try:
@@ -360,7 +360,7 @@ def _lock(folder: Path) -> int:
 def status_of(meta: Mapping[str, Any]) -> str:
     """Return done, stopped, failed, running, or killed (meta.json says running, but the process has ended).
 
-    A process on another computer cannot be checked: the result is then the status in meta.json.
+    If the process is on another computer, which r2s cannot check, return the status in meta.json.
     """
     process = meta.get("process", {})
     if meta["status"] != "running" or process.get("host") != platform.node():
@@ -377,18 +377,18 @@ def status_of(meta: Mapping[str, Any]) -> str:
 def default_name(overrides: Iterable[str]) -> str:
     """Return a folder name that consists of date, time and overrides."""
     typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=", "root=", "tracker")))
-    readable = re.sub(r"[^A-Za-z0-9.-]+", "_", typed)[:60].strip("_")  # Hydra accepts it without quotes
+    readable = re.sub(r"[^A-Za-z0-9.-]+", "_", typed)[:60].strip("_")  # Hydra accepts such a name without quotes
     return "_".join(p for p in (datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), readable) if p)
 
 
 def _take_name(folder: Path, parent: Path, name: str, exact_name: bool) -> Path:
-    """Rename a folder to the first free name of name, name_2, ...; with exact_name, allow only `name` itself."""
+    """Rename a folder to `name`, or if this name exists to name_2, name_3, ...; exact_name allows only `name`."""
     if not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name.startswith("."):
         raise UserError(f"name: {name!r} cannot be a folder's name")
     for k in range(1, 2 if exact_name else 1000):
         final = parent / (name if k == 1 else f"{name}_{k}")
         try:
-            os.rename(folder, final)  # replaces an empty folder, too; if two processes rename, the second fails
+            os.rename(folder, final)  # also replaces an empty folder; if two processes rename, the second fails
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                 raise

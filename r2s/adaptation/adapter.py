@@ -1,4 +1,4 @@
-"""The interface of adapters, which correct the torque of a frozen policy at 1 kHz."""
+"""Define the interface of adapters, which correct the torque of a frozen policy at 1 kHz."""
 
 from typing import Protocol
 
@@ -6,13 +6,13 @@ import numpy as np
 
 
 class Adapter(Protocol):
-    """A torque correction for one arm at 1 kHz, which the driver adds before the safety filter.
+    """An object that computes a torque at 1 kHz, which the driver of one arm adds before the safety filter.
 
-    An adapter must be picklable, because on a real-time arm it runs in another process than the policy.
+    An adapter must be picklable, because adapter and policy of a real-time arm run in different processes.
     """
 
     def begin(self) -> None:
-        """Start a motion from rest, and discard all earlier estimates."""
+        """Start a motion from rest, and discard all estimates of earlier motions."""
         ...
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Create the adapters of conf/adapt from the result of an identification.
 
-A new adapter needs a function or class with an `AdapterContext` and settings as arguments, and a file in conf/adapt
-that names this function or class.
+To add an adapter, write a function or class whose arguments are an `AdapterContext` and the adapter's settings, and
+name this function or class in a new file of conf/adapt.
 """
 
 from dataclasses import dataclass
@@ -26,11 +26,11 @@ from r2s.recordings.recording import Recording
 
 @dataclass(frozen=True)
 class AdapterContext:
-    """The result of an arm's identification, from which the arm's adapter is made.
+    """Result of an arm's identification, from which a function such as `observer` creates an adapter for this arm.
 
     Attributes:
-        robot, dynamics: the identified arm. posterior: parameter space and posterior draws; None if not available.
-        unloaded: two recordings without a payload that contain commanded torque; None if not available.
+        robot, dynamics: the identified arm. posterior: parameter space and posterior draws; None without draws.
+        unloaded: two recordings of commanded torque without a payload; None without such recordings.
     """
 
     robot: Robot
@@ -40,17 +40,17 @@ class AdapterContext:
 
     @cached_property
     def arm(self) -> ArmModel:
-        """The identified arm as arrays for compiled functions."""
+        """Return the identified arm as an `ArmModel`, whose arrays compiled functions can read."""
         return make_arm_model(self.robot, self.dynamics)
 
     @cached_property
     def corrected(self) -> tuple[ArmModel, Noise]:
-        """The arm with a model correction fitted to `unloaded`, and the uncertainty of the corrected model."""
+        """Return the arm's model after a correction fitted to `unloaded`, and the corrected model's uncertainty."""
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 
     def gated(self, adapter: Holdable) -> Adapter:
-        """Return the adapter; for a robot with a tool, wrap it in a `ContactGate`, which freezes it in contact."""
+        """Return the adapter; if the robot has a tool, a `ContactGate` wraps and freezes the adapter in contact."""
         if self.robot.tool is None:
             return adapter
         wrench = WrenchObserver(self.robot, self.dynamics)

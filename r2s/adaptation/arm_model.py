@@ -1,7 +1,7 @@
-"""The identified arm as arrays for compiled functions: links, friction, latency.
+"""Convert an identified arm to arrays for compiled functions: links, friction and latency.
 
-Each joint has a friction table over speed, for any friction family. With the presliding deflection z in [-1, 1], the
-friction is z times the row FORWARD (for z >= 0) or BACKWARD (for z < 0), plus the row SPEED_ONLY.
+A table per joint represents any friction law: its columns are speeds. At the presliding deflection z in [-1, 1],
+friction equals z times the row FORWARD (z >= 0) or BACKWARD (z < 0), plus the row SPEED_ONLY.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ FORWARD, BACKWARD, SPEED_ONLY = range(3)  # rows of a table
 
 
 class ArmModel(NamedTuple):
-    """Model of an arm of n joints without a payload, as float arrays.
+    """Model of an arm with n joints and without a payload, in arrays of floats.
 
     `angle_friction` and `compliance` are 0 until `apply_correction` (model_correction.py) adds fitted values.
     """
@@ -32,7 +32,7 @@ class ArmModel(NamedTuple):
     payload_frame: np.ndarray  # (12,), position and axes of the payload frame in the last link
     gravity: np.ndarray  # (3,) m/s^2
     armature: np.ndarray  # (n,) kg m^2
-    offset: np.ndarray  # (n,) Nm; for this and the next two see `Dynamics`
+    offset: np.ndarray  # (n,) Nm; `Dynamics` explains offset, load and drag
     load: np.ndarray  # (n,)
     drag: np.ndarray  # (n, 2)
     angle_friction: np.ndarray  # (n, 2) Nm, friction proportional to sin q, to cos q
@@ -43,7 +43,7 @@ class ArmModel(NamedTuple):
     level: np.ndarray  # (n,) Nm, sliding friction
     breakaway: np.ndarray  # (n,) Nm, largest torque that stiction balances
     latency: np.ndarray  # (2,) cycles, delay and lag
-    payload_max: np.ndarray  # (2,) kg, m, see `Robot`
+    payload_max: np.ndarray  # (2,) kg, m, largest mass and distance of a payload, see `Robot`
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
@@ -86,7 +86,7 @@ def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
 
 @njit(cache=True, inline="always")
 def friction_torque(table, max_speed, v, z):
-    """Return friction in Nm at v rad/s with presliding deflection z in [-1, 1]; table (3, 2 POINTS - 1)."""
+    """Return a joint's friction in Nm at speed v rad/s and presliding deflection z; table: (3, 2 POINTS - 1) Nm."""
     u = min(abs(v) / max_speed, 1.0) ** 0.5
     at = (u if v >= 0.0 else -u) * (POINTS - 1) + (POINTS - 1)
     k = min(int(at), 2 * POINTS - 3)

@@ -1,4 +1,4 @@
-"""Detect contacts: forces far beyond their standard deviation that are not a payload's weight; compiled."""
+"""Detect contacts by forces far above their standard deviation, and recognize a payload's weight; compiled."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def detect(threshold, floor, state):
-    """Test whether a contact begins or ends; this needs a moving joint, because friction at rest hides forces."""
+    """Test whether a contact begins or ends; a joint must move, because friction of resting joints hides forces."""
     x, P, contact = state.x, state.P, state.contact
     square = floor**2
     a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]
@@ -35,7 +35,7 @@ def detect(threshold, floor, state):
 
 @njit(cache=True, error_model="numpy")
 def weigh(arm, state):
-    """Add up the tip's path under a downward force; a force that stays downward over 5 cm is a payload's weight."""
+    """Add up the tip's travel while the force points down; beyond 5 cm, the force is a payload's weight."""
     x, P, joints, J, contact = state.x, state.P, state.joints, state.jacobian, state.contact
     g = np.sqrt((arm.gravity * arm.gravity).sum())
     if contact[TOUCHES] == 0.0 or g == 0.0:

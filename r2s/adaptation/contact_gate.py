@@ -1,6 +1,6 @@
-"""Freeze an adapter in contact, because it would treat the contact force as a model error and push against it.
+"""Freeze an adapter in contact, because adapters treat a contact force as a model error and push against the force.
 
-In contact, the gate returns the adapter's torque of REWIND cycles earlier, and the adapter's estimate is frozen.
+In contact, the gate returns the torque that the adapter computed REWIND cycles earlier, and freezes the estimate.
 """
 
 from typing import Protocol
@@ -20,10 +20,10 @@ class Holdable(Adapter, Protocol):
 
 
 class ContactGate:
-    """An `Adapter` that freezes another adapter in contact.
+    """Wrap an adapter, and freeze the wrapped adapter in contact.
 
     Args:
-        adapter: the adapter to freeze. wrench: observer that detects contacts.
+        adapter: the wrapped adapter. wrench: observer that detects contacts.
     """
 
     def __init__(self, adapter: Holdable, wrench: WrenchObserver):
@@ -31,7 +31,7 @@ class ContactGate:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest, without contact."""
+        """Start a motion from rest and without contact."""
         self.adapter.begin()
         self.wrench.begin()
         self.adapter.held = False
@@ -39,7 +39,7 @@ class ContactGate:
         self._cycle = 0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Process one cycle and return the torque (n,) Nm to add; see `Adapter`."""
+        """Process one cycle; return the torque (n,) Nm that the driver adds in the next cycle; see `Adapter`."""
         self.adapter.held = self.wrench(q, dq, tau)
         torque = self.adapter(q, dq, tau)
         oldest = self._past[self._cycle % REWIND]

@@ -4,8 +4,8 @@
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A call takes about 15 us, at the end of a span about 50 us; reading `now` takes longer. `now` reports a physical body,
-whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1), 2018).
+A call of the estimator takes about 15 us, or 50 us at the end of a span. The property `now` takes longer and returns
+a physical body, whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1), 2018).
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from r2s.physics.robot import SIM_DT
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimate at one time; fields ending in `_half` are half widths of 95 % intervals."""
+    """Estimate of payload, friction and offsets at one time, with half widths (`_half`) of the 95 % intervals."""
 
     cycle: int  # cycles since the start
     t: float  # s since the start, pauses included
@@ -45,10 +45,10 @@ class Estimate:
 
 
 class Estimator:
-    """Recursive estimator of one arm's payload, friction and offsets, cycle by cycle.
+    """Estimate one arm's payload, friction and offsets recursively, in every cycle.
 
     Attributes:
-        changes: s, times of detected payload changes.
+        changes: times in s at which the estimator detected payload changes.
         held: whether the estimate is frozen, for example while the arm is in contact.
 
     Args:
@@ -69,7 +69,7 @@ class Estimator:
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Start a motion from rest, `pause_s` after the last motion; a pause increases the estimate's variance."""
+        """Start a motion from rest; a pause of `pause_s` since the last motion increases the estimate's variance."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None
@@ -78,7 +78,7 @@ class Estimator:
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
         """Process q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether the estimate is new.
 
-        Values that are not finite restart the motion, as `begin` does.
+        If a value is not finite, the estimator ignores this cycle and calls `begin`.
 
         Raises:
             UserError: an array does not have one value per joint.
@@ -128,20 +128,20 @@ class Estimator:
 
     @property
     def now(self) -> Estimate:
-        """The estimate at the end of the last span; computed when read, because this is slower than an update."""
+        """Return the estimate at the end of the last span; computed on reading, so that `__call__` stays fast."""
         if self._now is None:
             self._now = self._report(self._changed)
         return self._now
 
     @property
     def payload(self) -> np.ndarray:
-        """(10,), the payload's inertial parameters in the payload frame; zeros if its mass is not significant."""
+        """Return the payload's inertial parameters (10,) in the payload frame; zeros if the mass is insignificant."""
         x = self._filter.x[:BODY]
         return x.copy() if x[0] > max(Z_95 * np.sqrt(self._filter.P[0, 0]), self._least) else np.zeros(BODY)
 
     @property
     def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:
-        """Kalman filter, state of the residual's computation, and the last span's residual; read only."""
+        """Return the Kalman filter, the state of `update_residual`, and the last residual; do not modify these."""
         return self._filter, self._state, self._residual
 
     def _report(self, changed: bool) -> Estimate:
@@ -173,8 +173,8 @@ class Estimator:
 def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the physical body nearest to x (10,): mass kg, center (3,) m, tensor (3, 3) kg m^2 about the center.
 
-    Mass and first moments stay unchanged: the data determine them well. The nearest non-negative second moment about
-    the center replaces the estimated one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
+    The data determine mass and first moments well, so both stay unchanged. The nearest non-negative second moment
+    about the center replaces the estimate, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
     """
     m = float(x[0])
     if m <= 0.0:

@@ -1,18 +1,18 @@
-"""Feedforward of the estimated payload, friction and offsets.
+"""Compute the feedforward torque of the estimated payload, friction and offsets.
 
 The feedforward uses the payload's estimated mass and center, clipped by `plausible_payload`. For joint j, the
-estimate x predicts a torque c = h x, Nm. The row h contains the payload's ten columns (gravity, Coriolis,
-acceleration), the model's friction, and 1 for the offset. The variance of c is s^2 = h P h^T, with the covariance P
-of x. The feedforward is w c. For the true torque c*, the mean square error E (w c - c*)^2 is least at
-w = c*^2 / (c*^2 + s^2). Since c^2 - s^2 is an unbiased estimate of c*^2, the weight is
+estimate x with covariance P predicts the torque c = h x in Nm. The vector h consists of ten payload terms (gravity,
+Coriolis, acceleration), the model's friction, and 1 for the offset. The torque c has the variance s^2 = h P h^T. The
+feedforward torque is w c with a weight w. For the true torque c*, the mean square error E (w c - c*)^2 is smallest at
+w = c*^2 / (c*^2 + s^2). Since c^2 - s^2 is an unbiased estimate of c*^2, r2s chooses
 
     w = max(0, 1 - s^2 / c^2).
 
-This is James-Stein shrinkage (1961, positive part) for one number: w = 0 if |c| is below its standard deviation s.
+This formula is James-Stein shrinkage (1961, positive part) of one number: w is 0 if |c| is below s.
 
-The feedforward follows the motion without delay, but a low-pass over one span smooths the step at a new estimate. A
-torque step twists elastic gears, which the Kalman filter interprets as another payload. This causes the next
-step. On an elastic development twin, such steps of 30 Nm repeated at 25 Hz.
+The feedforward follows the motion without delay, but a low-pass over one span smooths the torque step at a new
+estimate. Without this low-pass, a torque step twists elastic gears, the Kalman filter mistakes the twist for a new
+payload, and the new estimate causes another step: on an elastic development twin, steps of 30 Nm repeated at 25 Hz.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ from r2s.physics.robot import SIM_DT
 
 
 class Feedforward:
-    """An `Adapter` that adds the estimated torque, with less weight if the estimate is uncertain.
+    """An `Adapter` that adds the estimated torque, and adds less of this torque if the estimate is uncertain.
 
     Args:
         arm: the corrected model. noise: uncertainty of the corrected model.
@@ -40,15 +40,15 @@ class Feedforward:
         self.begin()
 
     def begin(self) -> None:
-        """Start a motion from rest, and discard all earlier estimates."""
+        """Start a motion from rest, and discard all estimates of earlier motions."""
         n = self._n
         self.estimator = Estimator(self._arm, self._noise)
         self._payload, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))
-        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # estimated torque; part of it still to be added
+        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # estimated torque; its part not yet added
 
     @property
     def held(self) -> bool:
-        """Whether the estimate is frozen."""
+        """Return whether the estimate is frozen."""
         return self.estimator.held
 
     @held.setter
@@ -56,7 +56,7 @@ class Feedforward:
         self.estimator.held = held
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Process one cycle and return the torque (n,) Nm to add; see `Adapter`."""
+        """Process one cycle; return the torque (n,) Nm that the driver adds in the next cycle; see `Adapter`."""
         new = self.estimator(q, dq, tau)
         filter, state, residual = self.estimator.internals
         if new:
@@ -72,10 +72,10 @@ class Feedforward:
 
 @njit(cache=True, error_model="numpy")
 def plausible_payload(x, most, out):
-    """Write the ten parameters of a payload with the mass and center of x (10,), clipped to the arm's limits.
+    """Write the inertial parameters (10,) of a payload with estimated mass and center, clipped to the arm's limits.
 
-    most: (2,) kg, m, largest mass, and largest distance of the payload's center from its frame. The tensor is that
-    of a ball of water, because the data hardly determine it and a wrong tensor would feed back the acceleration.
+    most: (2,), largest mass in kg, and largest distance in m from the payload frame to the center. The tensor is that
+    of a water ball, because the data hardly determine tensors, and a wrong tensor would feed back the acceleration.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0
@@ -92,7 +92,7 @@ def plausible_payload(x, most, out):
 
 @njit(cache=True, error_model="numpy")
 def shrinkage_weights(filter, residual, payload, weight):
-    """Write the shrinkage weights (n,) of the joints' torques at the end of a span."""
+    """Compute the shrinkage weight of each joint's torque at the end of a span, and write all (n,) to `weight`."""
     x, P, n = filter.x, filter.P, len(weight)
     h, at = np.empty(BODY + 2), np.empty(BODY + 2, dtype=np.int64)
     for j in range(n):
@@ -110,7 +110,7 @@ def shrinkage_weights(filter, residual, payload, weight):
 
 @njit(cache=True, error_model="numpy")
 def _estimated_torque(x, state, payload, weight, slow, torque):
-    """Write the torque (n,) Nm of the estimate x times `weight`; update `slow` (n, 10), a low-pass of `payload_p`."""
+    """Write `weight` times the torque that x predicts to `torque` (n,) Nm; slow: (n, 10), low-pass of `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
         total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j]

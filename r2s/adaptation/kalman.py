@@ -1,15 +1,15 @@
-"""Kalman filter of payload, friction and offsets; compiled.
+"""Estimate payload, friction and offsets with a Kalman filter; compiled.
 
 The state of an arm with n joints has N = 10 + 4 n components:
 - the payload's mass, first moments and tensor about the payload frame: kg, kg m, kg m^2;
-- per joint the relative friction error, a random walk;
-- per joint a torque offset in Nm, a random walk;
+- per joint the relative error of the friction model, a random walk;
+- per joint the error of the torque offset in Nm, a random walk;
 - per joint the model error in Nm, an Ornstein-Uhlenbeck process whose variance grows when friction changes;
 - per joint the relative error of the momentum rate, an Ornstein-Uhlenbeck process.
 
-The filter processes the momentum residuals joint by joint. Breakaway or a vibrating gear causes large residuals for
-one or two spans. So Huber's function (Robust Statistics, 1981) reduces the weight of innovations beyond HUBER
-standard deviations. The filter still follows a payload change, because the innovations then stay large.
+The filter processes the momentum residual of one joint after the other. Breakaway or a vibrating gear causes large
+residuals for one or two spans. Huber's function (Robust Statistics, 1981) therefore reduces the weight of innovations
+beyond HUBER standard deviations. The filter still follows a payload change, whose innovations stay large for longer.
 """
 
 from typing import NamedTuple
@@ -30,11 +30,11 @@ from r2s.adaptation.payload_jump import (
 from r2s.adaptation.tuning import HUBER, MOMENTUM_CORRELATION, MOST_SURPRISE, ONSETS, REST_SPANS, STICTION_S, T
 from r2s.compiled import njit
 
-SPANS, AT_REST = range(2)  # indices of `Filter.counts`; the others are in payload_jump.py
+SPANS, AT_REST = range(2)  # indices of `Filter.counts`; payload_jump.py defines the indices 2 to 4
 
 
 class Noise(NamedTuple):
-    """Uncertainty of the model of an arm with n joints."""
+    """Uncertainty of the model of an n-joint arm: noise, missing terms, drift, and prior of the filter's state."""
 
     white: np.ndarray  # (n,) Nm, white noise of a residual
     momentum_share: np.ndarray  # (n,), relative error of the momentum rate
@@ -56,7 +56,7 @@ class Noise(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """State of the Kalman filter and of the test for payload jumps."""
+    """State of the Kalman filter, and of the likelihood ratio test for payload jumps."""
 
     x: np.ndarray  # (N,), mean
     P: np.ndarray  # (N, N), covariance
@@ -73,7 +73,7 @@ class Filter(NamedTuple):
 
     @staticmethod
     def fresh(noise: Noise) -> "Filter":
-        """Return the state before the first measurement."""
+        """Return the filter's state before the first measurement."""
         prior, N = noise.prior, len(noise.prior)
         n = (N - BODY) // 4
         return Filter(
@@ -85,7 +85,7 @@ class Filter(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def update(filter, noise, residual):
-    """Advance a `Filter` by one span, with the `MomentumResidual` of this span."""
+    """Predict and correct the filter's state with the residual of one span, and test for a payload jump."""
     predict(filter, noise, residual)
     correct(filter, noise, residual)
     detect(filter, noise)
@@ -93,7 +93,7 @@ def update(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def predict(filter, noise, residual):
-    """Propagate mean, covariance and jump signatures over one span."""
+    """Predict the state's mean and covariance, and its response to payload jumps (`signature`), over one span."""
     P, counts, n, moving = filter.P, filter.counts, len(residual.y), False
     for j in range(n):
         moving |= residual.sliding[j] > 0.0
@@ -115,7 +115,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Increase the variances, at most to the prior's, because the payload may change in a pause of `seconds`."""
+    """Increase the state's variances, at most to the prior's variances, because the payload may change in a pause."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:
@@ -172,7 +172,7 @@ def _predict_joint(filter, noise, residual, j):
 
 @njit(cache=True, error_model="numpy")
 def correct(filter, noise, residual):
-    """Correct mean and covariance by the residuals of all joints, one after the other."""
+    """Correct the state's mean and covariance by the residual of one joint after the other."""
     x, P, h, N = filter.x, filter.P, filter.work[0], len(filter.x)
     for j in range(len(residual.y)):
         v, S = _innovation(filter, noise, residual, j)
@@ -192,7 +192,7 @@ def correct(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def _innovation(filter, noise, residual, j):
-    """Return joint j's innovation in Nm and its variance; write P h^T into filter.work[0]."""
+    """Return the innovation of joint j in Nm and the innovation's variance; write P h^T into filter.work[0]."""
     x, P, h, n = filter.x, filter.P, filter.work[0], len(residual.y)
     friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
     of_friction, of_rate, payload = residual.friction[j], residual.rate[j], residual.payload

@@ -1,10 +1,10 @@
-"""Correction of the identified model, fitted to recordings without a payload.
+"""Correct the identified model by a fit to recordings without a payload.
 
-An identification omits terms that hardly improve its fit. A payload estimate needs them: 0.1 Nm at a lever arm of
-0.5 m is the weight of 20 g. So the correction fits all terms of a joint (`TERMS`), mass and first moments of every
-link, and the compliance of every gear. Each parameter has a prior with mean zero and a typical standard deviation,
-which makes the fit a ridge regression (Bishop 2006, 3.3). The data of the fit are momentum residuals
-(momentum_residual.py), which need no accelerations.
+An identification omits model terms that hardly improve its fit. A payload estimate needs these terms, because a
+torque error of 0.1 Nm at a lever arm of 0.5 m looks like a mass of 20 g. The correction therefore fits all terms of a
+joint (`TERMS`), mass and first moments of every link, and the compliance of every gear. Each parameter has a prior
+with mean zero and a typical standard deviation, so the fit is a ridge regression (Bishop 2006, 3.3). The fit uses
+momentum residuals (momentum_residual.py), which need no accelerations.
 
 A compliant gear of stiffness K twists by torque / K. A residual that ignores the twist between motor and link has an
 error of M d2(torque)/dt2 / K: 0.7 Nm at 15 kNm/rad on a Panda whose torque varies by 4 Nm at 7 Hz.
@@ -28,7 +28,7 @@ SHARE, OFFSET, LOAD, LAW, ANGLE, CABLE, TERMS = 0, 1, 2, 3, 7, 9, 11
 
 
 class ModelCorrection(NamedTuple):
-    """Correction of the model of an arm with n joints."""
+    """Corrections to the model of an n-joint arm: links, gears, joint terms, missing inertia and latency."""
 
     links: np.ndarray  # (n, 4) kg and kg m, mass and first moment
     compliance: np.ndarray  # (n,) rad/Nm, of the gears
@@ -38,12 +38,12 @@ class ModelCorrection(NamedTuple):
 
     @staticmethod
     def none(n: int) -> "ModelCorrection":
-        """Return a correction with all values zero."""
+        """Return a correction of zeros, which does not change a model."""
         return ModelCorrection(*map(np.zeros, ((n, 4), (n,), (n, TERMS), (n, n), (n, n))))
 
 
 def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumResidual]) -> ModelCorrection:
-    """Return the correction fitted to residuals of `arm` without a payload; zero for joints that hardly slid."""
+    """Fit a correction to residuals of `arm` without a payload; joints that hardly moved get no joint terms."""
     n = robot.n
     shared, own, y, sliding = _columns(robot, arm, residuals)
     sliding = sliding & (sliding.sum(0) >= tuning.LEAST_SPANS)
@@ -73,7 +73,7 @@ def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumRe
 
 
 def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
-    """Return the arm with all corrections except `inertia` and `latency`, which `Noise` contains."""
+    """Return the arm with all corrections except `inertia` and `latency`, which are part of `Noise`."""
     links, table = arm.links.copy(), arm.table.copy()
     before, has_mass = arm.links[:, MASS, None], arm.links[:, MASS] > 0.0
     mass = np.maximum(before + correction.links[:, :1], 0.5 * before)[has_mass]
@@ -98,7 +98,7 @@ def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
 def corrected_residuals(
     robot: Robot, arm: ArmModel, correction: ModelCorrection, residuals: list[MomentumResidual]
 ) -> list[MomentumResidual]:
-    """Return the `residuals` of `arm` after subtraction of all correction terms, inertia and latency included."""
+    """Return the `residuals` of `arm` minus all terms of the correction, including inertia and latency."""
     shared, own, y, _ = _columns(robot, arm, residuals)
     terms = own * np.concatenate([correction.joints, correction.inertia, correction.latency], 1)
     y = y - shared @ np.concatenate([correction.links.ravel(), correction.compliance]) - terms.sum(-1)
@@ -109,7 +109,7 @@ def corrected_residuals(
 def _columns(
     robot: Robot, arm: ArmModel, residuals: list[MomentumResidual]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return regressors of links and gears (T, n, 5 n) and joints (T, n, K), y (T, n) Nm, and sliding (T, n) bool."""
+    """Return regressors of links and gears (T, n, 5 n), of joints (T, n, K), residuals (T, n) Nm, sliding (T, n)."""
     names = ("q", "dq", "friction", "y", "sliding", "acceleration", "torque_rate")
     q, v, friction, y, sliding, ddq, torque_rate = (np.array([getattr(r, name) for r in residuals]) for name in names)
     samples, n = q.shape

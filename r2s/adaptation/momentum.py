@@ -1,8 +1,8 @@
-"""Generalized momentum of an arm, and its derivatives by a payload's ten inertial parameters (columns); compiled.
+"""Compute an arm's generalized momentum, and its derivatives by a payload's ten inertial parameters; compiled.
 
-p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q), without accelerations (De Luca and Mattone, ICRA 2003). Joint j
-has the screw S_j about the base origin and moves bodies with the total momentum h_j. Then p_j is S_j . h_j, and the
-j-th element of C^T dq is dS_j/dt . h_j. These two are linear in each body's mass, first moments and tensor.
+The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q), without accelerations (De Luca and Mattone, ICRA
+2003). Joint j has the screw axis S_j about the base origin and moves bodies with the total momentum h_j. Then p_j is
+S_j . h_j, and element j of C^T dq is dS_j/dt . h_j, both linear in each body's mass, first moments and tensor.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ MOMENTUM_WORK = 18  # columns of the workspace, per joint
 
 
 class MomentumTerms(NamedTuple):
-    """Momentum of n joints, and the torques that change this momentum, except commands and friction."""
+    """Momentum of n joints, and the Coriolis and gravity torques that change this momentum."""
 
     p: np.ndarray  # (n,) Nm s
     coriolis: np.ndarray  # (n,) Nm, C^T dq
@@ -28,7 +28,7 @@ class MomentumTerms(NamedTuple):
 
     @staticmethod
     def empty(n: int) -> "MomentumTerms":
-        """Return zeros for n joints."""
+        """Return the terms of n joints, filled with zeros."""
         return MomentumTerms(*np.zeros((4, n)), *np.zeros((2, n, BODY)))  # type: ignore[call-arg]
 
 
@@ -39,7 +39,7 @@ def _cross(ax, ay, az, bx, by, bz):
 
 @njit(cache=True, error_model="numpy")
 def momentum(arm, q, dq, terms, work):
-    """Write the `MomentumTerms` of an `ArmModel` at q, dq (n,) rad, rad/s; work: (n, MOMENTUM_WORK)."""
+    """Write momentum and torques of an arm at q, dq (n,) rad, rad/s to `terms`; scratch: work (n, MOMENTUM_WORK)."""
     n = len(q)
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     px, py, pz = 0.0, 0.0, 0.0
@@ -101,7 +101,7 @@ def momentum(arm, q, dq, terms, work):
 
 @njit(cache=True, error_model="numpy")
 def _payload_columns(arm, R, p, w, v, terms, work):
-    """Write the payload's columns; R, p, w, v: the last link's pose and twist, about the base origin."""
+    """Write the payload's columns to `terms`; R, p: pose of the last link; w, v: its twist about the base origin."""
     frame, (px, py, pz), (wx, wy, wz), (vx, vy, vz) = arm.payload_frame, p, w, v
     rx, ry, rz = rotate(R, frame[0], frame[1], frame[2])
     px, py, pz = px + rx, py + ry, pz + rz

@@ -1,12 +1,12 @@
-"""Momentum residual: mean torque over 60 ms that commands, friction and links do not explain; compiled.
+"""Compute the momentum residual: mean torque over 60 ms that command, friction and links do not explain; compiled.
 
-The change of momentum equals the integral of all torques, so no signal is differentiated. Let m be a moving average
-of the integrated model torque minus the momentum. The residual y = (m(t) - m(t - T)) / T, Nm, compares two averages
-one span of T s apart, and is linear in the unknown parameters x: y = H x + noise.
+The change of momentum equals the integral of all torques, so the residual needs no accelerations. Let m be the moving
+average of the model torque's integral minus the momentum. The residual y = (m(t) - m(t - T)) / T in Nm compares two
+averages at a distance of one span, T s. The residual is linear in the unknown parameters x: y = H x + noise.
 
-The moving average m has triangular weights over two spans, so y weights torque by a quadratic spline over three
-spans. Elastic gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm. Samples once per span
-would alias this vibration to a few hertz. The triangular weights pass 2.4 % of a 60 Hz vibration, the spline 0.4 %.
+The moving average has triangular weights over two spans, so y averages torque by a quadratic spline over three spans.
+Elastic gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm. Sampling once per span would
+alias this vibration to a few hertz. Of a 60 Hz vibration, the triangle passes 2.4 % and the spline 0.4 %.
 """
 
 from typing import NamedTuple
@@ -25,14 +25,14 @@ CYCLE, COMMAND, ENDED = range(3)  # indices of `counts`: cycles of this span, al
 BEFORE, INTEGRAL = range(2)  # rows of `model`, `friction`, `payload`: value a cycle ago; integral over the span
 # rows of `sums`: residual Nm s, friction Nm s, momentum Nm s, q, dq, motor torque Nm
 RESIDUAL, FRICTION, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
-# first index of `sums`: falling, rising side in this span; rising side in the last span; triangle ended with it
+# first index of `sums`: falling, rising side in this span; rising side in the last span; triangle that ended there
 FALLING, RISING, LAST_RISING, LAST_WHOLE = range(4)
 RISING_SUM = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of a rising side; the falling side has SPAN - 1 to 0
 STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in spans 1 and 2
 
 
 class ResidualState(NamedTuple):
-    """State of the residual's computation for n joints, from cycle to cycle."""
+    """State that `update_residual` needs from cycle to cycle, for n joints."""
 
     counts: np.ndarray  # (3,): CYCLE, COMMAND, ENDED
     commands: np.ndarray  # (SLOTS, n) Nm, delay line
@@ -40,8 +40,8 @@ class ResidualState(NamedTuple):
     motor_mean: np.ndarray  # (n,) Nm, mean motor torque in the coming cycle
     deflection: np.ndarray  # (n,), presliding deflection in [-1, 1]
     model: np.ndarray  # (2, n): BEFORE Nm, INTEGRAL Nm s of the model torque
-    friction: np.ndarray  # (2, n): the same for friction
-    payload: np.ndarray  # (2, n, 10): the same for the payload's columns
+    friction: np.ndarray  # (2, n): BEFORE Nm, INTEGRAL Nm s of friction
+    payload: np.ndarray  # (2, n, 10): BEFORE, INTEGRAL of the payload's columns
     sums: np.ndarray  # (4, SUMS, n), triangle sums
     payload_sums: np.ndarray  # (4, n, 10)
     motor_spans: np.ndarray  # (2, n) Nm, mean motor torque of the last two spans, latest first
@@ -51,7 +51,7 @@ class ResidualState(NamedTuple):
 
     @staticmethod
     def fresh(n: int) -> "ResidualState":
-        """Return the state of n joints before the first cycle."""
+        """Return the state of `update_residual` for n joints before the first cycle."""
         shapes = [(SLOTS, n), (n,), (n,), (n,), (2, n), (2, n), (2, n, BODY), (4, SUMS, n), (4, n, BODY)]
         arrays = map(np.zeros, [*shapes, (2, n), (2, n)])
         work = np.zeros((n, max(MOMENTUM_WORK, WORK)))
@@ -59,7 +59,7 @@ class ResidualState(NamedTuple):
 
 
 class MomentumResidual(NamedTuple):
-    """Residual of n joints at the end of a span, written by `update_residual`; means are over three spans."""
+    """Residual of n joints at the end of a span, and means of measured signals over the last three spans."""
 
     y: np.ndarray  # (n,) Nm, the residual
     payload: np.ndarray  # (n, 10), the payload's columns of y
@@ -75,7 +75,7 @@ class MomentumResidual(NamedTuple):
 
     @staticmethod
     def empty(n: int) -> "MomentumResidual":
-        """Return initial values, which `update_residual` overwrites."""
+        """Return a residual of n joints, whose values `update_residual` overwrites."""
         arrays = {name: np.zeros(n) for name in MomentumResidual._fields}
         arrays |= {"payload": np.zeros((n, BODY)), "sliding": np.ones(n), "gear": np.zeros((n, n))}
         return MomentumResidual(**arrays)
@@ -83,11 +83,11 @@ class MomentumResidual(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def update_residual(arm, state, q, dq, tau, out):
-    """Process one cycle; return whether `out` holds the residual of a new span.
+    """Process one cycle; return whether a span ended and `out` contains the residual of this span.
 
     Args:
-        arm: `ArmModel`. state: `ResidualState`. q, dq: (n,) rad, rad/s, measured in this cycle.
-        tau: (n,) Nm, command sent in this cycle, without gravity. out: `MomentumResidual`.
+        arm: model of the arm. state: is updated in place. q, dq: (n,) rad, rad/s, measured in this cycle.
+        tau: (n,) Nm, command sent in this cycle, without gravity. out: `MomentumResidual`, is updated in place.
     """
     counts = state.counts
     momentum(arm, q, dq, state.terms, state.work)
@@ -139,7 +139,7 @@ def _integrate(arm, state, q, dq, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_to_sums(state, q, dq):
-    """Add this cycle to two triangular averages: one ends with this span, the other begins with this span."""
+    """Add this cycle to two overlapping triangular sums, with peaks at the start and at the end of this span."""
     rising, p, payload_p = state.counts[CYCLE] + 1, state.terms.p, state.terms.payload_p
     for k, weight in ((FALLING, SPAN - rising), (RISING, rising)):
         sums, payload_sums = state.sums[k], state.payload_sums[k]
@@ -156,7 +156,7 @@ def _add_to_sums(state, q, dq):
 
 @njit(cache=True, error_model="numpy")
 def _close_span(arm, state, out):
-    """Write the residual at the end of a span, and reset the integrals to zero, so that they stay small."""
+    """Write the residual at the end of a span, and reset all integrals to zero, so that no integral grows large."""
     whole = SPAN * SPAN  # sum of the weights of a triangle
     scale = 1.0 / (whole * SPAN * SIM_DT)  # from sums to a change of means per second
     sums, slid, n = state.sums, state.slid, len(out.y)

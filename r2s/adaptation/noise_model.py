@@ -18,7 +18,7 @@ Prior = tuple[np.ndarray, np.ndarray]  # standard deviations of relative frictio
 
 
 def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
-    """Return the prior of friction and offsets, computed from posterior draws (S, P) of an identification."""
+    """Compute the prior of friction and offsets from the posterior draws (S, P) of an identification."""
     d = space.dynamics(samples)
     sliding = np.full(space.n, tuning.LEVEL_SPEED)
     levels = 0.5 * (d.friction(sliding) - d.friction(-sliding))
@@ -27,7 +27,7 @@ def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
 
 
 def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
-    """Return the default `Noise` of an arm without recordings; prior: None if no posterior is available."""
+    """Return the default `Noise` for an arm without recordings; `prior` may be None (no posterior)."""
     n = len(arm.level)
     zero = np.zeros(n)
     friction, offset = prior or (zero + 0.3, 0.3 * arm.level)
@@ -76,11 +76,11 @@ def fit_noise(
 ) -> tuple[ModelCorrection, Noise]:
     """Return the model correction from two motions without a payload, and the noise of the corrected model.
 
-    The noise is fitted to the residuals that a correction fitted to `train` leaves in `other`, another motion.
-    Residual covariances at lags of 60 to 300 ms yield a joint's model error; the remaining variance determines white
-    noise and its growth with the momentum rate. A factor per joint then scales the noise until innovations have
-    their predicted variance, and a common factor until the odds of a payload change stay below the number of spans.
-    The returned correction, initial friction and initial offsets are fitted to both motions.
+    The motion `train` yields a first model correction. The noise is fitted to the residuals of the corrected model in
+    the motion `other`: covariances at lags of 60 to 300 ms yield a joint's model error, and the remaining variance
+    yields white noise that grows with the momentum rate. Scaling each joint's noise then matches the variance of the
+    innovations to the prediction. A final common factor limits the odds of a payload change to the number of spans.
+    Both motions determine the returned correction and the prior means of friction and offsets.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)
@@ -118,7 +118,7 @@ def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
 
 
 def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: float) -> tuple[float, float, float]:
-    """Return joint j's white noise Nm, momentum share, and model error Nm; model: default of the model error."""
+    """Fit joint j's white noise, Nm, its growth with the momentum rate, and the model error, Nm (default `model`)."""
     columns = np.array([[r.friction[j], 1.0] for r in residuals])
     y, sliding = np.array([r.y[j] for r in residuals]), np.array([r.sliding[j] > 0 for r in residuals])
     fitted = columns @ np.linalg.lstsq(columns[sliding], y[sliding], rcond=None)[0]
@@ -138,13 +138,13 @@ def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: f
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
-    """Return the noise with the white noise and errors of each joint multiplied by scale (n,)."""
+    """Return `noise` after multiplying the white noise and the errors of each joint by a factor `scale` (n,)."""
     parts = {name: getattr(noise, name) * scale for name in ("white", "momentum_share", "model", "reversal")}
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["momentum_share"]))
 
 
 def _with_model(prior: np.ndarray, model: np.ndarray, momentum: np.ndarray) -> np.ndarray:
-    """Return `prior` with `model` and `momentum` (n,) as standard deviations of model and momentum errors."""
+    """Return a copy of `prior` with new standard deviations (n,) of the model errors and of the momentum errors."""
     out = prior.copy()
     out[-2 * len(model) :] = np.concatenate([model, momentum])
     return out
@@ -158,7 +158,7 @@ def _without_payload(noise: Noise) -> Noise:
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Filter M residuals; return the `Filter`, normalized innovations (M, n), nan at rest, and log odds (M,)."""
+    """Filter M residuals; return the `Filter`, normalized innovations (M, n) (nan: joint at rest), log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)
@@ -169,13 +169,13 @@ def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.nd
 
 
 def _largest_odds(noise: Noise, residuals: list[MomentumResidual]) -> float:
-    """Return the largest log odds of a payload change, for residuals without a payload change."""
+    """Return the largest log odds of a payload change in a motion whose payload does not change."""
     return float(_run(noise, residuals)[2][len(residuals) // 10 :].max())
 
 
 def _innovation_scale(noise: Noise, residuals: list[MomentumResidual]) -> np.ndarray:
     """Return (n,) root mean squares of the normalized innovations of an arm without a payload."""
-    size = np.abs(_run(_without_payload(noise), residuals)[1])[len(residuals) // 10 :]  # offsets settle before this
+    size = np.abs(_run(_without_payload(noise), residuals)[1])[len(residuals) // 10 :]  # offsets have settled
     scale = np.ones(size.shape[1])
     for j in range(len(scale)):
         own = size[np.isfinite(size[:, j]), j]

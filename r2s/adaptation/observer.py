@@ -6,7 +6,7 @@ the mean over three spans (momentum_residual.py), and tau the command after the 
 filter_s dd^/dt = d - d^ yields the estimate d^.
 
 If a joint does not slide throughout the three spans, stiction may hold it, and the residual only bounds d. The
-estimate then changes no more than these bounds require, because stiction supports the arm, as in the training.
+estimate of d then changes only as far as the bounds require, because stiction supports the arm as in training.
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ class Observer:
 
 @njit(cache=True, error_model="numpy")
 def _observe(arm, state, residual, q, dq, tau, share, disturbance):
-    """Process one cycle; write `disturbance` (2, n) Nm: mean over three spans, and its low-pass (gain `share`)."""
+    """Process one cycle; update the disturbance (mean over three spans) and its low-pass, (n,) Nm each."""
     measured, filtered = disturbance[0], disturbance[1]
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):

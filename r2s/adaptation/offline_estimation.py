@@ -33,7 +33,7 @@ def fit_correction(
         robot, dynamics: the identified arm.
         posterior: parameter space and posterior draws, for the uncertainty of friction and offsets.
         unloaded: two recordings with commanded torque and without a payload, for example those of the identification.
-            None: the correction is zero, and the model error is a tenth of the friction level.
+            Without recordings (None), the correction is zero and the model error a tenth of the friction level.
     """
     arm = make_arm_model(robot, replace(dynamics, declared_payload=np.zeros(4)))  # as during the identification
     prior = prior_of(*posterior) if posterior is not None else None
@@ -62,7 +62,7 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
 def estimate_recording(
     robot: Robot, estimator: Estimator, recording: Recording, report: Callable[[Estimate], None] | None = None
 ) -> list[Estimate]:
-    """Return the estimates at the ends of all spans of the recording; call `report` with each new estimate."""
+    """Return the estimate at the end of every span of the recording; pass each estimate to `report`."""
     recording, out = at_rate(robot, recording), []
     for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         estimator.begin(pause_s)
@@ -75,7 +75,7 @@ def estimate_recording(
 
 
 def pauses(recording: Recording) -> list[float]:
-    """Return the time without rows before each trajectory, s; UNKNOWN_PAUSE_S where the clock restarts."""
+    """Return the pause before each trajectory, s; it is UNKNOWN_PAUSE_S if the recording's clock restarts there."""
     starts = [recording.t[s.start] for s in recording.stretches]
     ends = [recording.t[s.stop - 1] for s in recording.stretches]
     between = [float(b - a) for a, b in zip(ends[:-1], starts[1:], strict=True)]

@@ -1,10 +1,10 @@
 """Detect sudden payload changes (jumps), and correct the Kalman filter's estimate after a jump; compiled.
 
-This is a generalized likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). A jump may begin in any of the
-last ONSETS spans. For each onset, the test stores the Kalman filter's response to a jump (signature) and computes
-the odds of a jump under a prior. Without a jump, the mean of these odds exceeds x with probability 1 / x at most
-(Markov's inequality, expectation 1). So a threshold equal to the number of tests in ten hours allows one false alarm
-in ten hours. In practice this aims at one per hour, because model errors have heavier tails than the filter's noise.
+This is a generalized likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). Each of the last ONSETS spans
+is a possible onset of a jump. For each onset, the test stores the Kalman filter's response to a jump (signature) and
+computes the odds of a jump under a prior. If no jump occurs, the odds averaged over the onsets have expectation 1,
+and exceed x with a probability of at most 1 / x (Markov's inequality). A threshold equal to the number of tests in
+ten hours thus allows one false alarm in ten hours; one per hour is the aim, as model errors have heavier tails.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ MEAN, ONSET = range(2)  # indices of `Filter.log_odds`
 
 @njit(cache=True)
 def begin_onset(filter):
-    """Replace the oldest onset by the present span."""
+    """Add the present span to the possible onsets of a jump, in place of the oldest one if all slots are used."""
     at = filter.counts[NEXT]
     filter.signature[at] = 0.0
     filter.information[at] = 0.0
@@ -33,7 +33,7 @@ def begin_onset(filter):
 
 @njit(cache=True, error_model="numpy")
 def update_onsets(filter, residual, j, v, S):
-    """Update all onsets with joint j's innovation v of variance S; filter.work[0] (N,) is P h^T."""
+    """Update all onsets with the innovation v of joint j, its variance S, and P h^T in filter.work[0] (N,)."""
     g, h, payload, N, n = np.empty(JUMP), filter.work[0], residual.payload, len(filter.x), len(residual.y)
     friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
     for k in range(filter.counts[USED]):
@@ -135,6 +135,6 @@ def apply_jump(filter, noise):
 
 @njit(cache=True)
 def widen_payload(P, noise):
-    """Add the variances of a new payload to those of the payload's mass and first moments."""
+    """Increase the variances of the payload's mass and first moments by the variances of a new payload."""
     for c in range(JUMP):
         P[c, c] += (NEW_PAYLOAD * noise.prior[c]) ** 2

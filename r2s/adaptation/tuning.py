@@ -1,7 +1,7 @@
 """Tuning constants of the package adaptation, each with unit and source.
 
-A constant without a named source is chosen by its order of magnitude. benchmarks/payload.py tested all constants
-together on development twins (seeds 0 to 9); its argument NAME=VALUE tests another value of a constant.
+Constants without a named source are estimates of the order of magnitude. benchmarks/payload.py tested all constants
+together on development twins (seeds 0 to 9). Its argument NAME=VALUE changes one constant for a test.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from r2s.physics.safety_filter import RATE
 
 # friction tables (arm_model.py)
 TABLE_END = 1.5  # share of dq_max: speed at the end of a friction table
-BREAKAWAY_SPEED = 0.02  # rad/s: friction at this speed replaces an unmeasured breakaway torque
+BREAKAWAY_SPEED = 0.02  # rad/s, the friction at this speed replaces an unmeasured breakaway torque
 LEVEL_SPEED = 0.1  # rad/s, speed at which the friction level is taken
 
 # momentum residual (momentum_residual.py)
@@ -29,8 +29,8 @@ FRICTION_SHARE = OFFSET_NM = 0.3  # share of friction; Nm
 ROTOR_INERTIA, LATENCY_S = 0.1, 0.002  # kg m^2; s
 GEAR_COMPLIANCE = 1e-4  # rad/Nm: gears of 10 kNm/rad
 STRIBECK_SPEED = 0.03  # rad/s, scale of the friction term that decreases with speed
-LEAST_SPANS = 50  # sliding spans that a fit needs
-CORRELATED_SPANS = 15  # spans that share one error: 0.3 s, see CORRELATION_S
+LEAST_SPANS = 50  # fewest spans with sliding from which a fit is made
+CORRELATED_SPANS = 15  # spans with the same model error: 0.3 s, see CORRELATION_S
 
 # noise model (noise_model.py)
 # shares of an arm's largest payload and distance: RMS of a mass uniform up to half the largest, RMS of centers

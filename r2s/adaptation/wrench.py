@@ -7,10 +7,10 @@
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
 tool (wrench_filter.py). A contact begins when the squared force, in units of its covariance, exceeds a threshold for
 15 ms while a joint moves, in a chi-square test of the hypothesis that no force acts. The threshold aims at one false
-alarm per hour. It is at least GAUSSIAN, the value for independent normal errors in each cycle. For larger errors,
-`contact_threshold` determines the threshold from recordings without contact: the largest squares of half seconds
-have an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling
-Extremal Events, 1997, section 3.3), which the function extrapolates to an hour.
+alarm per hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors,
+`contact_threshold` computes the threshold from recordings without contact: the largest squared force of each half
+second has an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch,
+Modelling Extremal Events, 1997, section 3.3), which the function extrapolates to an hour.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,10 +41,10 @@ class WrenchObserver:
 
     Attributes:
         threshold: squared force, in units of its covariance, above which the arm is in contact.
-        tool: the robot's tool, or None.
+        tool: tool of the robot; None for a robot without a tool.
 
     Args:
-        robot, dynamics: the identified arm. threshold: see the attribute; None: twice GAUSSIAN.
+        robot, dynamics: the identified arm. threshold: contact threshold; None: twice GAUSSIAN.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, threshold: float | None = None):
@@ -57,17 +57,17 @@ class WrenchObserver:
         self._q, self._dq, self._tau = np.zeros((3, robot.n))
         self.begin()
         zero = np.zeros(robot.n)
-        self(robot.q_home, zero, zero)  # compile before an arm waits
+        self(robot.q_home, zero, zero)  # compile now, while no arm waits for the result
         self.begin()
 
     def begin(self) -> None:
-        """Start a motion from rest, without contact, and with the model's payload only."""
+        """Start a motion of an arm that rests, touches nothing, and carries only the payload of its model."""
         self._state = WrenchState.fresh(len(self._arm.level), self._components)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
         """Process q, dq (n,) rad, rad/s and command (n,) Nm without gravity of one cycle; return `in_contact`.
 
-        Values that are not finite restart the motion, as `begin` does.
+        If a value is not finite, reset the estimate as `begin` does.
 
         Raises:
             UserError: an array does not have one value per joint.
@@ -83,19 +83,19 @@ class WrenchObserver:
         return self.in_contact
 
     def carry(self, payload: np.ndarray) -> None:
-        """Set the payload that the model lacks: ten inertial parameters in the payload frame (momentum.py)."""
+        """Set the inertial parameters (10,) of a payload that the model lacks, in the payload frame (momentum.py)."""
         n, state = len(self._arm.level), self._state
         state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # the payload's current momentum
         state.payload[:] = payload
 
     @property
     def in_contact(self) -> bool:
-        """Whether the arm touches its surroundings; False if the force is a payload's weight (`hangs`)."""
+        """Whether the arm touches its surroundings; the weight of a payload (`hangs`) is not a contact."""
         return bool(self._state.contact[TOUCHES] > 0.0) and not self.hangs
 
     @property
     def hangs(self) -> bool:
-        """Whether the force is a payload's weight: it has pointed down over 5 cm of the tip's path."""
+        """Whether the force is a payload's weight, because it pointed down while the tip moved by 5 cm."""
         return bool(self._state.contact[HANGING] > tuning.WEIGHT_PATH)
 
     @property
@@ -125,17 +125,17 @@ class WrenchObserver:
 
     @property
     def tip(self) -> np.ndarray:
-        """(3,) m, point in the base frame where the force acts."""
+        """(3,) m, position of the tip in the base frame; the estimated force acts at the tip."""
         return self._state.place
 
     @property
     def square(self) -> float:
-        """The squared force, in units of its covariance, which is compared with `threshold`."""
+        """Squared force, in units of its covariance; a contact begins when this value exceeds `threshold`."""
         return float(self._state.contact[SQUARE])
 
     @property
     def rests(self) -> np.ndarray:
-        """(n,), whether each joint rests; the friction of a resting joint may hide a force."""
+        """(n,) bool, True for a joint at rest; the friction of a resting joint may hide a force."""
         return self._state.joints[REST] > 0.0
 
 
@@ -158,10 +158,10 @@ def observe_recording(
     estimator: Estimator | None = None,
     report: Callable[[Estimate], None] | None = None,
 ) -> pd.DataFrame:
-    """Return a row per millisecond: wrench with half widths of 95 % intervals, contact, and position of the tip.
+    """Return a table with one row per millisecond: wrench, half widths of its 95 % intervals, contact, tip position.
 
     Args:
-        estimator: estimates a payload, whose effect is removed from the wrench; frozen while a tool is in contact.
+        estimator: estimates the payload, whose effect the observer removes from the wrench. Tool contacts freeze it.
         report: called with each new estimate of the payload.
     """
     recording = at_rate(robot, recording)
@@ -194,7 +194,7 @@ def observe_recording(
 
 
 def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
-    """Return begin and end, s, and the largest force, N, of each contact in the table of `observe_recording`."""
+    """Return the begin and end, s, and the largest force, N, of each contact in a table from `observe_recording`."""
     touches = np.diff(np.concatenate([[0], table["in_contact"].to_numpy(), [0]]))
     force = np.linalg.norm(table[["force_x_N", "force_y_N", "force_z_N"]].to_numpy(), axis=1)
     t = table["t"].to_numpy()
@@ -205,7 +205,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why the recordings are unfit for `contact_threshold` (rate or length), or None if they are fit."""
+    """Return why rate or length make the recordings unfit for `contact_threshold`; None if they are fit."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]

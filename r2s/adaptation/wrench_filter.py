@@ -5,14 +5,14 @@ for each of n joints, the error b of the friction f = f_model + b, Nm; and the g
 every cycle measures (momentum.py). Momentum obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
 and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 
-The uncertainty of a joint's friction depends on whether the joint slides (wrench_friction.py):
-- A sliding joint measures the wrench: its friction error b is small, with a short correlation time. Near a reversal,
-  b is larger, because the noisy speed leaves the direction of friction uncertain.
-- A resting joint only bounds the change of the wrench: its friction balances the other torques, between the negative
-  and the positive breakaway torque (edges).
-The wrench is assumed to change with the motion of the tip, as in a stiff environment. With all joints at rest, only a
-person's hand can change the force, and friction hides changes between the edges. The variance of a resting joint's
-friction is at most that of a uniform distribution between the edges.
+The uncertainty of a joint's friction depends on whether the joint slides (wrench_friction.py).
+- A sliding joint provides a precise measurement of the wrench, because its friction error b is small and has a short
+  correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain.
+- A resting joint only bounds the wrench. The friction of this joint balances all other torques, and may be any torque
+  between the negative and the positive breakaway torque (edges). The variance of this friction is at most that of a
+  uniform distribution between the edges.
+The filter assumes that the wrench changes as the tip moves, as in a stiff environment. If all joints rest, only a
+person's hand can change the force, and friction hides changes between the edges.
 """
 
 import numpy as np
@@ -47,12 +47,12 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
-    """Process one cycle; the first rows of `state.x` and `state.P` are the wrench and its covariance.
+    """Process one cycle; `state.x` and `state.P` begin with the wrench and its covariance.
 
     Args:
-        arm: `ArmModel`. tip: (3,) m in the last link's frame. noise: `WrenchNoise`.
+        arm: `ArmModel`. tip: (3,) m, position of the tip in the last link's frame. noise: `WrenchNoise`.
         threshold: squared force, in units of its covariance, above which the arm is in contact.
-        q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm, command sent in this cycle, without gravity.
+        q, dq: (n,) rad, rad/s, measured in this cycle. tau: (n,) Nm, command of this cycle, without gravity.
     """
     joints, counts, n = state.joints, state.counts, len(q)
     if counts[CYCLE] == 0:
@@ -98,7 +98,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
 
 @njit(cache=True, error_model="numpy")
 def _shake(state):
-    """Update the mean square of the high-frequency part of each joint's momentum, which vibrating gears cause."""
+    """Update each joint's mean squared high-frequency momentum, which is due to gear vibration."""
     joints, rate = state.joints, SIM_DT * tuning.SHAKE_BAND
     for j in range(joints.shape[1]):
         if state.counts[CYCLE] == 0:
@@ -112,7 +112,7 @@ def _shake(state):
 
 @njit(cache=True, error_model="numpy")
 def _begin(noise, state):
-    """Set the state of the first cycle: the measured momentum, and a wrench of zero with a small variance."""
+    """Initialize the filter with the measured momentum and with a wrench of zero and small variance."""
     x, P, joints = state.x, state.P, state.joints
     n = joints.shape[1]
     w = len(x) - 2 * n
@@ -127,14 +127,14 @@ def _begin(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _predict(noise, state):
-    """Advance state and covariance by one cycle."""
+    """Predict the filter's state and covariance one cycle ahead."""
     x, P, joints, J, column = state.x, state.P, state.joints, state.jacobian, state.column
     n, N = joints.shape[1], len(x)
     w = N - 2 * n
     decay = np.exp(-SIM_DT / tuning.FRICTION_NOISE_S)
     for j in range(n):
         m = w + n + j
-        if joints[REST, j] == 1.0:  # its momentum follows from that of sliding joints
+        if joints[REST, j] == 1.0:  # sliding joints determine a resting joint's momentum
             x[m] = state.terms.p[j]
             P[m] = 0.0
             P[:, m] = 0.0
@@ -176,7 +176,7 @@ def _hidden(noise, j):
 
 @njit(cache=True, error_model="numpy")
 def _wrench_variance(noise, state):
-    """Return the process noise, N^2, of a force component in this cycle."""
+    """Return by how much the variance of each force component, N^2, grows in this cycle (process noise)."""
     joints, J = state.joints, state.jacobian
     n = joints.shape[1]
     speed = creep = 0.0
@@ -220,7 +220,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Limit each resting joint's friction to its breakaway torques (edges), and its variance to `_hidden`."""
+    """Limit the friction of resting joints to the breakaway torques (edges), and its variance to `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)
@@ -239,7 +239,7 @@ def _keep_within_edges(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _update(state, gain, innovation, variance):
-    """Correct the state by a measurement whose derivative with respect to the state is `gain` (N,)."""
+    """Correct the state by a scalar measurement; the gradient of the measurement by the state is `gain` (N,)."""
     x, P, column = state.x, state.P, state.column
     N = len(x)
     total = variance

@@ -36,7 +36,7 @@ MASS_EVERY = 20  # cycles between two computations of the mass matrix
 
 @njit(cache=True, error_model="numpy")
 def masses(arm, noise, state, q):
-    """Write the mass matrix, its rate, and the variances of the measured momenta."""
+    """Compute the mass matrix, its time derivative, and the variances of the measured momenta."""
     n = len(q)
     mass, before, rest = state.mass, state.mass.copy(), np.zeros(n)
     equations(arm.links, arm.gravity, q, rest, mass, np.empty(n), state.work)
@@ -52,7 +52,7 @@ def masses(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def couple(state):
-    """Write the coupling M_rs M_ss^-1 of resting joints (r) and sliding joints (s), from the mass matrix M."""
+    """Compute the coupling M_rs M_ss^-1 of resting joints (r) to sliding joints (s); M is the mass matrix."""
     rest, mass = state.joints[REST], state.mass
     state.coupling[:] = 0.0
     sliding, resting = np.flatnonzero(rest == 0.0), np.flatnonzero(rest == 1.0)
@@ -72,7 +72,7 @@ def couple(state):
 
 @njit(cache=True, error_model="numpy")
 def known_torque(arm, noise, state, q):
-    """Decide which joints rest; write each joint's modeled friction and the sum of its known torques."""
+    """Detect which joints rest; compute each joint's modeled friction and the sum of its known torques."""
     joints, terms, x, P = state.joints, state.terms, state.x, state.P
     n = len(q)
     b = len(x) - 2 * n
@@ -111,7 +111,7 @@ def known_torque(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
-    """Decide whether joint j rests; a resting joint that has crept is treated as sliding for this cycle."""
+    """Detect whether joint j rests; a resting joint that creeps is treated as sliding for one cycle."""
     joints[CREEP, j] = 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])
@@ -147,7 +147,7 @@ def side_variance(noise, joints, j):
 
 @njit(cache=True, error_model="numpy")
 def holding_friction(state, j, gain):
-    """Return the friction, Nm, that keeps joint j at rest; write its derivative by the state x to `gain` (N,)."""
+    """Return joint j's friction at rest, Nm, and set `gain` (N,) to the gradient of this friction by the state x."""
     x, joints, J = state.x, state.joints, state.jacobian
     n = joints.shape[1]
     w = len(x) - 2 * n

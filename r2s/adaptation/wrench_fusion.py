@@ -3,12 +3,12 @@
 The joint angles yield the tip's penetration depth, and the law of the surface (r2s/physics/surface.py) yields the
 normal force F_s. The variance s^2 of F_s comes from the surface's posterior, encoder noise, and errors of the law. A
 Kalman update along the normal n combines F_s with the force F from momentum, which has the covariance P, as F' =
-F + P n (F_s - n . F) / (n . P n + s^2). The difference F_s - n . F is low-passed first, because angles are noisy.
+F + P n (F_s - n . F) / (n . P n + s^2). A low-pass first filters F_s - n . F, because the measured angles are noisy.
 
-F_s is wrong if the tip touches another surface or the surface has moved. An innovation test (Bar-Shalom, Li and
-Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore refuses a surface if the low-passed
-difference exceeds REFUSED standard deviations. For the rest of the motion, the estimate ignores a refused surface: a
-small force would pass the test with any surface.
+The force F_s is wrong if the tip touches a different surface or if the identified surface has moved. An innovation
+test (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore refuses a surface
+if the low-passed difference exceeds REFUSED standard deviations. The estimate ignores a refused surface until the
+motion ends, because with a small force any surface would pass the test.
 """
 
 from collections.abc import Sequence
@@ -44,10 +44,10 @@ def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle
 
 
 class FusedWrench(WrenchObserver):
-    """A `WrenchObserver` that also uses the law of a surface, but detects contacts by momentum alone.
+    """A `WrenchObserver` whose force estimate also uses an identified surface; contact detection does not.
 
     Args:
-        surface, draws: identified surface, and draws from its posterior (r2s/identification/contact/contact_file.py).
+        surface: identified surface. draws: posterior samples of it (r2s/identification/contact/contact_file.py).
 
     Raises:
         UserError: the robot has no tool.
@@ -68,7 +68,7 @@ class FusedWrench(WrenchObserver):
         super().__init__(robot, dynamics, threshold)
 
     def begin(self) -> None:
-        """Start a motion from rest; use the surface until the innovation test refuses it."""
+        """Start a motion from rest, and trust the surface again if an earlier motion refused it."""
         super().begin()
         self._memory = np.zeros(6)
         self._memory[TRUSTED] = 1.0
@@ -106,7 +106,7 @@ class FusedWrench(WrenchObserver):
 
 @njit(cache=True, error_model="numpy")
 def surface_force(law, k, tip, rate):
-    """Return normal force, N, and penetration depth, m, of a tip (3,) m with depth rate, m/s; k: row of `law.law`."""
+    """Return normal force, N, and depth, m, of a tip (3,) m that penetrates at `rate` m/s, by row k of `law.law`."""
     row = law.law[k]
     depth = law.radius
     for c in range(3):
@@ -116,12 +116,12 @@ def surface_force(law, k, tip, rate):
 
 @njit(cache=True, error_model="numpy")
 def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the variance, N^2, of the surface's normal force, from posterior, encoder noise, and law errors."""
+    """Return the variance, N^2, of the normal force due to the posterior, encoder noise, and errors of the law."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count
     normal, slope = law.law[0, LAW_NORMAL : LAW_NORMAL + 3], force * law.law[0, LAW_EXPONENT] / depth
-    smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # share of white noise's variance that passes the low-pass
+    smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # share of the variance of white noise that passes the low-pass
     for j in range(jacobian.shape[1]):
         lever = normal[0] * jacobian[0, j] + normal[1] * jacobian[1, j] + normal[2] * jacobian[2, j]
         square += smooth * (slope * lever * law.angle) ** 2
@@ -130,7 +130,7 @@ def surface_variance(law, force, depth, tip, rate, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance):
-    """Write the fused force (3,) N and its covariance (3, 3) N^2; `memory` (6,): state of `FusedWrench`."""
+    """Compute the fused force (3,) N and its covariance (3, 3) N^2; update `memory` (6,) of the observer."""
     fused[:] = force[:3]
     fused_covariance[:] = covariance[:3, :3]
     normal = law.law[0, LAW_NORMAL : LAW_NORMAL + 3]
@@ -138,7 +138,7 @@ def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance)
     if memory[SINCE] > 0.0:
         memory[RATE] += SIM_DT * tuning.DEPTH_RATE * ((depth - memory[DEPTH]) / SIM_DT - memory[RATE])
     memory[DEPTH], memory[SINCE] = depth, 1.0
-    if pressing <= 0.0:  # the tip does not touch; other bodies may
+    if pressing <= 0.0:  # the tip does not touch the surface, but another part of the arm may
         memory[DIFFERENCE] = 0.0
         return
     own = surface_variance(law, pressing, depth, tip, memory[RATE], jacobian)

@@ -26,8 +26,8 @@ class WrenchNoise(NamedTuple):
     """Uncertainties that the wrench filter assumes: friction of n joints, inertia, sensor noise, and force."""
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a sliding joint
-    edges: np.ndarray  # (n, 2) Nm, sum of the other torques at which a joint breaks away: negative, positive
-    presliding: np.ndarray  # (n,) rad, 0: a joint sticks until it breaks away
+    edges: np.ndarray  # (n, 2) Nm, breakaway torque of each joint in the negative and the positive direction
+    presliding: np.ndarray  # (n,) rad, decay length of presliding; 0: a joint sticks until it breaks away
     inertia: float  # inertia error as a share of a joint's net torque
     speed: float  # rad/s, white noise of measured speeds
     angle: float  # rad, noise of measured angles
@@ -35,7 +35,7 @@ class WrenchNoise(NamedTuple):
 
 
 class WrenchState(NamedTuple):
-    """State of the wrench filter, from cycle to cycle."""
+    """State of the wrench filter, updated in every cycle."""
 
     x: np.ndarray  # (N,), mean
     P: np.ndarray  # (N, N), covariance
@@ -43,7 +43,7 @@ class WrenchState(NamedTuple):
     counts: np.ndarray  # (2,), COMMAND, CYCLE
     contact: np.ndarray  # (6,), see SURPRISE to HANGING
     payload: np.ndarray  # (10,), payload beyond the model, in the payload frame (momentum.py)
-    commands: np.ndarray  # (SLOTS, n) Nm
+    commands: np.ndarray  # (SLOTS, n) Nm, the last commands
     place: np.ndarray  # (3,) m, tip in the base frame
     jacobian: np.ndarray  # (6, n), Jacobian of the tip's position (3 rows) and rotation (3 rows)
     frames: np.ndarray  # (n, POSE)
@@ -56,7 +56,7 @@ class WrenchState(NamedTuple):
 
     @staticmethod
     def fresh(n: int, components: int) -> "WrenchState":
-        """Return the state before the first cycle; components: 3 (force) or 6 (with moment)."""
+        """Return the initial state of a filter with 3 wrench components (force) or 6 (force and moment)."""
         N = components + 2 * n
         joints = np.zeros((ROWS, n))
         joints[REST] = 1.0

@@ -1,1 +1,1 @@
-"""Arms behind one interface: driver, policy runners, recorder, hidden twins, and clients of real arms."""
+"""Arms with one common interface: driver, policy runners, recorder, hidden twins, and clients of real arms."""

@@ -2,8 +2,8 @@
 
 Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives
 only the driver's torques; tests/test_command_loop.py checks that no other code commands an arm. Every cycle checks
-for a stop request (r2s/arm/stop_request.py). After the driver has brought the arm to rest, the loop stops the arm
-and raises ArmStopped with the reason.
+for a stop request (r2s/arm/stop_request.py). Once the driver has brought the arm to rest, the loop ends the arm's
+motion and raises ArmStopped with the reason.
 """
 
 import time
@@ -35,13 +35,13 @@ class CommandLoop:
     Attributes:
         arm, driver: the arguments.
         state: the arm's state in the current cycle. sent: (n,) Nm, the last torque command.
-        clock: s, three values of perf_counter in the last cycle: before the driver, after it, after the adapter.
+        clock: s, three perf_counter times of the last cycle: before the driver, after the driver, after the adapter.
 
     Args:
         arm: the arm. driver: limits the torques of all motions of this loop.
         log: receives (state, torque) of every cycle before the torque is sent.
-        adapter: called once per cycle; its torque is added in the next cycle. After an exception of the adapter, the
-            driver first stops the arm, as it does without new commands, and then the exception propagates.
+        adapter: called once per cycle; its torque is added in the next cycle. If the adapter raises an exception, the
+            driver receives no more commands and so stops the arm; then the loop raises this exception.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class CommandLoop:
         self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
 
     def place(self, q: np.ndarray) -> ArmState:
-        """Move the arm to q (n,) rad and begin a motion there, at rest; raise ArmStopped as `Arm.move_to` does."""
+        """Move the arm to rest at q (n,) rad and begin a motion there; raise ArmStopped as `Arm.move_to` does."""
         self._check_request()
         self._reset()
         try:
@@ -77,7 +77,7 @@ class CommandLoop:
         self.state = self.arm.read()
 
     def damp(self, hold: np.ndarray) -> None:
-        """Begin a motion that only damps the arm (see `rest`); a request to stop does not prevent it."""
+        """Damp the arm to rest (see `rest`), even if a stop was requested."""
         self._reset()
         self.state = self.arm.read()
         self.rest(hold)
@@ -86,7 +86,7 @@ class CommandLoop:
         """Run one cycle and return the state of the next one.
 
         Args:
-            command: (c,), input of the control law; None: no new command. hold: (n,) Nm, see `DriverBatch.__call__`.
+            command: (c,), input of the control law; None: no new command. hold: (n,) Nm, compensation of a payload.
 
         Raises:
             StopRequested: a stop was requested, and the driver has brought the arm to rest.
@@ -106,7 +106,7 @@ class CommandLoop:
         return self.state
 
     def _step(self, command: np.ndarray | None, hold: np.ndarray | None) -> None:
-        """Run one cycle as `_cycle` does, but do not raise ArmStopped when the driver has brought the arm to rest."""
+        """Run one cycle like `_cycle`, but without raising ArmStopped once the driver has brought the arm to rest."""
         if self._ended:
             raise ArmStopped("the motion is over")
         began = time.perf_counter()
@@ -127,8 +127,8 @@ class CommandLoop:
     def rest(self, hold: np.ndarray | None = None) -> None:
         """Damp the motion for at most 0.5 s, until the arm rests under the command `hold` (n,) Nm.
 
-        Without a contact, `resist` changes `hold` to brake joints that slide on, as in a stop by the driver.
-        Without `hold`, as after a contact, the command goes to zero.
+        If the arm is not in contact, `resist` adjusts `hold` so that it brakes joints that continue to move.
+        If `hold` is None, as after a contact, the final command is zero.
         """
         inertia, robot = 1 / np.diag(self._inverse(self.state.q[None])[0]), self.arm.robot
         limit, step, most = REST_SHARE * robot.tau_max, robot.step_max, ADDED * robot.tau_max
@@ -142,7 +142,7 @@ class CommandLoop:
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:
-        """If the driver has begun a stop before the end of a motion, complete this stop and raise its reason.
+        """Complete a stop that the driver began before the motion ended, and raise the reason of this stop.
 
         Raises:
             StopRequested, ArmStopped: as `__call__`.
@@ -153,7 +153,7 @@ class CommandLoop:
     def halt(self, reason: str) -> None:
         """Damp the arm to rest under zero command, and raise ArmStopped with `reason`.
 
-        Do nothing if the driver is already stopping the arm, because this stop makes the arm leave its path.
+        If the driver is already stopping the arm, do nothing, because this stop itself makes the arm deviate.
         """
         if self.driver.stopping is not None:
             return
@@ -161,7 +161,7 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return the reason of a stop that the driver or the arm itself had begun, else None.
+        """Stop the arm; return the reason if the driver or the arm itself had already begun a stop, else None.
 
         A driver with a push limit first holds or releases a contact, as in any stop (r2s/physics/contact_stop.py).
         """
@@ -175,7 +175,7 @@ class CommandLoop:
         return reason
 
     def _leave(self) -> str | None:
-        """Bring the arm to rest after a motion; return the reason if the arm stops itself meanwhile, else None."""
+        """Bring the arm to rest after a motion; if the arm stops itself meanwhile, return the reason, else None."""
         self.driver.stop("the motion is over")
         try:
             while not self.driver.done:
@@ -198,7 +198,7 @@ class CommandLoop:
             self._adapting, self._added = True, np.zeros(self.arm.robot.n)
 
     def _adapt(self, adapter: Adapter) -> None:
-        """Update the adapter's torque; if the adapter raises, let the driver stop the arm first, then re-raise."""
+        """Update the adapter's torque; if the adapter raises an exception, stop the arm, then raise it again."""
         try:
             self._added = np.asarray(adapter(self.state.q, self.state.dq, self.sent), dtype=float)
             if self._added.shape != self.sent.shape:
@@ -215,7 +215,7 @@ class CommandLoop:
             raise
 
     def _raise(self, reason: str, hold: np.ndarray) -> None:
-        """Stop the arm; raise ArmStopped or StopRequested with `reason`, whatever reason the arm itself reports."""
+        """Stop the arm; raise ArmStopped or StopRequested with `reason`, even if the arm reports a different one."""
         kind = StopRequested if self._requested else ArmStopped
         self._block(reason)
         self._stop_arm(hold)

@@ -1,4 +1,4 @@
-"""One compiled cycle of the driver for m arms; `DriverBatch` (r2s/arm/driver.py) runs it once per millisecond."""
+"""Compiled cycle of the driver for m arms; `DriverBatch` (r2s/arm/driver.py) runs one cycle per millisecond."""
 
 from typing import NamedTuple
 
@@ -37,18 +37,18 @@ TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` wou
 
 
 class Memory(NamedTuple):
-    """State of the driver for m arms, which `drive_cycle` updates.
+    """State of the driver of m arms; `drive_cycle` updates this state in place.
 
     Attributes:
-        command: (m, c), the last finite command. law: (m, k), memory of the control law.
+        command: (m, c), the last finite commands. law: (m, k), memory of the control law.
         target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `Actuation`.
         sent: (m, n) Nm, the last torque command.
-        held: (m, n) Nm, last sum of adapter torque and `Given.hold`, which a stop still applies, except in contact.
-        share: (m,), factor on the allowed speeds: 1 in a motion, decreasing in a stop (`_brake`).
-        cycle: (m,), cycles of the motion. silent: cycles since the last finite command. damped: cycles of the stop.
-        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the filter changed the torque.
-        rests: (m,), whether the arm is at rest. commanded: (m,), whether a command has arrived.
-        least: (m, K) m, least allowed distance between the two bodies of each pair of the fence.
+        held: (m, n) Nm, last sum of adapter torque and `Given.hold`, which a stop without contact still applies.
+        share: (m,), factor on the allowed speeds, which is 1 in a motion and decreases in a stop (`_brake`).
+        cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, and the stop's start.
+        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), number of cycles changed by the safety filter.
+        rests: (m,), whether each arm is at rest. commanded: (m,), whether each arm has received a command.
+        least: (m, K) m, smallest allowed distances between the bodies of the fence's K pairs.
         push: (m, COLUMNS), parameters and state of the push limit (push_limit.py); (m, 0): no push limit.
     """
 
@@ -81,10 +81,10 @@ class Memory(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Inputs of the driver in one cycle, for m arms.
+    """Inputs of the driver of m arms in one cycle.
 
-    command: (m, c), ignored unless `new`. added: (m, n) Nm, torque of the adapters, ignored unless `adds`.
-    hold: (m, n) Nm, part of the target torque that a stop still applies. contact: (m,), whether an arm is in contact.
+    command: (m, c), commands, used if `new` is True. added: (m, n) Nm, adapter torques, used if `adds` is True.
+    hold: (m, n) Nm, compensation that a stop still applies. contact: (m,), whether each arm is in contact.
     """
 
     command: np.ndarray
@@ -98,8 +98,8 @@ class Given(NamedTuple):
 class Bounds(NamedTuple):
     """Settings of the driver: `torque` and `added`, (n,) Nm, bound the target torque and the adapter's torque.
 
-    The driver stops arms beyond q_low, q_high, dq_max (n,) rad, rad/s, or `deadline` s after the last finite command.
-    spring: (n,) Nm/rad, see `resist`. factor: gain of the low-pass. fade: cycles of the soft start.
+    The driver stops arms beyond q_low, q_high, dq_max (n,) rad, rad/s, or without a finite command for `deadline` s.
+    spring: (n,) Nm/rad, stiffness in `resist`. factor: gain of the low-pass. fade: cycles that the soft start lasts.
     """
 
     torque: np.ndarray
@@ -125,7 +125,7 @@ class Model(NamedTuple):
 
 @njit(cache=True)
 def _watch(i, q, dq, given, bounds, memory):
-    """Store arm i's command if it is finite; set `why` if the arm must stop; return whether q and dq are finite."""
+    """Store a finite command of arm i, set `why` if the arm must stop, and return whether q and dq are finite."""
     seen = np.isfinite(q).all() and np.isfinite(dq).all()
     helped = given.adds and np.isfinite(given.added[i]).all()
     if given.new and np.isfinite(given.command[i]).all() and helped == given.adds:
@@ -146,12 +146,12 @@ def _watch(i, q, dq, given, bounds, memory):
 
 @njit(cache=True)
 def resist(dq, spring, most, held):
-    """Change the torque `held` (n,) Nm of a stop to oppose the joints that still slide, at dq (n,) rad/s.
+    """Adjust the torque `held` (n,) Nm of a stop so that it brakes the joints that still move, at dq (n,) rad/s.
 
-    A joint slides on if it carries an undeclared load, or if `held` still compensates the friction of the motion.
+    A joint continues to move if it carries an undeclared load, or if `held` still compensates kinetic friction.
 
     Args:
-        spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound on `held`.
+        spring: (n,) Nm/rad, SPRING^2 times each joint's inertia. most: (n,) Nm, largest magnitude of `held`.
     """
     for j in range(len(held)):
         if abs(dq[j]) > STILL:
@@ -162,7 +162,7 @@ def resist(dq, spring, most, held):
 
 @njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
-    """Add the adapter's torque to arm i's target torque (n,) Nm; during a stop, add `Memory.held` instead."""
+    """Add the adapter's torque, or `Memory.held` during a stop, to the target torque (n,) Nm of arm i."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:
@@ -182,7 +182,7 @@ def _compensate(i, dq, stopping, given, bounds, memory, target):
 
 @njit(cache=True)
 def _kinematics(model, q):
-    """Return position and rotation of the last link, and anchors and axes of the joints, at q (n,) rad."""
+    """Return the last link's position and rotation, the link frames, and the joint axes, at q (n,) rad."""
     n = len(q)
     frames, axes = np.empty((n, POSE)), np.empty((n, 3))
     link_frames(model.links, q, frames, axes)
@@ -191,7 +191,7 @@ def _kinematics(model, q):
 
 @njit(cache=True)
 def _brake(i, seen, arm, bounds, model, memory):
-    """Set arm i's target torque during a stop, and lower its allowed speeds, beginning at the present speed.
+    """Set the target torque of arm i in a stop, and lower the allowed speeds from the present speed toward zero.
 
     A stop with code SILENT, LAW_NOT_FINITE or REQUESTED first holds or releases a contact (`stop_torque`).
     """
@@ -214,8 +214,8 @@ def drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
-        q, dq: (m, n) rad, rad/s. applied: (m, n) Nm, torque of the last cycle. given, bounds, model: `Given` etc.
-        control: number and parameters of the control law. memory: `Memory`, updated.
+        q, dq: (m, n) rad, rad/s, measured. applied: (m, n) Nm, torques of the last cycle. given: driver inputs.
+        bounds: driver settings. control: number and parameters of the control law. memory: state, updated in place.
     """
     out, (m, n) = np.empty_like(memory.sent), q.shape
     number, parameters = control

@@ -52,16 +52,16 @@ def spring(robot: Robot) -> np.ndarray:
 
 
 class DriverBatch:
-    """The driver of m arms, the last stage of every torque command before the arm.
+    """The driver of m arms: the last stage that a torque command passes before it reaches an arm.
 
     Attributes:
-        stopping: for each of the m arms, the reason why the driver is bringing it to rest, or None.
+        stopping: for each of the m arms, the reason why the driver is bringing this arm to rest; None: no stop.
 
     Args:
-        robot: limits and nominal links. torque: (n,) Nm, largest target torque of each joint.
-        m: number of arms. cutoff_hz: cutoff of the low-pass. period_s: s between two commands of the policy.
+        robot: provides limits and nominal links. torque: (n,) Nm, largest target torque of each joint.
+        m: number of arms. cutoff_hz: cutoff of the low-pass. period_s: s, time between two policy commands.
         soft_start_s: s over which the target torque fades in at the start of a motion; 0: no fade.
-        friction: (n,) Nm, level of each joint's friction. rotors: (n,) kg m^2, see `Dynamics.armature`; None: as in
+        friction: (n,) Nm, friction level of each joint. rotors: (n,) kg m^2, see `Dynamics.armature`; None: those of
             `robot`. control: control law that maps commands to torques; None: commands are torques (n,) Nm.
         fence: pairs of bodies; the driver stops an arm before the bodies of a pair touch; None: no fence.
         speed_share: factor on all allowed speeds, in (0, 1].
@@ -113,7 +113,7 @@ class DriverBatch:
         self._nothing, self._free = np.zeros(self._shape), np.zeros(m, dtype=bool)
         self.reset()
         still = np.zeros(self._shape)
-        self(np.tile(robot.q_home, (m, 1)), still, still, None)  # compile now, before an arm waits
+        self(np.tile(robot.q_home, (m, 1)), still, still, None)  # compile now, while no arm waits
         self.reset()
 
     def reset(self) -> None:
@@ -128,7 +128,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, torque that a stop still applies: compensation, plus the contact's torque if a stop holds it."""
+        """(m, n) Nm, torque in a stop: compensation, plus the contact torque if the stop holds a contact."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -136,7 +136,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop holds, releases or retreats from a contact, which needs a `push_limit`."""
+        """Whether the driver has a `push_limit`, so that a stop can hold, release or retreat from a contact."""
         return bool(len(self._push))
 
     @property
@@ -163,14 +163,14 @@ class DriverBatch:
         """Return the torque commands (m, n) Nm of this cycle.
 
         Args:
-            q, dq: (m, n) rad, rad/s, in this cycle. An arm with values that are not finite is brought to zero torque.
+            q, dq: (m, n) rad, rad/s, measured in this cycle. If q or dq is not finite, the torque ramps to 0.
             tau_J_d: (m, n) Nm, the torque that the arms applied in the last cycle.
             command: (m, c), new commands for the control law; None: no new commands in this cycle.
             added: (m, n) Nm, torque of the adapters in this cycle, clipped to ADDED * tau_max; None: no adapter. If
-                an arm's values are not finite, the driver ignores these values and the arm's new command.
+                an arm's adapter torque is not finite, the driver ignores this torque and the arm's new command.
             hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. A stop
                 still applies the last sum of `hold` and `added`, clipped to ADDED * tau_max.
-            contact: (m,), whether each arm reports a contact; a stop in contact has no compensation. None: none.
+            contact: (m,), whether each arm is in contact; None: no contact. Stops in contact apply no compensation.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)
@@ -222,7 +222,7 @@ class Driver:
 
     @property
     def stopping(self) -> str | None:
-        """The reason why the driver is bringing the arm to rest, or None."""
+        """Reason why the driver is bringing the arm to rest; None: no stop."""
         return self._drivers.stopping[0]
 
     @property
@@ -232,12 +232,12 @@ class Driver:
 
     @property
     def held(self) -> np.ndarray:
-        """(n,) Nm, see `DriverBatch.held`; in contact the compensation is zero."""
+        """(n,) Nm, torque that a stop still applies, see `DriverBatch.held`; in contact, compensation is zero."""
         return self._drivers.held[0]
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop holds, releases or retreats from a contact; see `DriverBatch.decides_contact`."""
+        """Whether a stop can hold, release or retreat from a contact; see `DriverBatch.decides_contact`."""
         return self._drivers.decides_contact
 
     @property
@@ -265,7 +265,7 @@ class Driver:
 
         Args:
             state: the arm's state in this cycle. command: (c,), input of the control law; None: no new command.
-            added: (n,) Nm, torque of the adapter; None: no adapter. hold: (n,) Nm, see `DriverBatch.__call__`.
+            added: (n,) Nm, torque of the adapter; None: no adapter. hold: (n,) Nm, compensation of a payload.
         """
         given, more, kept = (None if x is None else x[None] for x in (command, added, hold))
         contact = np.array([state.in_contact])

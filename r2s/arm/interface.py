@@ -17,7 +17,7 @@ from r2s.recordings.recording import SIGNALS, Recording
 
 
 class ArmStopped(RuntimeError):  # noqa: N818 (a stop is not a bug)
-    """The motion ended for the reason in the message; the next `move_to` begins a new motion.
+    """Error: the motion has ended, for the reason in the message; the next `move_to` begins a new motion.
 
     Attributes:
         recording: the motion recorded before the stop; None if it is too short.
@@ -44,14 +44,14 @@ class ArmState:
         tau_J: (n,) Nm, measured link-side torque; it includes gravity, but little of the motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
         tau_ext_hat_filtered: (n,) Nm, torque that the joints exert on the surroundings: tau_J minus the torque
-            of the arm's own model (gravity, load, dynamics). None if not reported, as all later values.
+            of the arm's own model (gravity, load, dynamics). This and later values are None if the arm omits them.
         O_F_ext_hat_K: (6,) N, Nm, wrench that the end effector exerts on the surroundings, in the base frame.
         joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,) for joints, (6,) for the end
             effector; above 0 where the external torque or force exceeds the contact or collision threshold.
         control_command_success_rate: share of the last 100 commands that reached the arm; 0 while no motion runs.
         O_T_EE: (16,), pose matrix of the end effector in the base frame, column by column.
         m_ee, m_load: kg, masses of end effector and load that the arm's gravity compensation assumes.
-        box: (6,), a box in the base frame, as a camera measures it: center, m, and direction of its first axis.
+        box: (6,), pose of a box, measured by a camera in the base frame: center, m, and direction of the first axis.
     """
 
     t: float
@@ -92,7 +92,7 @@ def signal_sizes(n: int) -> dict[str, int]:
 
 
 def named_signals(values: np.ndarray, n: int) -> dict[str, Any]:
-    """Split `ArmState.signals` (..., k) by name, into (..., size), or (...) for size 1; omit all-nan signals."""
+    """Split `ArmState.signals` (..., k) into named arrays (..., size), or (...) if size is 1; omit all-nan arrays."""
     sizes = signal_sizes(n)
     parts = zip(sizes, np.split(values, np.cumsum([*sizes.values()])[:-1], axis=-1), strict=True)
     return {name: x[..., 0] if x.shape[-1] == 1 else x for name, x in parts if not np.isnan(x).all()}
@@ -112,7 +112,7 @@ class Arm(Protocol):
         ...
 
     def command(self, tau: np.ndarray) -> None:
-        """Send tau (n,) Nm WITHOUT gravity for one cycle, and wait for the next.
+        """Send tau (n,) Nm WITHOUT gravity for one cycle, and wait for the next cycle.
 
         Raises:
             ArmStopped: tau is not finite, exceeds tau_max, or differs from tau_J_d by more than dtau_max * 1 ms; a
@@ -132,9 +132,9 @@ class Operated(Protocol):
 
     Attributes:
         operator: function that asks the operator, given the reason of the stop, and returns whether the arm may move.
-            None: no operator, so the arm may not move again after a stop.
+            Without an operator (None), the arm may not move again after a stop.
         blocked: reason of a stop that the operator has not yet cleared; None: no such stop. Code that stops the arm
-            must write the reason to this attribute.
+            must write the reason to `blocked`.
     """
 
     operator: Callable[[str], bool] | None
@@ -146,7 +146,7 @@ class Holds(Protocol):
     """An `Arm` whose `stop` damps the motion.
 
     Attributes:
-        hold: (n,) Nm, torque that the next `stop` adds to its damping, for example to carry a payload.
+        hold: (n,) Nm, torque that the next `stop` adds to the damping torque, for example to carry a payload.
     """
 
     hold: np.ndarray

@@ -15,7 +15,7 @@ _kept: list[RawArray] = []  # type: ignore[valid-type]  # once locked: the C lib
 
 
 class Lifeline:
-    """A mutex in shared memory; a process can detect the death of another process that has locked this mutex.
+    """A mutex in shared memory that shows whether the process that locked the mutex has died.
 
     If the C library has no robust mutex of the expected layout, `lost` always returns None.
     """
@@ -38,7 +38,7 @@ class Lifeline:
             self.release()
 
     def release(self) -> None:
-        """Unlock the mutex, so that `lost` does not report the later end of this thread."""
+        """Unlock the mutex before this thread ends normally, so that `lost` does not report a death."""
         if sys.platform.startswith("linux"):
             ctypes.CDLL(None).pthread_mutex_unlock(self._raw)
 

@@ -1,7 +1,7 @@
 """Run episodes on a twin in parallel: each chunk of goals runs on a new twin with the same seed.
 
-The chunks, and therefore the results, do not depend on the number of cores. Each chunk has its own stream of sensor
-noise. A twin with temperature-dependent friction is cold at the start of each chunk.
+The division into chunks does not depend on the number of cores, so neither do the results. Each chunk has its own
+stream of sensor noise. A twin with temperature-dependent friction is cold at the start of each chunk.
 """
 
 import multiprocessing
@@ -36,11 +36,11 @@ def run_parallel_episodes(
     On Linux this function forks, so call it before any thread starts; elsewhere the calling process runs all chunks.
 
     Args:
-        open_twin: function that opens a twin for a chunk, given the chunk's number.
+        open_twin: function that opens the twin for a chunk; the function's argument is the number of the chunk.
         policy, task: see `rollout`.
         starts: (E, n) rad, first postures of the episodes. goals: (E, ...), see `Task`.
         workers: largest number of processes.
-        progress: called with (goals done, total).
+        progress: called after every chunk with (goals done, total).
     """
     chunks = range(-(-len(goals) // CHUNK))
     done: dict[int, tuple[Episodes, list[Stop], Timing]] = {}

@@ -1,7 +1,7 @@
 """Run a policy on an arm that waits for commands: observe, query the policy at its rate, command the arm at 1 kHz.
 
-Twins and the emulator in lock-step are such arms. Their clock stands still while the policy computes, which makes
-runs repeatable bit for bit. For arms whose clock does not wait, see r2s/arm/realtime_process.py.
+The clock of a twin, or of the emulator in lock-step, stands still while the policy computes, so runs are repeatable
+bit for bit. For arms whose clock does not wait, see r2s/arm/realtime_process.py.
 """
 
 import time
@@ -34,7 +34,7 @@ class Stop:
     """Why an episode ended early.
 
     Attributes:
-        episode: number, from 0. when: time in the episode, or "on the way to its start". reason: why it ended.
+        episode: number from 0. when: time of the stop, or "on the way to its start". reason: reason of the stop.
         log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, command Nm.
     """
 
@@ -67,20 +67,20 @@ class PolicyRunner:
     """Runs episodes on one arm through the driver, one control period per step; implements `r2s.tasks.rollout.Arms`.
 
     Attributes:
-        stops: why episodes ended early. timing: see `Timing`.
+        stops: stops that ended episodes early. timing: see `Timing`.
         done: number of episodes for which the arm moved, or tried to move, to the start.
-        speeds: (1, T, n) rad/s after each control step of the last episode, see `smooth_speeds`.
+        speeds: (1, T, n) rad/s, joint speeds after each control step of the last episode, see `smooth_speeds`.
         halted: why no further episode runs: a request to stop, the operator's refusal after a stop, or too many
             failed attempts to reach a start. None: not halted.
-        blocked: `Operated.blocked` at the end of the last episode; None: no stop is pending.
+        blocked: stop that the operator had not cleared when the last episode ended (`Operated.blocked`), or None.
 
     Args:
-        arm: an arm that waits for its commands.
+        arm: an arm whose clock waits for commands.
         task: rates, torque limits and controller.
         friction: (n,) Nm, friction level of each joint: `Dynamics.level` of the dynamics the policy was trained on.
         soft_start_s: s over which an episode's torque fades in; recommended on hardware, 0 for twins.
-        rotors: (n,) kg m^2, `Dynamics.armature` of the same dynamics; None: as in `arm.robot`.
-        adapter: adds torque to the policy's; None: no adaptation.
+        rotors: (n,) kg m^2, `Dynamics.armature` of the training dynamics; None: rotors of `arm.robot`.
+        adapter: adds torque to the policy's torque; None: no adaptation.
     """
 
     width = 1
@@ -111,8 +111,8 @@ class PolicyRunner:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move to starts (1, n) rad and begin episode `first` there.
 
-        If the arm stops on the way, the episode ends; an `Operated` arm tries again, up to ATTEMPTS times in total,
-        if its operator agrees. If the operator refuses or all attempts fail, this and later episodes do not run.
+        If the arm stops on the way, the episode ends. An `Operated` arm makes up to ATTEMPTS attempts if its operator
+        agrees to each new one. If the operator refuses or all attempts fail, this and later episodes do not run.
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []
@@ -126,7 +126,7 @@ class PolicyRunner:
         return self._observe()
 
     def step(self, command: np.ndarray) -> State:
-        """Run one control period with the command (1, c), or less if the arm stops, and return the state."""
+        """Run one control period with the command (1, c) and return the state; end early if the arm stops."""
         self.timing.policy.append(time.perf_counter() - self._observed_at)
         self.run(chain([command[0]], repeat(None, self._substeps - 1)))
         return self._observe()
@@ -208,7 +208,7 @@ class PolicyRunner:
 
 
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
-    """Return smoothed joint speeds (k, n) rad/s of every `every`-th cycle, from the measured angles (n,) rad.
+    """Compute smooth joint speeds (k, n) rad/s in every `every`-th cycle, from the angles (n,) rad of all cycles.
 
     Each speed is the slope of a parabola fitted over 2 SMOOTHING_CYCLES + 1 cycles (Savitzky and Golay, 1964).
     """
@@ -220,7 +220,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Return the `State` of one arm, a batch of one, from its `ArmState`, effort (n,) Nm, stop flag, filter rate."""
+    """Convert an `ArmState`, the effort (n,) Nm, stop flag and filter rate to a `State`, a batch of one arm."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],

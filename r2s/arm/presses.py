@@ -1,7 +1,7 @@
-"""Record presses and slides on a surface with any arm, from which the surface can be identified.
+"""Record an arm while it presses on a surface and slides along it, to identify the surface.
 
-The arm follows paths of `task=wipe` by hybrid control with its identified model. The force rises along one path and
-falls along the next. The joints must move, because friction at rest hides the force (docs/how_to/surfaces.md).
+The arm performs `task=wipe`: hybrid control with the identified model moves the tip along paths on the surface. The
+force rises or falls on alternate paths. The joints must move, as stiction hides the force (docs/how_to/surfaces.md).
 """
 
 from collections import deque
@@ -28,13 +28,13 @@ PAUSE_S = 2.0  # s added to the clock between two paths, so that identification/
 
 @dataclass(frozen=True)
 class PressPlan(WipeTask):
-    """Paths along which the force changes from one end to the other: it rises on one path and falls on the next."""
+    """Wipe task for recordings: the contact force rises along the first path, falls along the second, and so on."""
 
     speed: tuple[float, float] = (0.05, 0.1)
     force: tuple[float, float] = (1.0, 2.0)  # see `press_plan`
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return the goals of `WipeTask` with the plan's forces; every second goal begins with the larger force."""
+        """Return the goals of `WipeTask` with this plan's forces; every second path begins with the larger force."""
         goals = super().goals(robot, rng, count)
         goals[:, 6:8] = self.force
         goals[1::2, 6:8] = self.force[::-1]
@@ -47,7 +47,7 @@ def press_plan(
     point: Sequence[float] | None = None,
     normal: Sequence[float] | None = None,
 ) -> PressPlan:
-    """Return the plan for a plane whose point (3,) m and normal (3,) are known within 5 mm and 5 degrees.
+    """Return the task for recording presses on a plane: point (3,) m within 5 mm, normal (3,) within 5 degrees.
 
     Raises:
         UserError: the robot has no tool, or the plane is invalid.
@@ -69,15 +69,15 @@ def record_presses(
 ) -> Recording:
     """Follow `count` random paths on the surface; return a recording with commanded torque, one trajectory per path.
 
-    The recording has the rows of `r2s.arm.recorder.record`. The recorded time advances by PAUSE_S between paths.
+    The rows have the format of `r2s.arm.recorder.record`. The recorded time has gaps of PAUSE_S between paths.
 
     Args:
-        arm: moves above the first point of each path, and is always stopped at the end. dynamics: the arm's.
+        arm: moves above the start of each path, and is always stopped at the end. dynamics: the arm's dynamics.
         seed: random seed of the paths. progress: called after every path with (paths done, total).
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver ended a path; the exception's `recording` contains earlier paths, if any.
+        ArmStopped: the arm or the driver stopped the motion; `recording` contains the paths completed before, if any.
         UserError: the tip does not reach the surface, or no safe path leads there.
     """
     robot, control = arm.robot, plan.control(arm.robot)
@@ -116,7 +116,7 @@ def record_presses(
 
 
 def _recording(log: deque[tuple[ArmState, np.ndarray]], ends: list[int], name: str) -> Recording:
-    """Return the recording of the complete paths; path k has the rows ends[k] to ends[k + 1]."""
+    """Return the recording of the completed paths; rows ends[k] to ends[k + 1] of `log` belong to path k."""
     rows = list(log)[: ends[-1]]
     path = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
     t = np.arange(len(rows)) * SIM_DT + path * PAUSE_S

@@ -25,7 +25,7 @@ from r2s.recordings.recording import Recording
 # The ramp
 SLOW_TAU_MAX = 40.0  # Nm: joints with at least this tau_max have a large inertia, move late, and get a slower ramp
 SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; at 4 Nm/s light links move visibly within ms
-MAX_SHARE = 0.2  # of tau_max, default torque at which a ramp gives up
+MAX_SHARE = 0.2  # share of tau_max, default for the largest torque of a ramp
 AFTER_MOTION = 5  # cycles recorded after the joint has moved
 STRAY = DEVIATION  # rad: a ramp ends if any joint moves this far; an arm this far from its pose moves back to it
 POSE_MARGIN = 0.15  # rad from a pose to the position limits; more than any joint moves in one ramp
@@ -65,19 +65,19 @@ def ramp(
 ) -> Ramps:
     """Ramp every joint in both directions at every pose and return one trajectory per ramp.
 
-    A ramp begins with a short rest at zero command. Then one joint's command rises from 0 at `rate`, while the other
-    commands stay 0. The ramp ends when the joint has moved by MOVED, its command reaches `largest`, or any joint has
-    moved by STRAY. The recording omits the stop after each ramp. Rows are those of `r2s.arm.recorder`. If the
-    error of gravity compensation exceeds a joint's friction, the joint slides at zero command. The ramp then brakes
-    this joint until it rests under a constant command, from which the joint's ramp starts.
+    A ramp begins with a short rest at zero command. Then one joint's command rises from 0 at `rate`; the commands of
+    all other joints stay 0. The ramp ends when the joint has moved by MOVED, its command reaches `largest`, or any
+    joint has moved by STRAY. The recording omits the stop after each ramp. The rows have the format of
+    `r2s.arm.recorder`. If the error of gravity compensation exceeds a joint's friction, the joint slides at zero
+    command. Braking then finds a constant command that stops this joint, and the joint's ramp starts from there.
 
     Args:
         arm: moves to each pose, and is always stopped at the end.
-        poses: (P, n) rad, at least 0.15 rad inside the position limits. Nothing moves if the arm would come too close
-            to the table or to itself, at a pose or on a path (r2s/excitation/paths.py).
-        rate: (n,) or one number, Nm/s; default: 2.2 for joints with tau_max of at least 40 Nm, 4 for weaker ones, and
-            proportionally less below 12 Nm.
-        largest: (n,) or one number, Nm, command at which a ramp ends in any case; default 20 % of tau_max.
+        poses: (P, n) rad, at least 0.15 rad inside the position limits. The arm does not move if it would come too
+            close to the table or to itself, at a pose or on the way (r2s/excitation/paths.py).
+        rate: (n,) or one number, Nm/s, slope of the ramps; default: 2.2 for joints with tau_max of at least 40 Nm, 4
+            for weaker joints, and proportionally less below 12 Nm.
+        largest: (n,) or one number, Nm, largest command of a ramp; default 20 % of tau_max.
         progress: called after every ramp with (ramps done, total); it must return within the 1 kHz cycle.
         timing: receives the durations of the cycles.
 
@@ -135,7 +135,7 @@ class _Drive:
 
     Attributes:
         rows: t, q, dq and command of every cycle since the list was last emptied.
-        base: (n,) Nm, command under which the arm rests. held: (n,) Nm, mean command at the end of the last braking.
+        base: (n,) Nm, command under which the arm rests. held: (n,) Nm, mean command in the last braking cycles.
     """
 
     def __init__(self, loop: CommandLoop, timing: Timing):
@@ -171,7 +171,7 @@ class _Drive:
             self.stop(next_joint=0)
 
     def send(self, tau: np.ndarray) -> ArmState:
-        """Run one cycle with target torque tau (n,) Nm, append it to `rows` and return the state after it."""
+        """Run one cycle with the target torque tau (n,) Nm, append a row to `rows`, and return the next state."""
         s = self.state
         after = self._loop(tau, self.base)
         self._timing.cycle(self._loop.clock, after)
@@ -179,7 +179,7 @@ class _Drive:
         return after
 
     def push(self, joint: int, rate: float, largest: float) -> list:
-        """Ramp one joint at `rate` Nm/s (signed); return the rows of the rest before the ramp and of the ramp."""
+        """Ramp one joint at `rate` Nm/s (signed); return the rows, which include the rest before the ramp."""
         tau, start, left = self.base.copy(), self.rows[0][1], AFTER_MOTION
         while left and abs(tau[joint]) < largest:
             distance = np.abs(self.send(tau).q - start)
@@ -189,7 +189,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints, then release their torque; repeat if a joint slides on. next_joint: to be below STILL."""
+        """Brake all joints (`next_joint` below STILL), then release their torque; repeat if a joint still moves."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -202,14 +202,14 @@ class _Drive:
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:
-        """Clear `rows`, send the command `base` for RELEASE_CYCLES, and return whether each joint rests, (n,)."""
+        """Clear `rows`, send the command `base` for RELEASE_CYCLES, and return (n,) bool: which joints rest."""
         self.rows = []
         for _ in range(RELEASE_CYCLES):
             self.send(self.base)
         return self._speed(RELEASE_CYCLES // 2) < SLIDING
 
     def _speed(self, cycles: int) -> np.ndarray:
-        """Return speeds (n,) rad/s from the mean angles of the last `cycles` rows and of the `cycles` rows before."""
+        """Return joint speeds (n,) rad/s, computed from the mean angles of the last two groups of `cycles` rows."""
         q = np.array([row[1] for row in self.rows[-2 * cycles :]]).reshape(2, cycles, -1).mean(1)
         return np.abs(q[1] - q[0]) / (cycles * SIM_DT)
 

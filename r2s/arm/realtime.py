@@ -86,8 +86,8 @@ class Timing:
 
     Attributes:
         policy: time from a state to the policy's command, once per control step. driver: time of one driver cycle.
-        adapter: time of one update of the adapter, if there is one. period: time from one command to the next.
-        robot: time from one state to the next by the arm's clock; above 1 ms if cycles were lost.
+        adapter: time of one update of the adapter; empty without an adapter. period: time between two commands.
+        robot: time between two states by the arm's clock; above 1 ms if cycles were lost.
         success: control_command_success_rate of each cycle, without the first 100 cycles of a motion.
     """
 
@@ -103,7 +103,7 @@ class Timing:
         self._begun, self._last = len(self.success), (0.0, 0.0)
 
     def cycle(self, clock: tuple[float, float, float], state: ArmState, adapts: bool = False) -> None:
-        """Add the durations of one cycle, from `CommandLoop.clock` and the state after the cycle."""
+        """Add the durations of one cycle, given `CommandLoop.clock` and the state after this cycle."""
         began, driven, adapted = clock
         (sent_at, t), self._last = self._last, (driven, state.t)
         if not t:  # the first command starts the motion, which takes longer than a cycle
@@ -128,12 +128,12 @@ class Timing:
         return f"the arm got {100 * rate:.1f} % of its commands in time, at least {least} are needed"
 
     def check(self, arm: Arm) -> None:
-        """Raise ArmStopped if `refusal` returns a reason."""
+        """Raise ArmStopped if too few commands of a real-time motion came in time, see `refusal`."""
         if (reason := self.refusal(arm)) is not None:
             raise ArmStopped(reason)
 
     def table(self) -> list[dict[str, float | str]]:
-        """Return one row per duration: count, quantiles and maximum, ms; for `robot` also lost cycles and success."""
+        """Return a row per kind of duration: count, quantiles, maximum, ms; for `robot` also lost cycles, success."""
         rows: list[dict[str, float | str]] = []
         for name in ("policy", "driver", "adapter", "period", "robot"):
             values = getattr(self, name)

@@ -1,8 +1,8 @@
 """Run a policy on an arm whose clock does not wait: a separate process runs the 1 kHz cycle.
 
-The arm's process continues whatever happens to the policy's process: if no new command arrives within the driver's
-deadline, it damps and stops the arm. A thread instead of a process would not suffice: a policy that holds Python's
-global lock blocks every thread. The processes share memory without a lock: a killed process would not release it.
+The arm's process continues whatever happens to the policy's process. If no new command arrives within the driver's
+deadline, the driver damps and stops the arm. A thread would not suffice, because a policy that holds Python's global
+lock blocks all threads. The processes share memory without a lock, which a killed process would never release.
 
 The arm's process runs in its own session, so signals from the terminal do not reach it. Every motion, including the
 approach, is damped and ended if the policy's process receives a signal or ends, or if the arm's process receives a
@@ -54,7 +54,7 @@ class Slot:
         a[0] += 1
 
     def read(self) -> tuple[int, np.ndarray] | None:
-        """Return the number of writes and the values (width,), or None if a write is running or was interrupted."""
+        """Return the number of writes and the values (width,); None: a write is in progress or was interrupted."""
         a = np.frombuffer(self._raw)
         for _ in range(READ_ATTEMPTS):
             before = a[0]
@@ -68,9 +68,9 @@ class Channel(NamedTuple):
     """Memory that the policy's process and the arm's process share.
 
     Attributes:
-        command: (c,), written by the policy's process. state: written by the arm's process, see `_publish`.
-        end: above 0 if the policy's process has ended the episode.
-        signal: number of a signal that the policy's process received. lifeline: mutex that this process locks.
+        command: (c,), written by the policy's process. state: arm state, written by the arm's process (`_publish`).
+        end: 1 after the policy's process has ended the episode, else 0.
+        signal: number of a signal that the policy's process received. lifeline: mutex locked by the policy's process.
     """
 
     command: Slot
@@ -101,9 +101,9 @@ class RealtimeRunner:
         robot: the arm's model. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
-        open_arm: function, called in the arm's process, that returns the arm or its context manager; picklable.
+        open_arm: picklable function that opens the arm in its process; returns the arm or a context manager for it.
         robot: a model with the arm's number of joints. task, friction: see `PolicyRunner`.
-        settings: further arguments of `PolicyRunner`; its adapter runs in the arm's process.
+        settings: further arguments of `PolicyRunner`; an adapter runs in the arm's process.
 
     Raises:
         UserError, ArmStopped: the arm cannot be opened.
@@ -162,7 +162,7 @@ class RealtimeRunner:
         return self._latest()[0]
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Begin episode `first` at starts (1, n) rad, see `PolicyRunner.place`; this process asks the operator."""
+        """Begin episode `first` at starts (1, n) rad, see `PolicyRunner.place`; ask the operator in this process."""
         self._channel.end.write(np.zeros(1))
         self._line.send(("place", starts, first))
         self.done, self.halted = self._receive("placed")
@@ -174,7 +174,7 @@ class RealtimeRunner:
     def step(self, command: np.ndarray) -> State:
         """Pass the command (1, c) to the arm's process, and return the state when the next control period begins.
 
-        A command that arrives after its period takes effect at once; the state is then that of the next period.
+        A late command takes effect at once; control periods always begin at multiples of their length.
         """
         self.timing.policy.append(time.perf_counter() - self._observed_at)
         self._channel.command.write(command[0])
@@ -204,7 +204,7 @@ class RealtimeRunner:
             serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, low-passed target (n,) Nm, whether stopped, and number of safety-filtered cycles."""
+        """Return cycle, state, effort (n,) Nm, whether the arm stopped, and the number of safety-filtered cycles."""
         while (latest := self._channel.state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")
@@ -222,7 +222,7 @@ class RealtimeRunner:
         return state
 
     def _receive(self, kind: str, timeout_s: float | None = None) -> Any:
-        """Return the content of the next message of this kind from the arm's process; meanwhile, ask the operator."""
+        """Return the next message of this kind from the arm's process; meanwhile, ask the operator if required."""
         try:
             while True:
                 if timeout_s is not None and not self._line.poll(timeout_s):
@@ -246,7 +246,7 @@ def _serve(
     settings: dict[str, Any],
     channel: Channel,
 ) -> None:
-    """Open the arm, run the requested episodes, and end when the process `parent` closes the line."""
+    """Open the arm, run the requested episodes, and end when the policy's process closes the connection `line`."""
     os.setsid()  # so that signals of the terminal reach only the other process
 
     def forward(reason: str) -> bool:
@@ -297,10 +297,10 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
-    """Yield a new command, or None, for each cycle from the first new command until the episode ends.
+    """Wait for the first command of the episode, then yield a new command, or None, for each cycle until the end.
 
     Args:
-        last: number of commands written in earlier episodes.
+        last: number of commands that the policy wrote in earlier episodes.
     """
     while not channel.ended:
         latest = channel.command.read()

@@ -40,21 +40,21 @@ def record(
 ) -> Recording:
     """Follow the excitation at 1 kHz and return the recorded motion.
 
-    Row k contains the arm's state in cycle k, with the time t of the arm's clock. With torque='commanded', tau[k] is
-    the command of cycle k, which the arm reports as tau_J_d in cycle k + 1. So a replay of tau[k : k + m] from state
-    k predicts q[k + 1 : k + m + 1]. With torque='measured', tau[k] is tau_J of cycle k, as in robot logs.
+    Row k contains the arm's state in cycle k and the time t by the arm's clock. With torque='commanded', tau[k] is
+    the command of cycle k, which the arm reports as tau_J_d in cycle k + 1. So simulating the torques tau[k : k + m]
+    from state k predicts q[k + 1 : k + m + 1]. With torque='measured', tau[k] is tau_J of cycle k, as in robot logs.
 
     Args:
-        arm: the arm, which moves to the excitation's first posture; after the recording it always stops.
+        arm: the arm, which moves to the first posture of the excitation, and always stops after the recording.
         excitation: motion with a time step of 1 ms, checked for limits and clearance before the arm moves.
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, includes gravity).
-        progress: called every 0.5 s with (cycles done, total cycles); it must return at once, as the arm is moving.
+        progress: called every 0.5 s with (cycles done, total cycles); must return at once, because the arm is moving.
         loaded: whether the arm may carry an undeclared payload; if so, `LoadedTrackingController` tracks the motion.
-        timing: stores the duration of each cycle.
+        timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver stopped the motion, or the arm deviated from the plan by more than its
-            `DeviationLimits`. On a real-time arm also if more than 1 % of the commands did not arrive in time. The
+        ArmStopped: the arm or the driver stopped the motion, the arm deviated from the excitation by more than the
+            `DeviationLimits`, or more than 1 % of the commands did not reach a real-time arm in time. The
             exception's `recording` contains the rows recorded before the stop, if there are at least MIN_ROWS.
         UserError: the excitation does not fit the arm, exceeds its limits or leaves too little clearance.
 
@@ -106,7 +106,7 @@ class _Rows:
         self.filled = 0
 
     def add(self, state: ArmState, sent: np.ndarray) -> None:
-        """Append a row with the state of a cycle and the command `sent`, (n,) Nm, of this cycle."""
+        """Append a row with the state in a cycle and the command sent in this cycle, (n,) Nm."""
         k = self.filled
         self._t[k], self._q[k], self._dq[k], self._signals[k] = state.t, state.q, state.dq, state.signals
         self._tau[k] = sent if self._torque == "commanded" else state.tau_J

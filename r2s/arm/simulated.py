@@ -15,10 +15,10 @@ class SimulatedArm:
 
     Attributes:
         external: (n,) Nm, external joint torque that acts from the next cycle on; zero by default.
-        declared_payload: see the arguments.
+        declared_payload: payload in the arm's gravity compensation.
 
     Args:
-        robot, dynamics: the arm and its true dynamics.
+        robot: the arm. dynamics: its true dynamics.
         position_noise, velocity_noise: standard deviations of white noise on q, rad, and dq, rad/s.
         seed: random seed of the noise.
         payload: carried body and its attachment times. declared_payload: payload in the arm's gravity compensation.
@@ -79,7 +79,7 @@ class SimulatedArm:
         self._sense()
 
     def _update_payload(self) -> None:
-        """Attach or detach the payload at the time that its `on_s` and `off_s` set."""
+        """Attach the payload at the time `on_s`, and detach the payload at the time `off_s`."""
         now = self._payload is not None and bool(self._payload.attached(self._cycle * SIM_DT))
         if now != self._carries:
             self._sim.set_dynamics(self._dynamics[now])

@@ -22,7 +22,7 @@ GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s eac
 
 
 class _Request:
-    """The stop request of this process. `ending`: a motion is stopping on request; `served`: the motion has ended."""
+    """The stop request of this process, with `ending` while a motion stops, `served` once this motion has ended."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -34,7 +34,7 @@ _request = _Request()
 
 
 def requested() -> str | None:
-    """Return the first reason for a stop request in this process, or None without a request."""
+    """Return the reason of the stop request in this process (the first reason if several), or None: no request."""
     if _request.reason is None:
         for source in _request.sources:
             if (reason := source()) is not None:
@@ -49,7 +49,7 @@ def begin_ending() -> None:
 
 
 def serve() -> None:
-    """Record that the stop request has ended the motion, so that the next signal raises KeyboardInterrupt at once."""
+    """Record that the motion has ended on request; from now on, a signal raises KeyboardInterrupt at once."""
     _request.ending, _request.served = False, True
 
 
@@ -69,12 +69,12 @@ def parent_ended(parent: int) -> Callable[[], str | None]:
 
 
 def pipeline() -> int | None:
-    """Return the pid in the variable PARENT, or None; in a grandchild this pid differs from the parent's pid."""
+    """Return the pid in the environment variable PARENT, or None; it may be the pid of a grandparent process."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 
 def _follow(parent: int, over: threading.Event) -> None:
-    """Send SIGTERM to this process if its parent ends before `over` is set."""
+    """Send SIGTERM to this process if the process `parent` ends before the event `over` is set."""
     while not over.wait(FOLLOW_S):
         if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -97,15 +97,15 @@ def handled_signals(
     """Convert each signal of SIGNALS to a stop request while an arm is open in this process.
 
     If no motion is stopping GRACE_S after the request, the main thread gets a KeyboardInterrupt, and this context
-    raises `Stopped` with the signal's name. The context also raises `Stopped` if its block ends before a motion has
-    stopped, because later code may move the arm. The context has no effect outside the main thread.
+    raises `Stopped` with the signal's name. If its block ends before the request has stopped a motion, the context
+    also raises `Stopped`, because later code may move the arm. The context acts only in the main thread.
 
     Args:
         forward: function that the signal handler calls with each signal's number.
         parent: pid of the parent process, whose end acts like SIGTERM; None: no process is watched.
 
     Raises:
-        Stopped: a signal arrived while no motion ran.
+        Stopped: a signal arrived between motions.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

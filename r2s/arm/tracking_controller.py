@@ -31,13 +31,13 @@ class TrackingController:
 
     Each joint's estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max): offset, Coulomb and viscous friction.
     theta adapts during the motion as in Slotine and Li (IJRR 6(3), 1987), within limits. Light wrist joints need
-    the estimate: their PD gains must be small, so friction can cancel the PD torque and stop the joint. The PD gains
-    are the nominal mass matrix times BANDWIDTH^2 and times 2 BANDWIDTH. They suit any arm, while separate gains per
-    joint would be unstable on an arm with nearly parallel joint axes.
+    the estimate, because the PD torque of their small gains may not overcome friction. The PD gains are the nominal
+    mass matrix times BANDWIDTH^2 and times 2 BANDWIDTH. Such gains suit any arm; separate gains per joint would be
+    unstable on an arm with nearly parallel joint axes.
 
     Args:
         robot: the nominal model. excitation: the motion to track.
-        allowed: limits of the deviation from this motion; None: MAX_DEVIATION for each joint.
+        allowed: limits of the deviation from the excitation; None: MAX_DEVIATION for each joint.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):
@@ -71,7 +71,7 @@ class TrackingController:
         return self._theta[0]
 
     def deviation(self, k: int, state: ArmState) -> str | None:
-        """Return a message if a joint deviates too far from the plan in cycle k, else None."""
+        """Return a message if a joint deviates too far from the excitation in cycle k, else None."""
         deviation = np.abs(self._plan.q[k] - state.q)
         share = self._allowed.share(k, deviation)
         total = share.sum(1)
@@ -87,10 +87,10 @@ class TrackingController:
 
 
 class LoadedTrackingController(TrackingController):
-    """Tracking controller for an arm that may carry an undeclared payload of up to half the arm's largest payload.
+    """Tracking controller for an arm with an undeclared payload of up to half the mass that the arm can carry.
 
-    The PD gains include half of this payload; otherwise the sag of a strong joint would swing the wrist. The limits
-    of deviation and correction are larger than in `TrackingController`.
+    The gains assume half of this payload, as otherwise the sag of a strong joint would swing the wrist. Limits of
+    deviation and correction are larger than in `TrackingController`.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):

@@ -17,13 +17,13 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import Task
 
-CYCLES = 200  # cycles at rest, and again in motion: each ten spans of an estimator
+CYCLES = 200  # cycles at rest and cycles in motion: ten times the span of an estimator
 SWING_RAD, SWING_HZ = 0.05, 1.0  # up to 0.3 rad/s: every joint slides
-RAMP_NM = 0.02  # Nm, largest torque of the ramps, so low that they end at once
+RAMP_NM = 0.02  # Nm, largest torque of the ramps; it is so low that each ramp ends at once
 
 
 class _Puppet:
-    """A mock `Arm` that ignores commands: it rests, then swings all joints by `swing` rad."""
+    """A mock `Arm` that ignores commands; it first rests and then moves each joint sinusoidally by `swing` rad."""
 
     def __init__(self, robot: Robot, swing: float):
         self.robot, self._swing, self._cycle = robot, swing, 0
@@ -55,7 +55,7 @@ def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = No
     and a ramp and, if there is a task, an episode with a copy of the adapter.
 
     Raises:
-        Exception: any exception that the adapter raises.
+        Exception: the adapter raised this exception.
     """
     rest = np.zeros((CYCLES, robot.n))
     still = Excitation(SIM_DT * np.arange(CYCLES), robot.q_home + rest, rest, rest)

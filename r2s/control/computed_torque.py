@@ -2,9 +2,9 @@
 
     tau = action + ID(q_r, dq_r, ddq_r) + M(q_r) (w^2 (q_d - q) + 2 w (dq_d - dq))
 
-ID is the inverse dynamics of the identified arm, with friction and without gravity. q_d is the reference now, and q_r
-is the reference at the later time when the torque acts, so that latency does not delay the feedforward (Spong,
-Hutchinson and Vidyasagar, Robot Modeling and Control, ch. 8).
+ID is the inverse dynamics of the identified arm, with friction and without gravity. q_d is the present reference
+position. q_r is the reference position at the later time when the torque acts, so that latency does not delay the
+feedforward (Spong, Hutchinson and Vidyasagar, Robot Modeling and Control, ch. 8).
 """
 
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import SIM_DT, Robot
 
 LATENCY = 0.007  # s, assumed latency of the feedback: delay, lag and velocity filter (docs/explanation/arms.md)
-# rad: bandwidth times latency of the loop. 0.6 leaves a phase margin of 56 deg; pi / 2 is the stability limit.
+# rad, the loop's bandwidth times its latency: 0.6 yields a phase margin of 56 deg; pi / 2 is the stability limit.
 BANDWIDTH_LATENCY = 0.6
 
 
@@ -38,7 +38,7 @@ class ComputedTorque(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Number of values in a setpoint: feedforward, q_d, dq_d (n each) and M (n n)."""
+        """Number of values in a setpoint: n each for feedforward, q_d and dq_d, and n * n for M."""
         n = self.action_dim
         return n * (3 + n)
 
@@ -53,7 +53,7 @@ class ComputedTorque(Controller):
         return self.model(q[None], still, still, still)[0]
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s): feedforward Nm, q_d rad, dq_d rad/s, and M kg m^2 row by row."""
+        """Return the setpoints (m, s): feedforward Nm, q_d rad, dq_d rad/s, and the flattened mass matrix kg m^2."""
         q_d, dq_d, _ = task.trajectory(t, goals, 0.0)
         q, dq, ddq = task.trajectory(t, goals, self.ahead_s)
         mass = self.model.mass(q).reshape(len(q), -1)
@@ -74,8 +74,8 @@ def computed_torque(
     Args:
         robot, task: the arm and its task. dynamics: the identified arm.
         residual: share of the task's torque limit that an action of 1 adds.
-        bandwidth: w, rad/s, of the critically damped feedback, whose loop bandwidth is 2 w. None: BANDWIDTH_LATENCY
-            over twice the latency, which is the sum of control period, low-pass time constant and LATENCY.
+        bandwidth: w, rad/s, natural frequency of the critically damped feedback; the loop's bandwidth is 2 w. None:
+            BANDWIDTH_LATENCY / (2 latency), with latency = control period + low-pass time constant + LATENCY.
         feedback_hz: Hz, update rate of the feedback, at most 1000; None: the policy's rate.
 
     Raises:

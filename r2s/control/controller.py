@@ -23,7 +23,7 @@ class ControlledTask(Protocol):
     def cutoff_hz(self) -> float: ...  # noqa: D102
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return the largest target torque (n,) Nm."""
+        """Return the task's limit (n,) Nm of each joint's target torque."""
         ...
 
 
@@ -32,7 +32,7 @@ class Controller:
     """An action space and a control law for all arms of one robot; `control=` selects the kind of controller.
 
     A policy's action lies in [-1, 1]. The controller scales the action to SI units: action_offset + action_scale *
-    action. A command consists of this scaled action and of the setpoint that the controller derives from the task.
+    action. A command consists of the scaled action and of the setpoint, which the controller computes from the task.
 
     Attributes:
         name: the controller's name.
@@ -40,7 +40,7 @@ class Controller:
         action_scale, action_offset: (a,) in `unit`. action: name of the quantity that an action sets.
         parameters: (p,), the law's parameters. memory_size: number of values that the law stores between cycles.
         torque_limit: (n,) Nm, the largest target torque; None: the task's limit.
-        cpp: C++17 body of the law for contract.hpp; "": a bundle with this controller has no contract.hpp.
+        cpp: C++17 body of the law for contract.hpp; "": bundles with this controller lack contract.hpp.
     """
 
     name: str
@@ -75,13 +75,13 @@ class Controller:
         return False
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s) of m episodes with these goals at the times t (m,) s."""
+        """Return the setpoints (m, s) of m episodes with the goals `goals`, each at its own time in t (m,) s."""
         return np.empty((len(t), 0))
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that holds the law's model at rest at q (n,) rad, for example with a payload.
+        """Return the torque (n,) Nm that holds the law's model, for example with a payload, at rest at q (n,) rad.
 
-        The driver continues to apply this torque while it brings the arm to rest.
+        While the driver brings the arm to rest, the driver continues to apply this holding torque.
         """
         return np.zeros(len(q))
 
@@ -99,5 +99,5 @@ class Controller:
         return np.concatenate([scaled, self.setpoint(task, t, goals)], axis=1)
 
     def torque(self, q: np.ndarray, dq: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n) Nm that a new command (m, c) causes at q, dq (m, n) rad, rad/s."""
+        """Return the torque (m, n) Nm in the first cycle of a command (m, c) at q, dq (m, n) rad, rad/s."""
         return run_law(self.law, q, dq, command, self.parameters, self.memory_size)

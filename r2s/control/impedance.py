@@ -1,8 +1,8 @@
 """`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs to a target; actions set target or stiffness.
 
-The control laws are in r2s/physics/impedance_laws.py; this module computes their parameters from arm, task and model.
-The defaults scale with the arm: a force is the torque limit over the lever arm at home, a stiffness is a force over a
-distance, and the latency of the loop limits the natural frequency of each spring.
+r2s/physics/impedance_laws.py contains the control laws; this module computes their parameters from arm, task and
+model. Default values scale with the arm: a spring's force is a share of the torque limit divided by the lever arm at
+home, and a spring's stiffness is this force divided by a distance. The loop's latency limits a spring's stiffness.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from r2s.physics.newton_euler import COM, LINK, MASS, links_of
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 
 ACTIONS = ("target", "stiffness", "both")
-# share of the force that the torque limit allows in every direction at home; the rest is for damping and feedforward
+# the springs' share of the force that the torque limit allows at home; damping and feedforward use the rest
 CLIP = 0.7
 CLIP_M = 0.05  # m, error at which the default spring saturates
 
@@ -35,8 +35,8 @@ class Impedance(Controller):
     """Impedance control of joints or end effector; for the other attributes see `Controller`.
 
     Attributes:
-        model: the identified arm. target_size: number of values in the task's target. hybrid: whether hybrid control.
-        contact: (4,), surface normal and contact force, N, for hybrid control; None: the task's contact.
+        model: the identified arm. target_size: number of values in a target. hybrid: whether hybrid control is used.
+        contact: (4,), surface normal and contact force, N, for hybrid control; None: use the task's contact.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -46,12 +46,12 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Size of a setpoint: target; hybrid: normal (3), force, measured force and its flag; sliding: pull (3)."""
+        """Number of values in a setpoint: the target, 6 values of the contact if `hybrid`, and 3 if `slides`."""
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
     def slides(self) -> bool:
-        """Whether the target slides on a surface; if so, the setpoint contains the feedforward force `task.pull`."""
+        """Whether the task moves its target along a surface; the setpoint then ends with the force `task.pull`."""
         return bool(self.hybrid and self.parameters[law.APPROACH] == law.SLIDES)
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ class Impedance(Controller):
         return self.model(q[None], still, still, still)[0]
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s): the task's target; for hybrid control also contact, with measured force 0."""
+        """Return the setpoints (m, s): the task's target; hybrid control appends the contact, measured force 0."""
         if not self.target_size:
             return np.empty((len(t), 0))
         if self.law is joint_impedance_law:
@@ -73,7 +73,7 @@ class Impedance(Controller):
         return np.concatenate([target, contact, np.zeros((len(t), 2)), *pull], axis=1)
 
     def with_force(self, command: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Return hybrid commands (m, c) that contain the measured force (m,) N against the normal."""
+        """Return hybrid-control commands (m, c) with the measured force (m,) N, positive against the normal."""
         out, at = command.copy(), self.command_size - 3 * self.slides - 2
         out[:, at], out[:, at + 1] = force, 1.0
         return out
@@ -97,9 +97,10 @@ def joint_impedance(
     Args:
         robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
         action: quantity that an action sets: target, stiffness or both.
-        torque_fraction: largest torque over tau_max. displacement: rad, by which an action of 1 shifts the target.
-        stiffness: Nm/rad, largest one; None: CLIP * torque limit / displacement, at most that of `fastest_spring`.
-        softest: smallest over largest stiffness that an action sets. damping: damping ratio of all modes.
+        torque_fraction: torque limit as a share of tau_max. displacement: rad, shift of the target by an action of 1.
+        stiffness: Nm/rad, largest stiffness of each joint; None: CLIP * torque limit / displacement, or less if the
+            spring's natural frequency would exceed `fastest_spring`. damping: damping ratio of all modes.
+        softest: ratio of the smallest to the largest stiffness that an action sets.
         tank: J, initial level and capacity of the energy tank.
 
     Raises:
@@ -165,17 +166,16 @@ def cartesian_impedance(
     Args:
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
         displacement, rotation: m and rad, shift and rotation of the target by an action of 1.
-        stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, at most that of `fastest_spring`.
+        stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less so as not to exceed `fastest_spring`.
         rotational_stiffness: Nm/rad, largest rotational stiffness; 0: the orientation is free.
-        force_clip: N, largest spring force at the largest stiffness. It must not exceed the force that the torque
-            limit allows in every direction at home. None: CLIP times this force. moment_clip: Nm, same for moments.
-        null_stiffness: 1/rad, null-space stiffness towards home, divided by each joint's torque limit.
-        hybrid: whether a force acts along the normal of a surface, and the impedance only across the normal. An
-            action that displaces the target against the normal adds the force stiffness * displacement. If the task
-            `approaches` a surface, its target moves into the surface, and the spring to the target bounds the force,
-            so that the tip approaches no faster than the target.
-        normal: (3,), surface normal in the base frame. force: N, against the normal. None: the task's contact.
-        integral_rate: 1/s, integral gain of the force error. integral_max: bound of the integral over force_clip.
+        force_clip: N, largest spring force at the largest stiffness, at most the force F that the torque limit allows
+            in every direction at home; None: CLIP * F. moment_clip: Nm, largest spring moment, limited likewise.
+        null_stiffness: 1/rad, each joint's null-space stiffness towards home as a multiple of its torque limit.
+        hybrid: whether a force acts along a surface normal, and the impedance only across this normal. An action
+            that displaces the target against the normal adds a force stiffness * displacement. If `task.approaches`,
+            the target moves into the surface; the spring limits the force, so the tip is no faster than the target.
+        normal: (3,), surface normal in the base frame. force: N, force against the normal. None: the task's contact.
+        integral_rate: 1/s, integral gain of the force error. integral_max: integral's limit, a share of force_clip.
 
     Raises:
         UserError: the task has no target or contact, or a setting is out of its range.
@@ -232,7 +232,7 @@ def cartesian_impedance(
 
 
 def _check(action: str, softest: float, displacement: float) -> None:
-    """Raise UserError if a setting of joint and Cartesian impedance is out of range."""
+    """Raise UserError if a setting that joint and Cartesian impedance share is out of range."""
     if action not in ACTIONS:
         raise UserError(f"action: '{action}'; {instead_of(action, ACTIONS)}")
     check_number("softest", softest, "(0, 1]")
@@ -248,7 +248,7 @@ def _torque(robot: Robot, fraction: Sequence[float] | float) -> np.ndarray:
 
 
 def _contact(task: Any, normal: Sequence[float] | None, force: float | None, most: float) -> np.ndarray | None:
-    """Return normal and force (4,) of the settings, or None to use the task's contact."""
+    """Return the unit normal and force (4,) from the settings, or None if the controller uses the task's contact."""
     if normal is None and force is None and hasattr(task, "contact"):
         return None
     if normal is None or force is None:
@@ -263,7 +263,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Check and return a force or moment limit; None: CLIP times the largest that `limit` (n,) Nm allows at home."""
+    """Return `value`, checked, or by default CLIP times the largest force or moment that `limit` allows at home."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most
@@ -274,7 +274,7 @@ def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian
 
 
 def fastest_spring(task: ControlledTask) -> float:
-    """Return the highest natural frequency w, rad/s, of a spring, whose loop bandwidth is 2 w at critical damping."""
+    """Return a spring's highest natural frequency w, rad/s; a critically damped spring has the loop bandwidth 2 w."""
     return 0.5 * BANDWIDTH_LATENCY / (1 / (2 * np.pi * task.cutoff_hz) + LATENCY)
 
 
@@ -290,7 +290,7 @@ def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _action(
     action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return scale and offset of an action, and store in `parameters` where a command contains the action."""
+    """Return an action's scale and offset, and write the action's position in a command to `parameters`."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
     parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]
@@ -302,7 +302,7 @@ def _action(
 def _parameters(
     robot: Robot, task: ControlledTask, dynamics: Dynamics, damping: float, tank: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the law's parameters (p,), before springs and action are set, and a view (n, ROW) of the joint rows."""
+    """Return the law's parameters (p,), except springs and action, and a view (n, ROW) of the joints' parameters."""
     check_number("damping", damping, "(0, 10]")
     if np.shape(tank) != (2,) or not 0 <= tank[0] <= tank[1] < np.inf:
         raise UserError(f"tank: expected first level and size in J, 0 <= level <= size, got {tank}")

@@ -1,4 +1,4 @@
-"""The impedance laws (r2s/physics/impedance*.py) in C++17, for contract.hpp; a test compares both versions."""
+"""The impedance laws (r2s/physics/impedance*.py) in C++17, for contract.hpp; a test compares C++ with Python."""
 
 from r2s.physics import impedance, newton_euler
 

@@ -11,6 +11,6 @@ CPP = "for (int j = 0; j < n; ++j) out[j] = command[j];"
 
 
 def torque(robot: Robot, task: ControlledTask, dynamics: Dynamics | None = None) -> Controller:
-    """Return the controller that maps an action of 1 to the task's torque limit."""
+    """Return the torque controller; an action of 1 commands the task's torque limit."""
     limit = task.torque_limit(robot)
     return Controller("torque", torque_law, limit, np.zeros(robot.n), cpp=CPP, torque_limit=limit)

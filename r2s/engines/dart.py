@@ -28,7 +28,7 @@ class DartEngine:
         armature: (n,) kg m^2, armature of the joints; None: the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
-    The engine, like MuJoCo, has no velocity limits, because they would hide that a policy violates them.
+    This engine has no velocity limits, as MuJoCo has none, because such limits would hide a policy's violations.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class DartEngine:
         return joint, link
 
     def relink(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
-        """Replace the last link's mass, kg, center (3,) m and tensor (3, 3) kg m^2 about the center in a motion."""
+        """Set the last link's mass kg, center (3,) m and tensor (3, 3) kg m^2 about the center, during a motion."""
         at = self._last
         self._links.mass[at], self._links.com[at], self._links.inertia[at] = mass, com, inertia
         self._tip.setInertia(_dartpy().dynamics.Inertia(*self._links.lumped(at)))
@@ -125,7 +125,7 @@ class DartEngine:
         Args:
             tau: (n,) Nm, the command; clipped to the torque limits.
             passive: (n,) Nm, additional joint torque that is not clipped, such as friction and offsets.
-            damping: (n,) Nm s/rad, joint damping that DART integrates implicitly in this step.
+            damping: (n,) Nm s/rad, joint damping that DART adds in this step and integrates implicitly.
         """
         drive = np.minimum(np.maximum(tau, self._low), self._high)
         if passive is not None:
@@ -145,11 +145,11 @@ class DartEngine:
         return pose.rotation() @ self._ee + pose.translation()
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """Return the mass matrix (n, n) kg m^2 with armature at q (n,); the arm's state does not change."""
+        """Return the mass matrix (n, n) kg m^2 with armature at q (n,) rad; the arm's state does not change."""
         return self._at(q, self._skeleton.getMassMatrix) + np.diag(self._armature)
 
     def gravity_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that holds the arm against gravity at q (n,); the state does not change."""
+        """Return the torque (n,) Nm that holds the arm against gravity at q (n,) rad; the state does not change."""
         return self._at(q, self._skeleton.getGravityForces)
 
     def gravity_torque_there(self, q: np.ndarray) -> np.ndarray:
@@ -185,7 +185,7 @@ def _dartpy() -> ModuleType:
 
 def _as_gazebo(dart: ModuleType, world) -> None:
     """Change the settings in which dartpy 6.20 differs from Gazebo's plugin."""
-    # a process-wide setting; by default DART pushes a joint beyond its limit back at up to 10 rad/s
+    # this setting affects the whole process; by default DART pushes a joint beyond its limit back at up to 10 rad/s
     dart.constraint.JointConstraint.setMaxErrorReductionVelocity(0.0)
     options = dart.simulation.DeactivationOptions()
     options.mEnabled = False

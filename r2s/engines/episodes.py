@@ -21,7 +21,7 @@ NONE = np.zeros(1, dtype=bool)  # no arm has stopped
 class EngineArms:
     """The arms of `count` successive episodes, with the interface `Arms` of `r2s.tasks.rollout.rollout`.
 
-    Arm e has the e-th random draw, as in `r2s.learning.evaluate.make_evaluation`, and its own stream of sensor noise.
+    Episode e uses the e-th random draw of `r2s.learning.evaluate.make_evaluation` and the seed e for sensor noise.
 
     Args:
         make: function that returns the engine of an arm with given dynamics.
@@ -62,7 +62,7 @@ class EngineArms:
         return self._read()
 
     def step(self, command: np.ndarray) -> State:
-        """Run one control period with the controller's command (1, c)."""
+        """Simulate one control period under the controller's command (1, c)."""
         self._limited = self._guard.changed
         control, target = self._control, np.empty(self.robot.n)
         for _ in range(self._substeps):
@@ -76,7 +76,7 @@ class EngineArms:
         return self._read()
 
     def end(self) -> np.ndarray:
-        """Return (1,) False, because an arm in an engine has no reflexes that could stop it."""
+        """Return an array (1,) with the value False, because an engine simulates no reflexes that stop the arm."""
         return NONE
 
     def _read(self) -> State:

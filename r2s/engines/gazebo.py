@@ -27,8 +27,8 @@ PHYSICS = {"filename": "gz-sim-physics-system", "name": "gz::sim::systems::Physi
 class GazeboEngine:
     """An arm in a Gazebo server.
 
-    Each command acts for one step of 1 ms. The bindings can set a joint state only within an update, and the same
-    update integrates this state. So `reset` only stores q and dq, and the next `step` starts exactly from them.
+    Each command acts for one step of 1 ms. The bindings can set a joint state only within an update, and this update
+    also integrates the state. So `reset` only stores q and dq, and the next `step` starts exactly from q and dq.
 
     Args:
         robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.
@@ -64,7 +64,7 @@ class GazeboEngine:
             raise UserError("simulator=gazebo: the server did not load the arm; see its messages above")
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Start the next step at q, dq (n,) rad, rad/s."""
+        """Store the positions q (n,) rad and velocities dq (n,) rad/s from which the next step starts."""
         self._start = np.array(q, dtype=float), np.array(dq, dtype=float)
         self._q, self._dq = self._start
 
@@ -80,7 +80,7 @@ class GazeboEngine:
             raise self._error
 
     def _guarded(self, update):
-        """Return a callback that stores an exception of `update` for `_run`, as the bindings would lose it."""
+        """Return a callback that runs `update` and stores exceptions, which the bindings ignore, for `_run`."""
 
         def call(info, ecm):
             try:

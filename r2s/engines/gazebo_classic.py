@@ -31,7 +31,7 @@ from r2s.physics.simulator import single_arm
 PHYSICS = ("ode", "dart")
 PLUGIN = Path(__file__).with_name("libr2s_gazebo_classic.so")
 ROOT = "R2S_GAZEBO_ROOT"  # environment variable: a root directory with Gazebo
-FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # library folders, relative to that of the processor in Debian
+FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # library folders, relative to Debian's folder of the processor
 NAME = "simulator=gazebo_classic"
 HELP = "docs/how_to/gazebo.md installs it; simulator=dart needs nothing more"
 START_S = 60.0  # s, longest wait for the server; a start takes 0.5 s
@@ -39,10 +39,10 @@ SDF = "1.7"  # newest SDF version that Gazebo 11 reads
 
 
 class GazeboClassicEngine:
-    """An arm in a `gzserver` process, which ends with this object.
+    """An arm in a `gzserver` process, which ends when this object is deleted.
 
-    Each command acts for one step. ODE solves the joint constraints iteratively, so its motion differs from MuJoCo's
-    by 1e-4 m after 1 s. DART's motion does not differ from MuJoCo's.
+    Each command acts for one step. ODE solves the joint constraints iteratively, so the motion with ODE differs from
+    MuJoCo's by 1e-4 m after 1 s. The motion with DART does not differ from MuJoCo's.
 
     Args:
         robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.
@@ -95,7 +95,7 @@ class GazeboClassicEngine:
         self._start = False  # whether the next step begins at the state of `reset`
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Start the next step at q, dq (n,) rad, rad/s."""
+        """Store the positions q (n,) rad and velocities dq (n,) rad/s from which the next step starts."""
         self._q, self._dq, self._start = np.array(q, dtype=float), np.array(dq, dtype=float), True
 
     def step(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -128,7 +128,7 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
     """Return the function that creates a Gazebo Classic engine from the dynamics of an arm.
 
     Raises:
-        UserError: an unknown physics engine, or Gazebo or the plugin is missing.
+        UserError: `physics` is not in PHYSICS, Gazebo is missing, or the plugin is missing.
     """
     if physics not in PHYSICS:
         raise UserError(f"simulator.physics: expected {choices(PHYSICS)}, got '{physics}'{nearest(physics, PHYSICS)}")
@@ -137,12 +137,12 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 
 
 def gzserver() -> list[str]:
-    """Return the command that starts the server.
+    """Return the command that starts `gzserver`.
 
-    The dynamic loader of a root directory starts the server there; unlike chroot, the loader needs no root rights.
+    The dynamic loader in R2S_GAZEBO_ROOT starts `gzserver` there, because chroot would need root rights.
 
     Raises:
-        UserError: the server or the plugin is missing.
+        UserError: `gzserver` or the plugin is missing.
     """
     root, server = os.environ.get(ROOT), shutil.which("gzserver")
     if root:
@@ -162,7 +162,7 @@ def gzserver() -> list[str]:
 
 
 def version() -> str:
-    """Return the server's version, such as "11.1.0"."""
+    """Return the version of `gzserver`, such as "11.1.0"."""
     done = subprocess.run([*gzserver(), "--version"], capture_output=True, text=True)
     words = re.findall(r"version (\S+)", done.stdout)
     if not words:
@@ -171,7 +171,7 @@ def version() -> str:
 
 
 def _environment(folder: str) -> dict[str, str]:
-    """Return the server's environment variables: settings in `folder`, a free port, no model database."""
+    """Return environment variables for `gzserver`: settings in `folder`, a free port, no model database."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         master = f"http://127.0.0.1:{free.getsockname()[1]}"

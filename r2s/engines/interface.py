@@ -17,7 +17,7 @@ from r2s.physics.simulator import single_arm
 
 
 class Engine(Protocol):
-    """An arm without gravity, because a real arm, such as a Franka, compensates gravity itself."""
+    """Interface of an engine that simulates one arm without gravity, as real arms compensate gravity themselves."""
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Set the joint positions q (n,) rad and velocities dq (n,) rad/s."""
@@ -31,15 +31,15 @@ class Engine(Protocol):
 class FrictionTorque:
     """Joint torque of friction and contact (r2s/physics/friction.py, contact.py), for engines with torque input.
 
-    MuJoCo integrates friction implicitly: with the friction torque P and its slope D at the present velocity, MuJoCo
-    solves (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias computes the same acceleration a
-    with F = P - h D a. Without the term h D a, wrist joints chatter at a time step of 1 ms.
+    MuJoCo integrates friction implicitly: with the friction torque P, its slope D at the present velocity and the
+    time step h, MuJoCo solves (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias computes the
+    same acceleration a if F = P - h D a. Without the term h D a, wrist joints chatter at h = 1 ms.
 
     Args:
         robot, dynamics: the arm and its dynamics.
 
     Attributes:
-        contact: (COLUMNS,), contact state with the last step's force, see contact.py; None without a surface.
+        contact: (COLUMNS,), contact state with the last step's force, see contact.py; None if there is no surface.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics):
@@ -54,7 +54,7 @@ class FrictionTorque:
             self.contact[:] = contact_columns(robot, dynamics.surface)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return the torque F (n,) Nm to add to tau (n,) Nm in the step that begins at q, dq (n,) rad, rad/s."""
+        """Return the torque F (n,) Nm that friction and contact add to tau (n,) Nm at q, dq (n,) rad, rad/s."""
         m, d = self._model, self._data
         d.qpos[:], d.qvel[:], d.qfrc_applied[:] = q, dq, tau
         mujoco.mj_forward(m, d)

@@ -1,7 +1,7 @@
 """Design a motion of up to ten minutes, segment by segment, from which chosen parameters can be identified well.
 
-Each segment is the Fourier series (fourier.py) with the best score, given the earlier segments (sequential design:
-Chernoff, Ann. Math. Stat. 30(3), 1959). Between two segments the arm follows a checked path with minimum jerk.
+A segment is the Fourier series (fourier.py) that best adds to the earlier segments (sequential design: Chernoff, Ann.
+Math. Stat. 30(3), 1959). Between two segments the arm follows a checked path with minimum jerk.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ SEGMENT_S = 60.0  # s, longest segment: two minutes of a series need 1 GB
 LONGEST_S = 600.0
 PEAKS = 1.875, 5.7735  # peak velocity and acceleration of a minimum-jerk motion of 1 rad in 1 s
 SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor on the duration while torque is too high; its most uses
-EVERY = round(1 / (COARSE_HZ * SIM_DT))  # ms between the samples of a motion that a design evaluates
+EVERY = round(1 / (COARSE_HZ * SIM_DT))  # ms between two samples that a design evaluates
 
 
 class Design(Protocol):
@@ -34,7 +34,7 @@ class Design(Protocol):
         ...
 
     def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
-        """Add a motion (T, n) to the motions chosen so far."""
+        """Add a motion t (T,) s and q, dq, ddq (T, n) rad, rad/s, rad/s^2 to the motions chosen so far."""
         ...
 
 
@@ -56,7 +56,7 @@ def designed(
         design: criterion that scores motions.
         seconds: total duration of the segments. center: (n,) rad, center posture, see `fourier.checked_center`.
         seed: random seed. effort: number of motions tried per segment.
-        report: function that is called with the completed share of the work.
+        report: function that receives the completed share of the work.
 
     Raises:
         UserError: an argument is out of range, no random series is safe, or no path between two segments is safe.
@@ -100,7 +100,7 @@ def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Exc
 
 
 def joined(parts: list[Excitation]) -> Excitation:
-    """Return the sequence of several motions, each of which begins at the end of the previous motion."""
+    """Return one motion that joins several motions; each motion begins where the previous motion ends."""
 
     def all_of(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
@@ -110,7 +110,7 @@ def joined(parts: list[Excitation]) -> Excitation:
 
 
 def trajectory_yaml(motion: Excitation, joints: list[str], rate_hz: float) -> str:
-    """Return a motion as trajectory_msgs/msg/JointTrajectory (ROS 2), sampled at `rate_hz`, plus the last sample.
+    """Return a motion as trajectory_msgs/msg/JointTrajectory (ROS 2), with samples at `rate_hz` and the last sample.
 
     ROS 2 controllers interpolate by quintic polynomials between points with position, velocity and acceleration.
     """

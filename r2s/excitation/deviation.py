@@ -10,11 +10,11 @@ from r2s.physics.fence import FENCE_M
 
 @dataclass(frozen=True)
 class DeviationLimits:
-    """Limits of the deviation e (n,) rad from a motion: in cycle k, weights[k // every] @ |e| must be at most 1.
+    """Limits on the deviation e (n,) rad of an arm from its motion: weights[k // every] @ |e| <= 1 in cycle k.
 
     Attributes:
-        weights: (R, K, n) 1/rad: K linear limits in each of R time intervals. every: cycles per interval.
-
+        weights: (R, K, n) 1/rad, coefficients of |e| in K linear limits for each of R time intervals.
+        every: number of cycles per time interval.
     """
 
     weights: np.ndarray
@@ -22,27 +22,27 @@ class DeviationLimits:
 
     @classmethod
     def uniform(cls, n: int, most: float) -> "DeviationLimits":
-        """Return limits that allow each of n joints a deviation of `most` rad in all cycles."""
+        """Return limits that allow a deviation of `most` rad for each of n joints in all cycles."""
         return cls(np.eye(n)[None] / most)
 
     @classmethod
     def along(cls, space: Space, motion: Motion, most: float) -> "DeviationLimits":
-        """Return limits along a motion: in an interval, the smaller limits of `deviation_weights` at its two ends."""
+        """Return limits along a motion; an interval has the stricter `deviation_weights` of its two end postures."""
         rows = geometry_rows(motion)
         weights = deviation_weights(space, motion.q[rows], most)
         return cls(np.maximum(weights[:-1], weights[1:]), int(rows[1] - rows[0]))
 
     def share(self, k: int, deviation: np.ndarray) -> np.ndarray:
-        """Return the share (K, n) of each limit that each joint uses in cycle k; a row's sum must be at most 1."""
+        """Return shares (K, n): how much of each limit each joint uses in cycle k; a row's sum must be at most 1."""
         return self.weights[min(k // self.every, len(self.weights) - 1)] * np.abs(deviation)
 
 
 def deviation_weights(space: Space, q: np.ndarray, most: float) -> np.ndarray:
-    """Return weights (T, K + n, n) 1/rad that limit deviations from q (T, n) rad, so that links avoid obstacles.
+    """Return the weights (T, K + n, n) 1/rad of `DeviationLimits` at postures q (T, n) rad.
 
-    K limits keep each distance above FENCE_M to first order: a joint's deviation reduces a distance in proportion to
-    the joint's lever. n limits keep the deviation of each joint below `most`. All joints may always deviate by
-    DEVIATION, so that an arm that starts too near to an obstacle can move away.
+    The first K limits ensure, to first order, that each distance of a link from the table, an obstacle or another
+    link stays above FENCE_M. The last n limits ensure that each joint deviates by at most `most` rad. All joints may
+    deviate by DEVIATION even near an obstacle, so that an arm that starts too near to the obstacle can move away.
     """
     distances, levers = space.measured(q)
     levers = levers[:, 1:]

@@ -1,9 +1,9 @@
 """Design an excitation: a finite Fourier series that the arm follows at several speeds.
 
 The choice of a series by the determinant of its information matrix (D-optimality) follows Swevers et al., IEEE T-RA
-13(5), 1997. A prior prevents unidentifiable quantities from dominating the determinant. Friction curves and delay
-need several speeds. So the motion consists of rungs, sections of the series at 10 % to 100 % of full speed, with
-rests between rungs. Slow rungs also run backwards, so that every joint reverses at low speed.
+13(5), 1997. A prior prevents unidentifiable quantities from dominating the determinant. Only motion at several speeds
+determines friction curves and delay. So the motion consists of rungs, which are sections of the series at 10 % to
+100 % of full speed; the arm rests between rungs. Slow rungs also run backwards, so that joints reverse at low speed.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 # Speed ladder: paces relative to full speed.
 SLOWEST = 0.1
-REVERSES_BELOW = 0.4  # a rung at a lower pace also runs backwards for a part of its way
+REVERSES_BELOW = 0.4  # pace below which a rung also runs backwards for a part of its length
 RUNG_S = 4.0  # s, approximate duration of a rung with its rest
 SHORT = 0.3, 0.8  # paces if the duration allows one rung only
 LADDER = 6  # maximum number of rungs per ladder
@@ -38,18 +38,18 @@ LONGEST_S = 120.0
 LEAST_S = 5 * BLEND_S
 # Series.
 TOP_HZ = 1.0  # highest harmonic, in the series' own time
-DECAY = 1.5  # amplitude decreases with this power of the harmonic: low harmonics need range, high ones acceleration
+DECAY = 1.5  # harmonic k has an amplitude proportional to k^-DECAY: the acceleration limit bounds high harmonics
 SHORTEST_S = 4.0  # s, minimum fundamental period
 RANGE = 0.8  # share of the distance from the center to the nearer position limit, or of pi rad if that is less
 SPEED = 0.65  # share of dq_max
 ACCELERATION = 0.7  # share of ddq_max
-STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then it catches up at a higher speed
+STUCK_S = 0.12  # s for which a light joint may stick at a reversal; after this time the joint moves faster
 # Search.
 DRAWS = 12  # random series
-KEPT = 3  # number of safe draws; the search starts from the best of them
+KEPT = 3  # number of safe random series; the search starts from the best of these
 TRIES = 5  # candidates per step of the local search
-MIN_AMPLITUDE = 0.3  # share of a joint's largest amplitude; a series that needs less to be safe is dropped
-MARGIN = 0.3  # share of each clearance, and 0.03 of tau_max: reserve for motion between two samples
+MIN_AMPLITUDE = 0.3  # share of a joint's largest amplitude; a series that is safe only below this share is dropped
+MARGIN = 0.3  # least `_safety` (share of a clearance, 0.03 of tau_max), a reserve for motion between two samples
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
 FINE = 10  # number of samples for limits per sample for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
@@ -72,15 +72,15 @@ def fourier(
     """Return an informative motion that passes `motion_checks.check_motion`.
 
     A random series uses up to 80 % of the position range, 65 % of the velocity limit and 70 % of the acceleration
-    limit, and less near obstacles. A local search then increases the `information`. The motion does not repeat,
-    because it is shorter than the period of the series. The same arguments produce the same motion.
+    limit, and less near obstacles. A local search changes the series to increase the motion's `information`. The
+    motion is shorter than the period of the series, so no part repeats. Equal arguments produce equal motions.
 
     Args:
         robot: limits, links and nominal model.
         duration: s, including the rests at both ends.
         seed: random seed.
         gravity: see `information`.
-        effort: number of motions that the local search tries; 0: return the first safe draw.
+        effort: number of motions that the local search tries; 0: return the first safe random series.
         q_center: (n,) rad, center posture; default: the middle of the position range.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
@@ -113,13 +113,13 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions (x, a): series coefficients x (2 H, n), and amplitudes a (n,) as shares of the largest ones.
+    """Candidate motions (x, a): coefficients x (2 H, n) of a series, amplitudes a (n,) as shares of the largest.
 
-    The limits of a joint determine its largest amplitude; x determines only the shape of the motion.
+    A joint's limits determine the joint's largest amplitude; the coefficients x determine only the motion's shape.
 
     Args:
-        robot: limits and links. center: (n,) rad, center posture. duration: s. space: computes link distances.
-        score: function that scores motions, larger scores for better motions; see `Score`.
+        robot: limits and links. center: (n,) rad, center posture. duration: s, duration of a motion.
+        space: computes link distances. score: function that returns higher scores for better motions, see `Score`.
     """
 
     def __init__(self, robot: Robot, center: np.ndarray, duration: float, score: Score, space: Space):
@@ -151,7 +151,7 @@ class Candidates:
         return motion
 
     def draw(self, rng: np.random.Generator, count: int) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """Return (score, x, a) of the best of up to `count` safe random series, or None if no series is safe."""
+        """Return (score, x, a) of the best among up to `count` safe random series; None if no series is safe."""
         shapes = [rng.standard_normal((2 * self.harmonics, self.robot.n)) for _ in range(DRAWS)]
         full = np.ones(self.robot.n)
         if count > 1:
@@ -171,7 +171,7 @@ class Candidates:
         effort: int,
         report: Callable[[float], None],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (x, a) of a local search that begins at `best` and changes one joint at random at a time."""
+        """Return the best (x, a) of a local search from `best`; a step changes one joint's motion at random."""
         most, x, a = best
         steps = -(-effort // TRIES)
         for step in range(steps):
@@ -194,7 +194,7 @@ class Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the motion at 1 kHz, with amplitudes that are safe at GEOMETRY_HZ; None: these are too small."""
+        """Return the motion at 1 kHz with amplitudes safe at GEOMETRY_HZ; None if safe amplitudes are too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))
@@ -206,12 +206,12 @@ class Candidates:
         return Excitation(self.clock[0], self.center + offset, dq, ddq)
 
     def scores(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return the scores (B,) of B pairs (x, a), computed together for speed."""
+        """Return the scores (B,) of B motions (x, a); one call for all B saves time."""
         offset, dq, ddq = (np.stack(m) for m in zip(*(self._coarse(x, a) for x, a in motions), strict=True))
         return self.score(self.t, self.center + offset, dq, ddq)
 
     def _basis(self, rows: slice) -> Samples:
-        """Return matrices (T, 2 H) that map x to position, velocity and acceleration at the milliseconds `rows`."""
+        """Return matrices (T, 2 H) that map x to position, velocity and acceleration at the motion's rows `rows`."""
         _, s, pace, slope = (c[rows, None] for c in self.clock)
         order = np.arange(1, self.harmonics + 1)
         omega = 2 * np.pi / self.period * order
@@ -221,7 +221,7 @@ class Candidates:
         return np.hstack([sine, cosine]), first * pace, second * pace**2 + first * slope
 
     def _scaled(self, series: Samples, a: np.ndarray) -> Samples:
-        """Return offset from the center, velocity and acceleration (T, n) of a series with amplitude shares a."""
+        """Return offset from the center, velocity and acceleration (T, n) of a series with the amplitudes `a`."""
         r = self.robot
         q, dq, ddq = series
         room = RANGE * np.minimum([r.q_max - self.center, self.center - r.q_min], np.pi)
@@ -236,7 +236,7 @@ class Candidates:
         return q[::FINE], dq[::FINE], ddq[::FINE]
 
     def _safety(self, offset: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return safety (T,), the smaller of gap / clearance and unused torque share / 0.1; negative: unsafe."""
+        """Return safety (T,): the smaller of gap / clearance and torque reserve / (0.1 tau_max); negative: unsafe."""
         q = self.center + offset
         torque = (TORQUE_SHARE - torque_share(self.robot, q, dq, ddq)).min(1)
         return np.minimum((self.space.gaps(q) / self.space.clearance).min(1), 10 * torque)
@@ -255,9 +255,9 @@ class Candidates:
     def _shrink(
         self, a: np.ndarray, moved: Callable[[np.ndarray], Samples], by: float, margin: float, least: float
     ) -> np.ndarray | None:
-        """Return amplitude shares a, reduced until `_safety` reaches `margin`; None if a share falls below `least`.
+        """Return `a`, reduced until `_safety` is at least `margin`; None if an amplitude would be below `least`.
 
-        Each round reduces the joint whose smaller amplitude most improves the least safe sample.
+        Each round reduces the amplitude of one joint: the joint that most improves the least safe sample's safety.
         """
         a = a.copy()
         for every in (5, 1):  # first every fifth sample, so that most rounds are fast
@@ -277,7 +277,7 @@ class Candidates:
 
 
 def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return time t, time s within the series, ds/dt and d2s/dt2, each (T,); raised cosines blend the paces ds/dt."""
+    """Return time t, the series' own time s, the pace ds/dt and d2s/dt2 (T,); raised cosines blend the paces."""
     t = SIM_DT * np.arange(round(duration / SIM_DT) + 1)
     levels, shares, fixed = [0.0], [0.0], [ENDS_S]  # a level lasts `fixed` s plus its share of the remaining time
     rungs = _rungs(duration)
@@ -293,13 +293,13 @@ def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
         u = np.clip((t - start) / BLEND_S, 0, 1)
         pace += (b - a) * 0.5 * (1 - np.cos(np.pi * u))
         slope += (b - a) * 0.5 * np.pi / BLEND_S * np.sin(np.pi * u)
-        # integral of the raised cosine and of the constant after it
+        # integral of the raised cosine and of the constant pace after the cosine
         s += (b - a) * (0.5 * BLEND_S * (u - np.sin(np.pi * u) / np.pi) + np.maximum(t - start - BLEND_S, 0))
     return t, s, pace, slope
 
 
 def _rungs(duration: float) -> list[list[float]]:
-    """Return the paces of each rung: the rungs of a ladder go from slow to fast; slow rungs also run backwards."""
+    """Return the paces of each rung; a ladder's rungs go from slow to fast, and slow rungs also run backwards."""
     count = int(duration / RUNG_S + 0.5)
     if count < 2:
         return [list(SHORT)]

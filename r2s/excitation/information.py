@@ -10,12 +10,12 @@ COARSE_HZ = 10  # rate of the samples for information and safety
 # Standard deviations of noise and priors, rough values of torque-controlled arms.
 NOISE = 0.002  # share of tau_max, per sample
 FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
-DRAG_PRIOR = 0.01  # share of tau_max, torque proportional to the sine of the angle, such as a cable's
+DRAG_PRIOR = 0.01  # share of tau_max, torque proportional to the sine of the angle, for example from a cable
 MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, for each coordinate of its center of mass
 SCALE_PRIOR = 0.3  # share of a link's tensor, or of its trace
 DELAY_PRIOR = 3e-3  # s
 SLOPE = 0.05  # share of dq_max, width of the sign change of friction
-RESTING = 1e-3  # share of dq_max; a slower joint may stick, and its torque carries no information
+RESTING = 1e-3  # share of dq_max; a slower joint may stick, so that the joint's torque carries no information
 
 
 def information(
@@ -23,11 +23,11 @@ def information(
 ) -> np.ndarray:
     """Return the information (B,) nats in motions (B, T, n) at times (T,) s.
 
-    Information is half of log(det posterior precision / det prior precision), with independent normal priors. Each
-    joint has the unknowns offset, Coulomb friction as a tanh, its width and shift, viscous friction and drag. Each
-    link has the unknowns mass and center of mass, whose errors remain in the torque despite gravity compensation. For
-    commanded torque (`gravity` false) each tensor's scale and one delay are unknown, for link-side torque the whole
-    tensors. The noise is 0.2 % of tau_max at 10 Hz. A resting joint's samples are ignored, as friction may hold it.
+    Information is half of log(det posterior precision / det prior precision), with independent normal priors. The
+    unknowns of each joint are offset, Coulomb friction (a tanh with unknown width and shift), viscous friction and
+    drag. The unknowns of each link are mass and center of mass; gravity compensation does not remove their errors.
+    For commanded torque (`gravity` false), each tensor's scale and one delay are also unknown; for link-side torque,
+    each tensor element is. Samples at 10 Hz have a noise of 0.2 % of tau_max; a resting joint's samples are ignored.
     """
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)

@@ -8,7 +8,7 @@ def minimum_jerk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return position, velocity and acceleration of a motion from `start` to `end` (n,) rad in `seconds`.
 
-    Each array is (n,) for a time t, s, and (T, n) for times t (T, 1). The arm rests before t = 0 and after `seconds`.
+    The arrays are (n,) for one time t, s, and (T, n) for times t (T, 1), s. Outside [0, `seconds`] the arm rests.
     """
     s = np.clip(t / seconds, 0.0, 1.0)
     distance = end - start

@@ -15,7 +15,7 @@ from r2s.physics.robot import Robot
 
 @dataclass(frozen=True)
 class Excitation:
-    """A reference motion at 1 kHz, at rest at both ends: t (T,) s from 0; q, dq, ddq (T, n) rad, rad/s, rad/s^2."""
+    """A reference motion at 1 kHz that begins and ends at rest: t (T,) s; q, dq, ddq (T, n) rad, rad/s, rad/s^2."""
 
     t: np.ndarray
     q: np.ndarray

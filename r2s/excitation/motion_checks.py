@@ -1,6 +1,7 @@
 """Check a motion before an arm runs it: consistency, limits, torque, and clearance to table and links.
 
-The checks test joint limits at every sample, torque and distances at GEOMETRY_HZ. MJCF geoms define the links' shape.
+The checks test joint limits at every sample, but torque and distances only at GEOMETRY_HZ. The geoms of the MJCF
+define the links' shapes.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,12 +19,12 @@ from r2s.physics.robot import SIM_DT, Robot
 
 TOOL_M = 0.1  # m, default minimum height of the end effector, because the MJCF contains no tool
 CLEARANCE_M = 0.03  # m, least distance between a link and the table or another link
-DEVIATION = 0.05  # rad, a deviation of all joints by this much must not bring a link nearer than the driver's fence
+DEVIATION = 0.05  # rad; if all joints deviate by this angle, the links must still keep the distance FENCE_M
 FAR_M = 0.1  # m, at larger distances the distance of bounding spheres is accurate enough
 GEOMETRY_HZ = 100
 TORQUE_SHARE = 0.8  # share of tau_max for |gravity| + |dynamics| + friction
 FRICTION_SHARE = 0.15  # share of tau_max for friction; a Panda's joint 5 has 0.14
-FRICTION_ROOT = 0.5  # sqrt(Nm), friction of strong joints is at most this times sqrt(tau_max)
+FRICTION_ROOT = 0.5  # sqrt(Nm); the friction of strong joints is at most FRICTION_ROOT * sqrt(tau_max)
 
 
 class Motion(Protocol):
@@ -42,14 +43,14 @@ class Motion(Protocol):
 def check_motion(
     robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M, space: "Space | None" = None
 ) -> None:
-    """Raise UserError at the first violation, with joint or link, value and time of the violation.
+    """Raise UserError at a motion's first violation; the message names joint or link, value and time.
 
     Args:
         robot: limits and links.
         motion: the motion, sampled at 1 kHz.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
-        space: a `Space`, for example with obstacles, used instead of table and z_min; None: a `Space` of both.
+        space: a `Space`, for example with obstacles, that replaces table and z_min; None: a `Space` with these two.
     """
     check_shape(robot, motion)
     check_limits(robot, motion)
@@ -98,7 +99,7 @@ def check_limits(robot: Robot, motion: Motion) -> None:
 def check_derivatives(robot: Robot, motion: Motion) -> None:
     """Raise UserError unless dq and ddq are the derivatives of q, and the motion starts and ends at rest.
 
-    The tracking controller uses q, dq and ddq, so a jump of q alone would jerk the arm without exceeding a limit.
+    The tracking controller uses q, dq and ddq, so a jump of q alone would jerk the arm, even if no limit is exceeded.
     """
     e = motion
     for name, x, slope, most, unit in (
@@ -149,8 +150,8 @@ def check_space(
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
     """Return (|gravity| + |dynamics| + `friction_margin`) / tau_max (T, n) of the nominal model.
 
-    The sum of magnitudes is conservative, because the arm differs from the nominal model. The torque limit includes
-    gravity compensation on some arms and not on others; the sum is sufficient for both.
+    The sum adds magnitudes as a reserve, because a real arm differs from the nominal model. Some arms' torque limits
+    include the torque of gravity compensation and some do not; the sum is an upper bound for both kinds.
     """
     gravity = gravity_torque(robot, q)
     dynamics = nominal_torque(robot, q, dq, ddq) - gravity
@@ -163,7 +164,7 @@ def gravity_torque(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 def friction_margin(robot: Robot) -> np.ndarray:
-    """Return the torque (n,) Nm that is reserved for friction as long as friction is not identified."""
+    """Return the torque (n,) Nm that is reserved for friction, because the checks use no identified friction."""
     return np.minimum(FRICTION_SHARE * robot.tau_max, FRICTION_ROOT * np.sqrt(robot.tau_max))
 
 
@@ -171,14 +172,13 @@ class Space:
     """Computes the distances of an arm's links from table, obstacles and each other; `collision` selects the geoms.
 
     An arm does not follow its plan exactly. If each joint j deviates by e_j rad, a distance decreases by at most
-    sum_j lever_j |e_j|, to first order. lever_j is the displacement of the link per rad of joint j, from the Jacobian
-    at the posture. A planned posture needs enough distance for a deviation of all joints by DEVIATION. Larger
-    deviations need no distance in the plan, because the arm stops when it exceeds its `DeviationLimits`, which depend
-    on the distances along the motion.
+    sum_j lever_j |e_j| to first order, where lever_j bounds the link's displacement per rad of joint j. A planned
+    posture needs enough distance for a deviation of all joints by DEVIATION. Plans ignore larger deviations, because
+    an arm stops beyond its `DeviationLimits`, which depend on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, least distances: end effector above z_min (a scale for fourier.py; `gaps` requires 0 m),
-            links above the table, and links of a pair from each other.
+        clearance: (K,) m, smallest required distances, first between end effector and z_min, then between links and
+            table, last between geoms of pairs. For the end effector, `gaps` requires 0 m; fourier.py uses the value.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -216,7 +216,7 @@ class Space:
                 f"excitation: {name} reaches {-at_home[worst]:.3f} m below the table at {table:g} m already at "
                 "robot.q_home; set another height of the table, -inf for none"
             )
-        need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # an arm with a low home posture must be able to return to it
+        need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # so that an arm can return to a low home posture
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
         # at most half of the distance at home is required, so that an arm may return to a low home posture
         self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
@@ -233,7 +233,7 @@ class Space:
         return need
 
     def measured(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distances (T, K) m and levers (T, K, n) m/rad, see `Space`; the end effector has levers 0."""
+        """Return distances (T, K) m and levers (T, K, n) m/rad, see `Space`; the end effector's levers are 0."""
         tip, apart = np.empty((len(q), 1)), np.empty((len(q), len(self.pairs)))
         places, frames = (np.empty((len(q), self.model.ngeom, k)) for k in (3, 9))
         levers = np.zeros((len(q), 1 + len(self.above) + len(self.pairs), q.shape[1]))
@@ -246,7 +246,7 @@ class Space:
         return np.hstack([tip - self.floor, self._heights(places, frames) - self.table, apart]), levers
 
     def _levers(self) -> np.ndarray:
-        """Return upper bounds (K - 1, n) m/rad on the change of each distance per joint angle, at this posture."""
+        """Return levers (K - 1, n) m/rad: bounds on how fast K - 1 distances change with each joint's angle."""
         d, radius, link = self.data, self.model.geom_rbound, self._link
         arm = d.geom_xpos[:, None] - d.xanchor
         moved = np.cross(d.xaxis, arm)  # (ngeom, n, 3), displacement of each geom's center
@@ -256,11 +256,11 @@ class Space:
         far = np.linalg.norm(moved, axis=2) + radius[:, None]
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         between = (joint >= link[a, None]) & (joint < link[b, None])
-        # a joint between two links changes their distance equally, whichever link moves: the smaller bound holds
+        # a joint between two links changes their distance equally, whichever link moves: use the smaller bound
         return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
-        """Raise UserError for the first row of q (T, n) with a gap below 0; `when(k)` is the text for row k."""
+        """Raise UserError if a posture in q (T, n) rad has a gap below 0; `when(k)` is the error text for row k."""
         gaps = self.gaps(q)
         bad = np.argwhere(~(gaps >= 0))
         if len(bad):
@@ -268,7 +268,7 @@ class Space:
             raise UserError(f"excitation: {self.explain(int(which), q[row], when(row))}")
 
     def explain(self, which: int, q: np.ndarray, when: str) -> str:
-        """Return the message about a violation in column `which` of `gaps` at the posture q (n,) rad."""
+        """Return the error message for column `which` of `gaps`, a distance that is too small at q (n,) rad."""
         distances, levers = self.measured(q[None])
         seen, allowed = distances[0, which], self._needed(levers)[0, which]
         if which == 0:
@@ -289,7 +289,7 @@ class Space:
         return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
 
     def _apart(self) -> np.ndarray:
-        """Return the distance, m, of each geom pair in `pairs`; beyond FAR_M, that of the bounding spheres."""
+        """Return the distance, m, between the geoms of each pair, approximate (by bounding spheres) above FAR_M."""
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         radius, place = self.model.geom_rbound, self.data.geom_xpos
         out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]
@@ -298,14 +298,14 @@ class Space:
         return out
 
     def _heights(self, places: np.ndarray, frames: np.ndarray) -> np.ndarray:
-        """Return the heights (T, G) m of the lowest points of the geoms `above`, from geom_xpos and geom_xmat."""
+        """Return the height (T, G) m of the lowest point of each geom in `above`, from geom_xpos and geom_xmat."""
         lowest = [places[:, g, 2] - self._reach(g, frames[:, g, 6:]) for g in self.above]
         return np.array(lowest).T.reshape(len(places), len(self.above))
 
     def _reach(self, g: int, up: np.ndarray) -> np.ndarray:
-        """Return a geom's height (T,) m from lowest point to center; `up` (T, 3): the vertical in the geom's frame.
+        """Return the height (T,) m of a geom's center above its lowest point; `up` (T, 3): vertical in geom axes.
 
-        Other shapes than those below, such as a signed distance field, have the height of their bounding sphere.
+        For shapes without a formula in this function, such as signed distance fields, use the bounding sphere.
         """
         m, kind, size = self.model, mujoco.mjtGeom, self.model.geom_size[g]
         across, along = np.hypot(up[:, 0], up[:, 1]), np.abs(up[:, 2])
@@ -327,6 +327,6 @@ class Space:
 
 
 def geometry_rows(motion: Motion) -> np.ndarray:
-    """Return the indices of a motion's rows at the rate GEOMETRY_HZ, and of the last row."""
+    """Return the indices of a motion's rows at which geometry is checked: rows at GEOMETRY_HZ and the last row."""
     rows = np.arange(0, len(motion.t), max(1, round(1 / (GEOMETRY_HZ * SIM_DT))))
     return np.union1d(rows, [len(motion.t) - 1])

@@ -1,7 +1,7 @@
 """Find a joint-space path to a posture, and check its limits and clearance before an arm moves along the path.
 
-A path is an array of postures (k, n) rad, connected by straight lines in joint space, without speeds. Distances and
-clearances are computed as in `motion_checks`.
+A path is an array of postures (k, n) rad, connected by straight lines in joint space, without speeds.
+motion_checks.py computes distances and clearances.
 """
 
 from collections.abc import Iterator
@@ -12,20 +12,20 @@ from r2s.errors import UserError
 from r2s.excitation.motion_checks import CLEARANCE_M, Space
 from r2s.physics.robot import Robot
 
-CLOSER_M = 1e-3  # m by which an arm that starts too near to an obstacle may come closer before it moves away
+CLOSER_M = 1e-3  # m; an arm that starts too near to an obstacle may come closer by CLOSER_M before it moves away
 SAME = 1e-3  # rad, a joint this close to its target need not move
 
 
 def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, space: Space) -> np.ndarray:
     """Return the first candidate path (k, n) rad from q_from to q_to without `path_violation`.
 
-    The candidates are the straight line, two straight lines through q_home, a path that moves one joint after the
-    other (from the last or from the first), and such a path through q_home.
+    The candidates are the straight line, two straight lines through q_home, two paths that move one joint at a time
+    (from the last or from the first joint on), and two paths through q_home that move one joint at a time.
 
     Args:
         robot: limits and links.
-        q_from, q_to: (n,) rad.
-        what: name of the path in the error message. space: `Space` of the robot.
+        q_from, q_to: (n,) rad, first and last posture.
+        what: name of the path in the error message. space: object that computes the arm's distances.
 
     Raises:
         UserError: every candidate has a violation; the message describes the violation on the straight line.
@@ -40,7 +40,7 @@ def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, s
 
 
 def _candidates(robot: Robot, a: np.ndarray, b: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the candidate paths (k, n) rad from a to b (n,) in the order that `approach` lists."""
+    """Yield the candidate paths (k, n) rad from a to b (n,) rad, in the order of `approach`'s docstring."""
     home, last_first = robot.q_home, np.arange(robot.n)[::-1]
     yield np.array([a, b])
     yield np.array([a, home, b])
@@ -62,7 +62,7 @@ def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
 def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
     """Return a description of the first violation of limits or clearances on a path (k, n) rad, or "".
 
-    The first posture, where the arm is, may violate clearances; its distances may decrease by CLOSER_M at most.
+    A distance that is already too small at the first posture, where the arm is, may decrease by at most CLOSER_M.
     """
     if path.ndim != 2 or len(path) < 2 or path.shape[1] != robot.n:
         return f"expected postures of shape (2 or more, {robot.n}), got {path.shape}"
@@ -92,6 +92,6 @@ def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
 
 
 def _where(leg: int, count: int, share: float) -> str:
-    """Return a description of the point at a share of leg number `leg` of a path with `count` postures."""
+    """Return a text that describes the point at the fraction `share` of leg number `leg` of a path."""
     which = "" if count == 2 else f", from posture {leg + 1} to {leg + 2} of {count}"
     return f" {100 * share:.0f} % of the way{which}"

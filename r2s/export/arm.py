@@ -14,11 +14,11 @@ class Arm:
     """Description of the arm on which a bundle will run. The runtime refuses a bundle made for another arm.
 
     Attributes:
-        joints: joint names in order from the base. cycle_hz: rate at which the arm takes torque commands, Hz.
+        joints: joint names in order from the base. cycle_hz: Hz, rate of the torque commands to the arm.
         torque: "without gravity" if the arm itself compensates gravity, as a Franka arm does.
-        q_min, q_max, dq_max, tau_max, dtau_max: the arm's limits, one per joint: rad, rad, rad/s, Nm, Nm/s.
-        slows: each joint's (decelerations rad/s^2, offsets rad/s) in the speed limits of an arm such as the FR3 near
-            its position limits: sqrt(2 deceleration d) - offset at the distance d. None: no such speed limits.
+        q_min, q_max, dq_max, tau_max, dtau_max: the limits of each joint, in rad, rad, rad/s, Nm, Nm/s.
+        slows: (decelerations rad/s^2, offsets rad/s) of an arm such as the FR3, which limits each joint's speed to
+            sqrt(2 deceleration d) - offset at d rad before a position limit; None: the arm has no such limits.
     """
 
     joints: Sequence[str]
@@ -33,7 +33,7 @@ class Arm:
 
 
 def fits(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle was made for another arm, or exceeds a limit of this arm."""
+    """Raise BundleError if a bundle was made for an arm other than `arm`, or exceeds a limit of `arm`."""
     own, n = contract["joints"], len(contract["joints"])
     if len(arm.joints) != n:
         raise BundleError(f"expected {n} joints, got {len(arm.joints)} of the arm")
@@ -64,7 +64,7 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
 
 
 def _slows(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle allows higher speeds near position limits than the arm does in `Arm.slows`."""
+    """Raise BundleError if a bundle's speed limits near position limits are above those of `Arm.slows`."""
     law = Driver(contract["law"], Model(contract["model"]))
     deceleration, offset = np.array(arm.slows, dtype=float)
     for way in np.linspace(0.0, 1.0, 101):  # rad before the limit

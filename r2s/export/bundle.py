@@ -59,12 +59,12 @@ def write_bundle(
     """Write the bundle of a finished training atomically into the new folder `to`.
 
     Args:
-        to: the new folder. source: run folder of the training. robot, task, policy, config: parts of the training.
+        to: the new folder. source: run folder of the training. robot, task, policy, config: used in the training.
         dynamics: dynamics of one arm, at the center of the training's domain randomization.
-        places: names of all simulators and arms; the model card lists those without a transfer of the policy.
+        places: names of all simulators and arms; the model card lists where the policy has not run.
 
     Raises:
-        UserError: `to` exists, or the run's policy.onnx is missing or computes other actions than policy.pt.
+        UserError: `to` exists, the run has no policy.onnx, or policy.onnx and policy.pt compute different actions.
     """
     if to.exists():
         raise UserError(f"export: {to} exists; remove it, or choose another to=FOLDER")
@@ -109,7 +109,7 @@ def write_bundle(
 
 
 def surface_of(source: Path, robot: Robot, task: Task, dynamics: Dynamics) -> Surface | None:
-    """Return the identified surface of a run with contact, or else the nominal surface; None without contact."""
+    """Return the surface that a run identified, or the task's nominal surface; None if the task has no contact."""
     if not task.touches:
         return None
     if (source / "contact.yaml").is_file():
@@ -126,7 +126,7 @@ def check_with_own_runtime(folder: Path) -> None:
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
-    """Copy policy.onnx, and check its actions against policy.pt and its metadata against the contract."""
+    """Copy policy.onnx; compare its actions with those of policy.pt, and its metadata with the contract."""
     import onnx
     from onnx.reference import ReferenceEvaluator
 
@@ -208,7 +208,7 @@ def one_file(control: Controller) -> str:
 def law_source(law: Any) -> tuple[str, str]:
     """Return the name and the source of a control law as plain Python, without decorators.
 
-    If the law uses other functions or numbers, the source is a function that defines these and returns the law.
+    If the law uses functions or numbers of a module, the source is a function that defines these and returns the law.
 
     Raises:
         UserError: the law uses a name that is neither a function, a number, a builtin nor NumPy's `np`.
@@ -225,7 +225,7 @@ def law_source(law: Any) -> tuple[str, str]:
 
 
 def _collect(function: Any, law: str, sources: dict[str, str]) -> None:
-    """Add the functions and numbers that a function uses, then the function, to `sources` {name: source}."""
+    """Add to `sources` {name: source} the functions and numbers that `function` uses, then `function` itself."""
     node = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
     assert isinstance(node, ast.FunctionDef)
     node.decorator_list = []

@@ -28,8 +28,8 @@ def card(
     """Return the sections of the model card, {title: items}.
 
     Args:
-        source, config, meta: run folder of the training, its config.yaml and meta.json. contract: the bundle's
-            contract. bundle: the unfinished bundle folder. places: names of all simulators and arms.
+        source: run folder of the training. config, meta: contents of config.yaml and meta.json in this folder.
+        contract: the bundle's contract. bundle: the bundle folder, unfinished. places: all simulators and arms.
     """
     best, measures = json.loads((source / "summary.json").read_text())["best"], measures_of(source)
     rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
@@ -75,7 +75,7 @@ def card(
 
 
 def contacts(contract: Mapping[str, Any]) -> str:
-    """Return the words for the contacts that did not occur in the training."""
+    """Return the model card's words for contacts that did not occur in the training."""
     return "no contact but of the tip" if contract["goal"]["kind"] == "surface" else "no contact"
 
 
@@ -149,7 +149,7 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"simulator or arm (run)": measures} of all ended transfers of a policy that have `measure`."""
+    """Return {"simulator or arm (run)": measures} for a policy's ended transfers that recorded `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:

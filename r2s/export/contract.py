@@ -1,4 +1,4 @@
-"""Make contract.json, which contains all data that a program needs to run a policy on the arm of its training.
+"""Make contract.json, which contains all data that a program needs to run a policy on the arm of the training.
 
 The contract contains all parameters of driver and safety filter (r2s/arm/driver.py, r2s/physics/safety_filter.py), of
 the controller, and of the model for computed torque (r2s/physics/inverse_dynamics.py).
@@ -33,7 +33,7 @@ from r2s.tasks.task import ObservationTerm, Task, observation_scale
 from r2s.tasks.track import TrackTask
 
 CONVENTION = "without gravity"
-# sources of observation terms for every kind of goal; `pull` is J^T error
+# sources of observation terms for every kind of goal; `pull` is J^T times the position error
 MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
 MORE_OF = {  # additional sources, by the kind of goal
     "point": (),
@@ -43,7 +43,7 @@ MORE_OF = {  # additional sources, by the kind of goal
         "velocity",
     ),
 }
-NEAR_RAD = 0.05  # rad, allowed distance from the start posture; half the path error that `move_to` allows
+NEAR_RAD = 0.05  # rad, allowed distance of a joint from the start posture; half the path error allowed in `move_to`
 FIRST_ROW = "at rest, at the joint angles of a plan's first row"
 RESTING = 0.1  # rad/s, speed below which a joint is at rest: five times the driver's STILL, for noisier sensors
 UNITS = {"q_low": "rad", "q_high": "rad", "q_fade": "rad", "most": "rad/s", "slowing": "rad/s^2", "offset": "rad/s"}
@@ -56,7 +56,7 @@ class DescribesObservation(Protocol):
     """A task that describes the terms of its observations."""
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms of an observation, in their order."""
+        """Return the terms of an observation, in the order of the observation vector."""
         ...
 
 
@@ -64,7 +64,7 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
     """Return a policy's contract without the keys files, versions, trained and seal, which `write_bundle` adds.
 
     Args:
-        robot, task: of the training. friction: Coulomb level (n,) Nm, see `r2s.physics.safety_filter.filter_torque`.
+        robot, task: those of the training. friction: (n,) Nm, Coulomb friction, see `safety_filter.filter_torque`.
         rotors: armatures (n,) kg m^2 for the safety filter; None: the armatures of `robot`.
 
     Raises:
@@ -123,7 +123,7 @@ def kind_of(task: Task) -> str:
 
 
 def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
-    """Return the position of the second joint, m, from which the contract measures the distance of a goal."""
+    """Return the position (3,) m of the shoulder, which is joint 2; the contract limits a goal's distance from it."""
     arm = Model(model)
     arm.place(robot.q_home)
     return listed(arm.origin[min(1, robot.n - 1)])
@@ -160,7 +160,7 @@ def check_exportable(robot: Robot, task: Task) -> None:
 
 
 def model_of(control: Controller, task: Task) -> InverseDynamics | None:
-    """Return the arm model for computed torque or for the estimate of contact force; None if neither is used."""
+    """Return the arm model that computed torque or the contact-force estimate needs; None if neither is used."""
     if isinstance(control, ComputedTorque):
         return control.model
     return task.model if isinstance(task, SurfaceTask) else None
@@ -193,7 +193,7 @@ def links_of(robot: Robot, dynamics: Dynamics) -> list[dict[str, Any]]:
 
 
 def observation(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the entry `observation`: name, unit, source and slice of each term."""
+    """Return the entry `observation`: each term's name, unit, source and slice of the observation vector."""
     if not hasattr(task, "observation_terms"):
         raise UserError(
             f"export: {type(task).__name__} does not describe its observations; it needs a method "
@@ -222,7 +222,7 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
 
 
 def width(of: str, joints: int, preview: int) -> int:
-    """Return the number of values in an observation term with the source `of`."""
+    """Return the number of values in an observation term whose values come from the source named `of`."""
     own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
     own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
     return {**own, "above_target": 1}.get(of, joints)
@@ -260,7 +260,7 @@ def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, A
 
 
 def start(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the entry `start`: the start posture, the allowed distance from this posture, and the allowed speed."""
+    """Return the entry `start`: the start posture, the allowed distance from this posture, the allowed speed."""
     rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
         return {"words": FIRST_ROW} | rest

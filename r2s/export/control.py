@@ -15,7 +15,7 @@ LAWS: dict[str, Callable] = {"torque": torque_law, "computed_torque": computed_t
 
 
 class Control:
-    """The controller of a contract: a call maps the policy's command and the arm's state to a target torque.
+    """The control law of a contract, which maps the policy's command and the arm's state to a target torque.
 
     Args:
         contract: contract of the bundle; the entry `control` describes the controller.
@@ -40,7 +40,7 @@ class Control:
         return out
 
     def at_rest(self, q: np.ndarray, dq: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
-        """Return the control law's torque (n,) Nm for an action of zero, as in the first cycle of a motion."""
+        """Return the control law's torque (n,) Nm for an action of zero in the first cycle of a motion."""
         out = np.zeros(self._n)
         command = np.concatenate([np.zeros(self.action_dim), setpoint])
         self._law(q, dq, command, self._parameters, np.zeros(self._memory_size), out)

@@ -1,6 +1,6 @@
 """Check start, goal and plan of a motion, run the policy in a thread, and bring the arm to rest after a signal.
 
-`r2s export` copies this module into the bundle. The thread is for physical arms, which do not wait for the policy.
+`r2s export` copies this module into the bundle. A physical arm needs the thread, because it cannot wait for a policy.
 """
 
 import signal
@@ -16,13 +16,13 @@ import numpy as np
 from r2s.export.law import BundleError, Model
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")  # Ctrl-C, kill, a closed terminal, Ctrl-\, Ctrl-Z
-POLL_S = 1e-4  # s, time between two reads of the mailbox by the policy's thread: a tenth of a cycle
+POLL_S = 1e-4  # s, time after which the policy's thread looks again for an observation: a tenth of a cycle
 ROUNDING_M = 1e-6  # m, tolerance of the border of the region of goals
 AGREE_M = 1e-3  # m, allowed distance between a position in a plan and the position that the plan's joint angles reach
 
 
 def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
-    """Return why a goal (3,) m is outside the region of the training's goals, or None if it is inside."""
+    """Return why a goal (3,) m is outside the region of the training's goals, or None if the goal is inside."""
     if not np.isfinite(point).all():
         return "the goal is not finite"
     away, azimuth = np.linalg.norm(point - np.array(trained["shoulder_m"])), abs(np.arctan2(point[1], point[0]))
@@ -37,7 +37,7 @@ def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
 
 
 def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.ndarray) -> None:
-    """Raise BundleError unless the arm rests near the posture `home` (n,) rad, within the limits `start`."""
+    """Raise BundleError unless the arm rests near the posture `home` (n,) rad, within the contract's `start`."""
     if not (np.isfinite(q).all() and np.isfinite(dq).all()):
         raise BundleError("the arm's state is not finite")
     if start["within_rad"] is not None and (far := np.abs(q - home)).max() > start["within_rad"]:
@@ -51,7 +51,7 @@ def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.n
 
 
 def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError if a plan exceeds limits of the arm, leaves the training's region or is for another arm."""
+    """Raise BundleError if a plan violates an arm limit, leaves the training's region or is for a different arm."""
     at, own = contract["goal"]["columns"], contract["law"]["joint"]
     place, q, dq = (plan[:, slice(*at[name])] for name in ("place", "q", "dq"))
     low, high, most = (np.array([s if v is None else v for v in own[k]]) for k, s in BOUNDS.items())
@@ -69,7 +69,7 @@ def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None
             raise BundleError(f"row {row} of the plan is {1e3 * off:.1f} mm from where its joint angles take the arm")
 
 
-BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # keys of the law, and values for null
+BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # limits in the law, and what null means
 
 
 class PolicyThread:

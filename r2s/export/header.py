@@ -63,7 +63,7 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
 
 
 def _push(push: Mapping[str, Any] | None) -> list[str]:
-    """Return the C++ constants of the push limit, 0 if there is none, and of a Franka arm's reflex thresholds."""
+    """Return the C++ constants of push limit (all 0 without push limit) and of a Franka arm's reflex thresholds."""
     own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
         PUSH_VECTOR, [0.0] * 3
     )
@@ -111,7 +111,7 @@ OWN = {"own_offset": "offset_Nm", "load": "load", "drag_sin": "drag_sin_Nm", "dr
 
 
 def _fences(contract: Mapping[str, Any]) -> list[str]:
-    """Return the C++ constants of the allowed start and the region of goals; a missing limit is infinite."""
+    """Return C++ constants: limits of the start and of the goals, with infinity for limits that are null."""
     start, trained = contract["start"], contract["goal"].get("trained") or {}
     near, far = trained.get("shoulder_distance_m", (0.0, None))
     numbers = {"start_within": start["within_rad"], "start_fastest": start["fastest_rad_per_s"], "goal_nearest": near}
@@ -122,7 +122,7 @@ def _fences(contract: Mapping[str, Any]) -> list[str]:
 
 
 def _rows(name: str, values: list[Any], before: str = "") -> str:
-    """Return the C++ line of a constant with a row per link: a frame has nine numbers, an inertia tensor six."""
+    """Return a line of C++ that defines an array with a row per link; a frame has 9 numbers, a tensor has 6."""
     if name == "frame":
         values = [[x for row in frame for x in row] for frame in values]
     elif name == "tensor":

@@ -43,9 +43,9 @@ class InverseDynamics:
         self._sign, self._slides = number["sign_rad_per_s"], number["load_sign_rad_per_s"]
 
     def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
-        """Return setpoints (rows, 3 n + n n) of a joint motion (T, n), sampled at `hz`, for its first `rows` rows.
+        """Return the setpoints (rows, 3 n + n n) for the first `rows` rows of a joint motion (T, n) sampled at `hz`.
 
-        A setpoint is feedforward, Nm, q_d, dq_d and the mass matrix row by row. Its computation takes over 1 ms.
+        A setpoint contains feedforward, Nm, q_d, dq_d and the flattened mass matrix; its computation takes over 1 ms.
         """
         n = q.shape[1]
         out = np.empty((rows, 3 * n + n * n))
@@ -61,7 +61,7 @@ class InverseDynamics:
         return out
 
     def equations(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm without the arm's own gravity compensation."""
+        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm, minus the arm's own gravity compensation."""
         self._own.place(q)
         self._nominal.place(q)
         mass, bias = self._own.equations(dq)

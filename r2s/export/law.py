@@ -10,15 +10,15 @@ import numpy as np
 
 LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
 
-OVER = 3  # last phase of a stop: the contact needs no further action, see push.py
+OVER = 3  # last phase of a stop in contact, which needs no further action, see push.py
 
 
 class BundleError(ValueError):
-    """A bundle does not fit the arm, or a program calls the runtime wrongly; the message is one line."""
+    """A bundle does not fit the arm, or a program calls the runtime wrongly; the error message is one line."""
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
-    """Return a contract's list as an array (n,), with `none` in place of null, because JSON has no infinity."""
+    """Return a contract's list as an array (n,) in which `none` replaces null, the contract's sign for infinity."""
     return np.array([none if v is None else v for v in values], dtype=float)
 
 
@@ -70,7 +70,7 @@ class Model:
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
 
-        Newton-Euler recursion yields the torque, and a sum of J_k^T (m, I)_k J_k over the links k the mass matrix.
+        Newton-Euler recursion yields the torque. The mass matrix is the sum of J_k^T (m, I)_k J_k over the links k.
         """
         R, p, z, n = self.frame, self.origin, self.axis, self.n
         spin = z * dq[:, None]
@@ -108,14 +108,14 @@ class Model:
 
 
 class Driver:
-    """Control law, low-pass and safety filter; a call returns a torque command within the arm's limits.
+    """Run control law, low-pass and safety filter; a call returns a torque command within the arm's limits.
 
     Attributes:
-        effort: (n,) Nm, the target torque after the low-pass. stopping: reason of the present stop, or None.
+        effort: (n,) Nm, the target torque after the low-pass. stopping: why the driver stops the arm, or None.
         limited: number of cycles of this motion in which the safety filter changed the torque.
 
     Args:
-        law: a contract's entry `law`. model: the arm's `Model`. soft_start_s: s, duration of the torque's fade-in.
+        law: a contract's entry `law`. model: the arm's `Model`. soft_start_s: s, time over which torque fades in.
         control: the contract's `Control`; None: commands are torques. push: the contract's `PushLimit`, or None.
     """
 
@@ -143,7 +143,7 @@ class Driver:
 
     @property
     def done(self) -> bool:
-        """Whether a stop has ended: either the arm is at rest, or the stop has lasted its longest duration."""
+        """Whether a stop has ended, because the arm is at rest or the longest duration of a stop is over."""
         over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
         return self.stopping is not None and self._damped > 0 and (self._rests or over)
 
@@ -154,7 +154,7 @@ class Driver:
 
         Args:
             q, dq: joint state (n,) rad, rad/s, in this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            command: (c,), new command; None: the previous command. placed: whether the caller did `model.place(q)`.
+            command: (c,), new command; None: the previous command. placed: whether `model` is already at q.
         """
         j, c = self._j, self._number
         seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
@@ -182,7 +182,7 @@ class Driver:
                 self._target = np.clip(target, -j["asked"], j["asked"])
                 self._rests = self._rests and self._push.phase == OVER
             self._share = max(needs, self._share - c["cycle_s"] / c["brake_s"])
-            if seen and self._share == 0.0:  # a spring stops joints that a load or a wrong friction model still moves
+            if seen and self._share == 0.0:  # a spring stops joints that a load or model error still moves
                 slides = np.abs(dq) > c["still"]
                 along = np.where(slides & (dq * self._held > 0), np.minimum(j["release"], np.abs(self._held)), 0.0)
                 turned = self._held - along * np.sign(dq) - c["cycle_s"] * j["spring"] * np.where(slides, dq, 0.0)
@@ -228,7 +228,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to the effort within all limits, and whether the filter changed it."""
+        """Return the torque (n,) Nm within all limits nearest to `effort`, and whether the two differ."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -249,9 +249,9 @@ class Driver:
     def _bounded(
         self, tau: np.ndarray, dq: np.ndarray, ddq: np.ndarray, bounds: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to tau with acceleration in bounds, and whether this differs from tau.
+        """Return the torque (n,) Nm nearest to tau with acceleration in `bounds`, and whether the two differ.
 
-        ddq: acceleration (n,) rad/s^2 due to tau. bounds: inverse mass matrix, lowest and highest ddq (n,) rad/s^2.
+        ddq: (n,) rad/s^2, acceleration by tau. bounds: inverse mass matrix, then lowest and highest allowed ddq (n,).
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():
@@ -266,7 +266,7 @@ class Driver:
         return tau + self._stops(mobility, ddq, low, high), True
 
     def fastest(self, q: np.ndarray, up: bool) -> np.ndarray:
-        """Return the speeds (n,) rad/s that the safety filter allows at q (n,) rad; `up`: towards the upper limit."""
+        """Return the speeds (n,) rad/s that the filter allows at q (n,) rad, towards q_max (`up`) or q_min."""
         return self._allowed(self._j["q_high"] - q if up else q - self._j["q_low"])
 
     def _allowed(self, way: np.ndarray) -> np.ndarray:

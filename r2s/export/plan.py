@@ -17,7 +17,7 @@ NO_PLAN = "the policy of this bundle follows plans: pass one to `reset`"
 
 
 def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a plan as an array; raise BundleError if it is missing, not finite, or of a wrong shape."""
+    """Return a plan as an array; raise BundleError if the plan is missing, not finite, or of a wrong shape."""
     if plan is None:
         raise BundleError(NO_PLAN)
     plan = np.array(plan, dtype=float)
@@ -30,7 +30,7 @@ def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Follower:
-    """Follow a plan: a call returns the observation sources and the controller's setpoint of a control step.
+    """Follow a plan; a call returns a control step's observation values and the controller's setpoint.
 
     Args:
         contract: contract with plans as goals. control: the contract's `Control`. model: not used.
@@ -46,7 +46,7 @@ class Follower:
         self._shape, self._plan = tuple(goal["shape"]), np.zeros(0)
 
     def take(self, plan: Any) -> None:
-        """Store the next motion's plan; raise BundleError if it is missing, not finite, or of a wrong shape."""
+        """Store the next motion's plan; raise BundleError if the plan is missing, not finite, or of a wrong shape."""
         plan = finite_plan(plan, self._shape)
         if self._dynamics is not None:
             q, dq, ddq = (plan[:, self._at[k]] for k in ("q", "dq", "ddq"))
@@ -61,12 +61,12 @@ class Follower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return the observation sources and the `setpoint` of a control step; `goal` is the reference position.
+        """Return {name: values} for the observation of a control step, and the controller's `setpoint`.
 
         After the last step the reference remains at the end of the path.
 
         Args:
-            step: number of the control step, from 0. seen: q, dq (n,) rad, rad/s, end-effector position `ee` (3,) m.
+            step: number of the control step, from 0. seen: measured q, dq (n,) rad, rad/s; end effector `ee` (3,) m.
             limited: share of the last control period in which the safety filter changed the command.
         """
         row, at, plan = min(step, self._steps), self._at, self._plan

@@ -1,7 +1,7 @@
 """Limit contact force and closing speed, and stop an arm whose tip presses on a surface, in NumPy.
 
-r2s itself uses compiled versions in r2s/physics: push_limit.py, with the derivation, and contact_stop.py. `r2s
-export` copies this module into r2s_runtime.py of a bundle.
+r2s itself uses two compiled modules instead, r2s/physics/push_limit.py, which contains the derivation, and
+r2s/physics/contact_stop.py. `r2s export` copies this module into r2s_runtime.py of a bundle.
 """
 
 from collections.abc import Callable
@@ -21,10 +21,10 @@ BEGINS, PRESSES, CLEAR = range(3)  # phases of a stop, before OVER
 
 
 class PushLimit:
-    """Limit one arm's contact force. In every cycle call `see`, then (during a stop) `stop`, then `limit`.
+    """Limit one arm's contact force; in every cycle call `see`, then during a stop `stop`, and at last `limit`.
 
     Args:
-        law: entry `law` of a contract. model: the arm's `Model`; call `model.place(q)` in every cycle before `see`.
+        law: a contract's entry `law`. model: the arm's `Model`; in every cycle, call `model.place(q)` before `see`.
     """
 
     def __init__(self, law: dict[str, Any], model: Model):
@@ -37,7 +37,7 @@ class PushLimit:
     def reset(self) -> None:
         """Prepare the next motion: reset the estimated contact force and the phase of a stop."""
         self._resisted, self._speed = 0.0, 0.0
-        self._before: float | None = None  # closing speed one cycle ago, m/s; None: tip far from the plane
+        self._before: float | None = None  # closing speed in the previous cycle, m/s; None: tip far from the plane
         self.phase, self._felt, self._from, self._pull = BEGINS, 0.0, 0.0, 0.0
 
     def see(self, dq: np.ndarray, mass: np.ndarray, bias: np.ndarray) -> None:
@@ -62,7 +62,7 @@ class PushLimit:
         self._dq, self._mass, self._bias = dq, mass, bias
 
     def _bound(self, last: np.ndarray) -> float:
-        """Return the upper bound of `lever @ torque`, inward acceleration by torque, m/s^2. last: previous torque."""
+        """Return the largest tip acceleration into the surface, m/s^2, that torque may cause; `last`: last torque."""
         p, c, mobility = self._p, self._c, self._mobility
         if self._height > p["near_m"]:
             self._resisted, self._before = 0.0, None
@@ -83,9 +83,9 @@ class PushLimit:
         return most - own
 
     def limit(self, effort: np.ndarray, last: np.ndarray, bounded: Callable[..., Any]) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within all bounds nearest to the effort (n,) Nm, and whether these two differ.
+        """Return the torque (n,) Nm within all bounds nearest to `effort` (n,) Nm, and whether the two differ.
 
-        bounded: function (torque, bias torque with contact), (n,) Nm, that limits the torque to the joint bounds.
+        bounded: function (torque, bias torque in contact), each (n,) Nm, that limits the torque to the joint bounds.
         """
         bound, p, row = self._bound(last), self._p, self._row
         bias = self._bias + max(self._resisted, 0.0) * row
@@ -111,10 +111,10 @@ class PushLimit:
         return out, True
 
     def stop(self, held: np.ndarray, cycles: int) -> tuple[np.ndarray, float]:
-        """Return the target torque (n,) Nm in a stop, and the share of the allowed joint speeds that it uses.
+        """Return a stop's target torque (n,) Nm, and the share of the allowed joint speeds that the stop needs.
 
         Args:
-            held: torque (n,) Nm that the driver adds to the target. cycles: number of cycles since the stop began.
+            held: (n,) Nm, torque that the driver adds to the target torque. cycles: cycles since the stop began.
         """
         p, row, lever, mobility = self._p, self._row, self._lever, self._mobility
         if cycles * self._c["cycle_s"] > p["leaves_s"]:

@@ -1,4 +1,4 @@
-"""Run a bundle of `r2s export` on an arm. This file needs NumPy and ONNX Runtime, but not r2s.
+"""Run a bundle of `r2s export` on an arm, with NumPy and ONNX Runtime but without r2s.
 
     python r2s_runtime.py BUNDLE         check the bundle, and print what it requires of an arm
 
@@ -9,7 +9,7 @@
             tau = runtime(q, dq, tau_J_d, goal)
 
 If the policy follows plans, pass a plan to `reset` and no goal to `runtime`. `Runtime.plan` makes a plan from a joint
-motion. contract.json lists the bundle's requirements; BundleError names one that the arm does not meet.
+motion. contract.json lists what the bundle requires of an arm; a BundleError names a requirement that is not met.
 """
 
 import hashlib
@@ -79,8 +79,8 @@ class Runtime:
         contract: content of contract.json. driver: the `Driver`, which makes the torque obey the arm's limits.
 
     Args:
-        folder: the bundle. arm: the arm on which it runs. soft_start_s: time over which the torque fades in, s.
-        live: whether the arm runs in real time; if so, the policy runs in a separate thread.
+        folder: the bundle. arm: the arm that executes the policy. soft_start_s: s, time over which torque fades in.
+        live: whether the arm runs in real time; then the policy runs in a separate thread.
 
     Raises:
         BundleError: the bundle is damaged or made for another arm.
@@ -95,7 +95,7 @@ class Runtime:
         options.intra_op_num_threads = options.inter_op_num_threads = 1  # do not wait for other threads
         try:
             self._policy = onnxruntime.InferenceSession(Path(folder) / "policy.onnx", options)
-        except Exception as error:  # ONNX Runtime raises many kinds
+        except Exception as error:  # ONNX Runtime raises many types of exceptions
             raise BundleError(f"policy.onnx cannot be loaded: {' '.join(str(error).split())}") from None
         self._model = Model(contract["model"])
         self._control = Control(contract)
@@ -116,11 +116,11 @@ class Runtime:
 
         Args:
             plan: (rows, columns), in the format of the contract's entry `goal`; None if goals are points. The arm
-                must be at the joint angles of the first row. Setpoints for computed torque take 0.1 s to compute.
+                must be at the joint angles of the plan's first row. Computed-torque setpoints take 0.1 s to compute.
 
         Raises:
-            BundleError: the plan is missing, has another shape, is not finite, or exceeds the arm's limits or the
-                region of the training's plans; or the policy takes points and a plan was passed.
+            BundleError: the plan is missing, has a wrong shape, is not finite, exceeds the arm's limits or is outside
+                the region of the training's plans; or the program passed a plan for a policy whose goals are points.
         """
         if self._follower is not None:
             self._follower.take(plan)
@@ -134,7 +134,7 @@ class Runtime:
         self._motion += 1
 
     def stop(self, why: str = "asked for") -> None:
-        """Bring the arm to rest from the next cycle on. `driver.stopping` is `why` of the first call."""
+        """Bring the arm to rest from the next cycle on; `driver.stopping` stores the first call's reason `why`."""
         self.driver.stopping = self.driver.stopping or why
 
     @property
@@ -149,14 +149,14 @@ class Runtime:
 
         Args:
             q, dq: measured joint state (n,) rad, rad/s. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            goal: finite point (3,) m in the base frame; None if the policy follows a plan, whose time is the number
-                of cycles since `reset`.
+            goal: finite point (3,) m in the base frame; None if the policy follows a plan, which starts at the first
+                cycle after `reset`.
 
-        During a motion, a goal outside the region of the training's goals brings the arm to rest.
+        If a goal during a motion is outside the region of the training's goals, the runtime brings the arm to rest.
 
         Raises:
-            BundleError: an argument has a wrong shape, there is no plan, the motion is over, or, in the first cycle,
-                the goal is outside the training's region or the arm is not at rest at the start posture.
+            BundleError: an argument has a wrong shape, the plan is missing, the motion is over, the first goal is
+                outside the training's region, or the motion does not begin at rest at the start posture.
         """
         if self.done:
             raise BundleError(f"the motion is over, {self.driver.stopping}: call reset before the next one")
@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Raise BundleError for a start or first goal outside the training's region; stop the arm at a later one."""
+        """Raise BundleError if start or first goal is outside the training's region; a later goal stops the arm."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)
@@ -207,7 +207,7 @@ class Runtime:
     def _look(
         self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray | None
     ) -> dict[str, np.ndarray]:
-        """Return {name: values} from which `observe` makes the observation; call `model.place(q)` first."""
+        """Return {name: values}, the input of `observe`; call `model.place(q)` before this function."""
         ee, jacobian = self._model.hand()
         made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort, "tau_J_d": tau_J_d}
         if self._follower is not None:
@@ -231,10 +231,10 @@ class Runtime:
         return self._policy.run(None, {"observation": observation[None]})[0][0].astype(float)
 
     def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the plan of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2. Call it between motions.
+        """Return the plan of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2; call only between motions.
 
-        Rows are one control step apart. The motion must begin and end at rest. The first `steps` + 1 rows are the
-        path; the rows after it are those that the policy previews at the path's end.
+        The time between two rows is one control step. The motion must begin and end at rest. The policy follows the
+        first `steps` + 1 rows. The policy also observes some later rows; near the end, these are the additional rows.
 
         Raises:
             BundleError: the policy's goals are points or plans on a surface, or the motion has a wrong shape.

@@ -1,8 +1,8 @@
-"""Check and follow plans on a surface, for policies that press and wipe; training uses tasks/surface_task.py instead.
+"""Check and follow plans on a surface, for policies that press or wipe; training uses tasks/surface_task.py instead.
 
-A plan's row for a control step contains the path's point on the nominal plane, the plane's normal, the target's depth
-below this point, the desired force, the path's velocity, the start posture and the controller's setpoint. This module
-imports only NumPy and modules that `r2s export` copies with it into r2s_runtime.py.
+Each row of a plan describes one control step: a point on the nominal plane, the plane's normal, the target's depth
+below this point, the desired force, the path's velocity, the start posture and the controller's setpoint.
+This module imports only NumPy and modules that `r2s export` also copies into r2s_runtime.py.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from r2s.export.law import BundleError, Model
 from r2s.export.plan import NO_PLAN, finite_plan
 
 WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
-NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and its position in the plan
+NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and the target in the plan's first row
 ROUNDING = 1e-6  # m and N, tolerance with which a plan is compared with the training's ranges
 
 
@@ -27,7 +27,7 @@ def columns_of(n: int, setpoints: int) -> dict[str, list[int]]:
 
 
 def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError if a plan leaves the training's plane, area or force range, or its start posture is wrong."""
+    """Raise BundleError if a plan leaves the training's plane, area or force range, or has a wrong start posture."""
     goal = contract["goal"]
     at, own, trained = goal["columns"], contract["law"]["joint"], goal["trained"]
     place, normal, depth, force, q = (plan[:, slice(*at[k])] for k in ("place", "normal", "depth", "force", "q"))
@@ -62,10 +62,10 @@ LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # keys of the law, and 
 
 
 class SurfaceFollower:
-    """Follow a plan on a surface: return the observation sources and the controller's setpoint for each control step.
+    """Follow a plan on a surface; a call returns a control step's observation values and the controller's setpoint.
 
     Args:
-        contract: contract with plans on a surface as goals. control, model: controller (not used) and arm model.
+        contract: contract with plans on a surface as goals. control: not used. model: the arm's `Model`.
     """
 
     def __init__(self, contract: dict[str, Any], control: Control, model: Model):
@@ -77,7 +77,7 @@ class SurfaceFollower:
         self._plan = np.zeros((0, self._shape[1]))
 
     def take(self, plan: Any) -> None:
-        """Store the next motion's plan; raise BundleError if it is missing, not finite, or of a wrong shape."""
+        """Store the next motion's plan; raise BundleError if the plan is missing, not finite, or of a wrong shape."""
         self._plan = finite_plan(plan, self._shape)
 
     @property
@@ -90,10 +90,10 @@ class SurfaceFollower:
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
         """Return {name: values} for the observation of a control step, and the controller's `setpoint`.
 
-        After the last step the target stays at the end of the plan.
+        After the last step the target stays at the end of the plan. Call `model.place(q)` before this function.
 
         Args:
-            step: control step, from 0. seen: q, dq (n,) rad, rad/s, tau_J_d (n,) Nm; call `model.place(q)` before.
+            step: number of the control step, from 0. seen: measured q, dq (n,) rad, rad/s, tau_J_d (n,) Nm.
             limited: share of the last control period in which the safety filter changed the command.
         """
         now = self._plan[min(step, self._steps)]

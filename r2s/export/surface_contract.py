@@ -17,7 +17,7 @@ from r2s.tasks.surface_task import REGULAR, START, SurfaceTask
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
-    """Return the plans (k, steps + 1, columns) for k goals (k, ...) that the task drew."""
+    """Return the plans (k, steps + 1, columns) for the rows of `goals`, k random goals of the task."""
     control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
     none, starts, out = np.zeros((len(t), 3)), np.zeros((len(t), robot.n)), []
     for goal in goals:
@@ -52,9 +52,9 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
 
 
 def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return the start posture, rad, of an example plan, and each joint's allowed deviation from a plan's start.
+    """Return an example plan's start posture, rad, and the joints' allowed deviation from a plan's start posture.
 
-    If no start angle deviates by more, the tip certainly starts above the surface.
+    If no joint deviates by more than the allowed deviation, the tip starts above the surface.
     """
     q = task.goals(robot, np.random.default_rng(0), 1)[0, START : START + robot.n]
     lever = np.abs(task.plane(robot)[1] @ Tip(robot)(q)[1]).sum()

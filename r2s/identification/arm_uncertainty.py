@@ -30,27 +30,27 @@ class Arm:
 
 
 def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Return a correction factor (n,) for a payload's torque in each joint, and its standard deviation (n,).
+    """Return correction factors (n,) for a payload's joint torques, and the factors' standard deviations (n,).
 
     The torque of an unloaded arm determines only the product of sensor gain and masses. If the masses in the robot's
-    file are wrong, the estimated gains compensate this error, and the computed torque of a payload is wrong by the
-    same factor. Sensor gains are independent between joints, but all masses have the same relative error. The most
-    likely mass error minimizes the sum of squares of gains and mass error, divided by their standard deviations GAIN
-    and MASSES.
+    file are wrong, the gains compensate the mass error, and a payload's computed torque is wrong by the same factor.
+    Gain errors are independent between joints, with standard deviation GAIN; all masses have one relative error, with
+    standard deviation MASSES. The most likely mass error minimizes the sum of squares of gain errors and mass error,
+    each divided by its standard deviation.
     """
     space, n = arm.space, arm.robot.n
     if "gain" not in space.blocks or LINK[0] in space.blocks:
         return np.ones(n), np.zeros(n)
     at = space.where("gain")
     gain, sd = arm.x[at], np.zeros(n) if arm.samples is None else arm.samples[:, at].std(0)
-    seen = sd < 0.5 * GAIN  # the data do not determine the gains of the other joints
+    seen = sd < 0.5 * GAIN  # whether the data determine a joint's gain
     information = seen.sum() / GAIN**2 + 1.0 / MASSES**2
     shift = -gain[seen].sum() / GAIN**2 / information
     return np.where(seen, 1.0 + shift / (1.0 + gain), 1.0), np.where(seen, information**-0.5 / (1.0 + gain), 0.0)
 
 
 def sliding_sign(torque: TorqueResidual) -> np.ndarray:
-    """Return the sign of friction (F, n) at F instants of a motion; it changes smoothly if joints may rest."""
+    """Return the sign of friction (F, n) at F instants of a motion; if joints may rest, the sign changes smoothly."""
     if torque.space.nominal.family.has_memory:
         return torque.motion.bristle
     dq = torque.motion.friction_dq
@@ -60,12 +60,12 @@ def sliding_sign(torque: TorqueResidual) -> np.ndarray:
 def arm_directions(
     torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
 ) -> np.ndarray:
-    """Return the residual's change (T, n, r) Nm due to one standard deviation of each of r independent arm errors.
+    """Return the residual's change (T, n, r) Nm if one of r independent arm errors grows by a standard deviation.
 
     Args:
-        torque: the residual. x: (P,) parameters of the arm. samples: (S, P), posterior draws of x, or None.
-        friction_drift: standard deviation of friction's change since the calibration, as a share of each joint's
-            friction. offset_drift: (n,) Nm, standard deviation of the offset's change.
+        torque: residual of the joint torque. x: (P,) parameters of the arm.
+        samples: (S, P), posterior draws of x, or None. offset_drift: (n,) Nm, standard deviation of offset drift.
+        friction_drift: standard deviation of friction drift since the calibration, as a share of joint friction.
     """
     d, n = torque.space.dynamics(x), torque.space.n
     friction = torque.motion.filtered(d.friction(torque.motion.friction_dq, sliding_sign(torque)))

@@ -1,8 +1,8 @@
 """Base parameters: the fewest combinations of inertial parameters on which joint torque depends.
 
-Torque is linear in ten standard parameters per link and one per rotor, but many act only in combination. The
-regressor has a column per parameter. A QR decomposition of the regressor at random states, without pivoting, selects
-the first independent columns; the others are regrouped with these (Gautier, J. Robotic Systems 8(4), 1991).
+Torque is linear in ten standard parameters per link and one per rotor, but many parameters act only in combination.
+A QR decomposition without pivoting, of the regressor at random states, selects the first independent columns (one per
+parameter); the dependent columns are regrouped with these (Gautier, J. Robotic Systems 8(4), 1991).
 """
 
 from typing import NamedTuple
@@ -17,14 +17,14 @@ from r2s.physics.robot import Robot
 
 STANDARD = ("mass", "mx", "my", "mz", "xx", "yy", "zz", "xy", "xz", "yz")  # of a link, about its origin
 UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
-ORDER = (*range(4, 10), 1, 2, 3, 0)  # within a link: the mass comes last, so it is regrouped first
+ORDER = (*range(4, 10), 1, 2, 3, 0)  # order of a link's parameters; the mass is last, so it is regrouped first
 DEPENDENT, NONE = 1e-9, 1e-9  # relative size below which a column is dependent, and a coefficient is set to 0
 
 
 class BaseParameters(NamedTuple):
-    """K base parameters: `matrix` (K, 10 n + n) times the standard parameters of links and rotors.
+    """Base parameters: `matrix` (K, 10 n + n) maps standard parameters of links and rotors to K base parameters.
 
-    names: (K,), the first parameter of each combination. units: (K,). combinations: (K,), as "zz[2] + 0.1 my[3]".
+    names, units, combinations: (K,), first term, unit and formula, such as "zz[2] + 0.1 my[3]", of each parameter.
     """
 
     names: list[str]
@@ -36,14 +36,14 @@ class BaseParameters(NamedTuple):
         """Return the values (..., K) of the base parameters for the dynamics of one or many arms."""
         links = LinkInertia(d.mass, d.com, d.inertia).standard()
         links = links.reshape(*links.shape[:-2], -1)
-        count = links.shape[-1]  # d may have many arms' rotors but one arm's links
+        count = links.shape[-1]  # `d` may contain the rotors of many arms but the links of one arm
         return links @ self.matrix[:, :count].T + d.armature @ self.matrix[:, count:].T
 
 
 def base_parameters(robot: Robot, rotors: bool) -> BaseParameters:
     """Return the base parameters of an arm.
 
-    rotors: whether the measured torque includes the torque on the rotors; link-side torque does not.
+    rotors: whether the measured torque includes the torque on the rotors; link-side torque excludes this torque.
     """
     n, rng = robot.n, np.random.default_rng(0)
     q = rng.uniform(*robot.q_range, (40 * n, n))
@@ -68,7 +68,7 @@ def base_parameters(robot: Robot, rotors: bool) -> BaseParameters:
 
 
 def base_table(space: ParameterSpace, found: ParameterEstimate, rotors: bool) -> pd.DataFrame:
-    """Return a row per base parameter: nominal and identified value, 95 % interval, unit and combination."""
+    """Return a table with a row per base parameter: nominal and identified value, 95 % interval, unit, formula."""
     base = base_parameters(space.robot, rotors)
     low, high = np.percentile(base.values(space.dynamics(found.samples)), [2.5, 97.5], axis=0)
     columns = {"parameter": base.names, "unit": base.units, "nominal": base.values(space.nominal)}
@@ -77,7 +77,7 @@ def base_table(space: ParameterSpace, found: ParameterEstimate, rotors: bool) ->
 
 
 def _combination(row: np.ndarray, names: list[str], first: int) -> str:
-    """Return a row of the matrix as text, "zz[2] + 0.1 my[3]", which begins with the name of column `first`."""
+    """Return a row of the matrix as text such as "zz[2] + 0.1 my[3]", with the parameter number `first` in front."""
     others = [k for k in np.flatnonzero(row).tolist() if k != first]
     parts = [f"{'-' if row[k] < 0 else '+'} {_factor(abs(row[k]))}{names[k]}" for k in others]
     return " ".join([names[first], *parts])

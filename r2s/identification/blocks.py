@@ -1,18 +1,18 @@
-"""Divide a recording into blocks with independent errors, the clusters of a posterior's covariance.
+"""Divide a recording into blocks with independent errors, which are the clusters in the posterior's covariance.
 
 Model error lasts longer than noise: torque ripple at low speed lasts seconds, and recurs when motion is repeated. So
-each block spans several correlation times of the residual. If residuals recur, a block joins repetitions.
+each block spans several correlation times of the residual. If residuals recur, repetitions belong to the same block.
 """
 
 import numpy as np
 
 BLOCK_S = 0.5  # s, shortest block
-BLOCKS = 20, 400  # fewest and most blocks in a recording: fewer make the scatter uncertain, more cost time
-LENGTH = 5.0  # correlation times per block: the block sum then has 90 % of a long block's variance per length
+BLOCKS = 20, 400  # fewest and most blocks; few blocks make the scatter uncertain, many blocks cost time
+LENGTH = 5.0  # correlation times per block: a block sum then has 90 % of the variance per length of a long block
 WINDOW = 5.0  # correlation times; beyond this lag, autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
 LONGEST_S = 60.0  # s, longest lag of the autocorrelation
-REPEATED = 0.3  # relative growth of variance due to repetition, above which repetitions are one block
-SAME = 0.1  # distance of a repetition's mean angle from the usual one, in standard deviations of the motion
+REPEATED = 0.3  # relative growth of variance due to repetition above which blocks join repetitions
+SAME = 0.1  # largest distance of a repetition's mean angle from the median, in standard deviations of the motion
 
 
 def blocks_of(
@@ -22,13 +22,13 @@ def blocks_of(
     residual: np.ndarray | None = None,
     shortest_s: float = BLOCK_S,
 ) -> np.ndarray:
-    """Return the block (T,) of each moment, numbered from 0 to B - 1.
+    """Return the number (T,) of the block to which each row belongs, from 0 to B - 1.
 
     Args:
-        t: (T,) s, rising within a trajectory. q: (T, n) rad. period: s, of a repeated motion; None: no repetition.
-        residual: (T, n), residual of a fit; None: blocks last `shortest_s` and repetitions have separate blocks.
+        t: (T,) s, rising within a trajectory. q: (T, n) rad, joint angles. period: s, period of the motion, or None.
+        residual: (T, n), residual of a fit; None: each block lasts `shortest_s`, and no block joins repetitions.
     """
-    run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of times that the clock has restarted
+    run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of the trajectory; the clock restarts in each
     steps = np.diff(t)[np.diff(run) == 0]
     step = float(np.median(steps)) if len(steps) else shortest_s
     seconds, visit, at = step * len(t), run, run
@@ -46,7 +46,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return blocks (T,) joined over the repetitions `visit` (T,), except where a repetition's q (T, n) differs."""
+    """Return block numbers (T,) that are the same in all repetitions `visit` (T,) unless q (T, n) rad differs."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -56,9 +56,9 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
-    """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,).
+    """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,) s.
 
-    The squared autocorrelation's integral bounds this time even for oscillating scores (residual times slope).
+    The integral of the squared autocorrelation bounds the correlation time even if residual times slope oscillates.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))
@@ -74,7 +74,7 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether residuals (T, n) at the same phase `at` (T,) are similar between repetitions `visit` (T,)."""
+    """Return whether residuals (T, n) at equal phases `at` (T,) are similar in different repetitions `visit` (T,)."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]
@@ -92,7 +92,7 @@ def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
 
 
 def _labels(*keys: np.ndarray) -> np.ndarray:
-    """Number the distinct combinations of keys, each (T,), from 0; return the number (T,) at each moment."""
+    """Return a number (T,) per row; rows have the same number if all `keys`, each (T,), are equal in these rows."""
     out = np.zeros(len(keys[0]), dtype=int)
     for key in keys:
         index = np.unique(key, return_inverse=True)[1]

@@ -1,4 +1,4 @@
-"""Check a recording before a fit: number of joints, limits, enough motion, damaged rows, units."""
+"""Check a recording before a fit: the number of joints, limits, amount of motion, damaged rows and units."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 SPIKE = 5.0  # times the limits of speed and torque: beyond any sensor noise
-NONSENSE = 1e9  # times the same limits: no wrong unit reaches this factor, and larger squares would overflow
+NONSENSE = 1e9  # times the limits of speed and torque: no wrong unit reaches this factor; larger squares overflow
 JUMP = 0.05  # rad, an allowed jump of an encoder
-MARGIN = 0.05  # rad by which a log may exceed the position limits, as happens at a limit
+MARGIN = 0.05  # rad by which a log may exceed the position limits, as can happen when an arm is at a limit
 LEAST_S = 1.0  # s, least duration of a recording
 
 
 def check_recording(robot: Robot, recording: Recording) -> Judged | None:
-    """Check a user's recording, and return what `check_units` measured.
+    """Check a user's recording, and return the result of `check_units`.
 
     Raises:
         UserError: the recording does not fit the arm (`check_motion`), is damaged or has wrong units.
@@ -39,7 +39,7 @@ def check_rate(cutoff_hz: float, recording: Recording) -> None:
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if the recording is of another arm, exceeds this arm's limits or hardly moves."""
+    """Raise UserError if the recording is from a different arm, exceeds `robot`'s limits or has little motion."""
     _check_joints(robot, recording, "the recording")
     moved = np.ptp(recording.q, axis=0)
     if moved.max() < MOVED or recording.duration < LEAST_S:
@@ -73,7 +73,7 @@ def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
 
 
 def check_ramps(robot: Robot, ramps: Ramps) -> None:
-    """Raise UserError if the ramps are of another arm, exceed this arm's limits or have other units."""
+    """Raise UserError if the ramps come from a different arm, exceed `robot`'s limits or are not in SI units."""
     _check_joints(robot, ramps.recording, "the ramps")
     most = np.abs(ramps.recording.tau).max(0)
     j = int((most / robot.tau_max).argmax())
@@ -85,7 +85,7 @@ def check_ramps(robot: Robot, ramps: Ramps) -> None:
 
 
 def _check_joints(robot: Robot, recording: Recording, what: str) -> None:
-    """Raise UserError if a recording, named `what`, has a wrong number of joints or exceeds the position limits."""
+    """Raise UserError if the recording `what` has a wrong number of joints or exceeds the position limits."""
     if recording.n_joints != robot.n:
         raise UserError(f"{what}: expected {robot.n} joints of {robot.name}, got {recording.n_joints}")
     out = np.maximum(robot.q_min - MARGIN - recording.q.min(0), recording.q.max(0) - robot.q_max - MARGIN)

@@ -1,8 +1,8 @@
 """Assess what each of several recordings adds to an identification, and whether one contradicts the others.
 
-Two further fits assess a recording: a fit to all other recordings, and a fit to this recording alone. Both start at
-the fit to all recordings and need only a few least-squares steps on torque. A recording's rows are weighted by its
-residual in the fit to it alone, because contradicting recordings would increase the residual of a common fit.
+Two further fits assess each recording: a fit without this recording, and a fit to this recording alone. These fits
+start from the fit to all recordings, so that few least-squares steps on torque suffice. The residual of a fit to one
+recording alone sets this recording's weights, because contradicting recordings increase the residual of a common fit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,24 +19,24 @@ from r2s.identification.search.levenberg_marquardt import minimize, normal_equat
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CONTRADICTS = 2.0  # ratio of sums of squares: one fit to all recordings, over a separate fit to one of them
-WORSE = 4.0  # ratio of a recording's RMSE, fitted alone, to the others'; above it the model does not fit
+CONTRADICTS = 2.0  # ratio of sums of squares: one fit to all recordings, over two fits with one recording apart
+WORSE = 4.0  # ratio of a recording's RMSE in a fit to it alone to the median of the other recordings' RMSE
 CARRIED = 0.5  # a body on the last link is reported if it explains this share of the squared left-out error
 LEAST_MASS = 0.01  # least mass of such a body, relative to the arm's mass
 ROUNDS = 3  # reweighted fits of each recording alone
-STEPS, FTOL = 10, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by less (relative)
+STEPS, FTOL = 10, 1e-3  # most Jacobians in a fit; a fit ends when a step reduces the cost by less than this share
 USED_S, RATE_HZ = 120.0, 50.0  # s, longest part of a recording that is compared; rows per second
 
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """Contribution of one recording to a fit; errors are torque RMSE on this recording.
+    """Contribution of one recording to a fit; each error is the torque RMSE on this recording.
 
     Attributes:
         label, torque, seconds: name, kind of torque and length of the recording. use: "training" or "validation".
         rmse: (n,) Nm, error of the fit to all recordings.
-        left_out: (n,) Nm, error of a fit to the other recordings. narrower: (P,) ratio of 95 % interval widths
-            without and with this recording. For validation, left_out and narrower are None.
+        left_out: (n,) Nm, error of a fit without this recording; None for a validation recording.
+        narrower: (P,), ratio of 95 % interval widths without and with this recording; None for validation.
         alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio of sums of squares, see
             CONTRADICTS; 1 for one recording. body_kg: mass on the last link that explains the contradiction, or nan.
     """
@@ -56,10 +56,10 @@ class Contribution:
 def contributions(
     found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
 ) -> list[Contribution]:
-    """Return the contribution of each recording, {label: recording} with one kind of torque, to the fit `found`."""
+    """Return each recording's contribution to the fit `found`; all recordings have the same kind of torque."""
     space, u = found.space, found.space.to_unit(found.x)
     r0, slope = found.prior_rows
-    flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # a flat prior has no row of its own
+    flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # the prior residual lacks rows for flat priors
     prior = np.concatenate([r0, np.zeros(len(u))]), np.concatenate([slope, flat])
     parts = [_torque(space, spread(r, USED_S), cutoff_hz) for r in recordings.values()]
     parts = [p.reweighted(found.x, fitted=True) for p in parts]
@@ -67,7 +67,7 @@ def contributions(
     for _ in range(ROUNDS):
         alone = [_fitted([p], u, prior) for p in parts]
         parts = [p.reweighted(space.from_unit(v), fitted=True) for p, v in zip(parts, alone, strict=True)]
-    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # assume as much information in unused parts
+    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # assume that unused parts inform equally
     information = [k * normal_equations(p.linearize(u))[1] for k, p in zip(more, parts, strict=True)]
     total = sum(information) + prior[1].T @ prior[1]
     width, square = np.sqrt(np.diag(np.linalg.inv(total))), _square(parts, _fitted(parts, u, prior))
@@ -91,7 +91,7 @@ def contributions(
 def validated(
     found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
 ) -> list[Contribution]:
-    """Return the contributions of validation recordings {label: recording}, which the fit did not use."""
+    """Return the contributions of validation recordings {label: recording}, which contain only the error `rmse`."""
     out = []
     for label, r in recordings.items():
         data = _torque(found.space, r, cutoff_hz)
@@ -105,12 +105,12 @@ def _torque(space: ParameterSpace, recording: Recording, cutoff_hz: float) -> To
 
 
 def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
-    """Return the sum of squares of all residuals in `parts` at u (P,)."""
+    """Return the sum of squares of the residuals `parts` at the unit-cube parameters u (P,)."""
     return sum(float((p(p.space.from_unit(u)[None]) ** 2).sum()) for p in parts)
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the fit (P,) to the residuals `parts`, started at u (P,). prior: residual (B,) at u and its Jacobian."""
+    """Return the fit (P,) to the residuals `parts`, starting at u (P,). prior: residual (B,) at u and Jacobian."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:
@@ -132,7 +132,7 @@ def _rmse(error: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
-    """Return the additional mass on the last link, kg, that explains an error (T, n) Nm, or nan if none does."""
+    """Return the additional mass on the last link, kg, that explains a torque error (T, n) Nm; nan: no mass does."""
     some = data.seen.ravel()
     y = data.rigid_body_of_last_link()
     rows, tau = y.reshape(-1, y.shape[-1])[some], -error.ravel()[some]
@@ -142,7 +142,7 @@ def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
 
 
 def contradictions(parts: Sequence[Contribution]) -> list[str]:
-    """Return a message about a recording that contradicts the others or that the model fits far worse, or []."""
+    """Return a message, if any, about a recording that contradicts the others or that the model fits far worse."""
     trained = [p for p in parts if p.left_out is not None and p.alone is not None]
     if len(trained) < 2:
         return []

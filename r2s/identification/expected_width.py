@@ -1,8 +1,8 @@
 """Predict the widths of the 95 % intervals of an identification before it runs.
 
 A few least-squares steps on torque, with all model terms, estimate the parameters and the noise. `posterior`
-linearizes the model at these parameters and computes the widths. The slow parts of an identification are skipped:
-comparison of friction families, selection of terms, convergence, replays and breakaway torques.
+linearizes the model at these estimates and computes the widths. The prediction omits slow parts of an identification,
+namely the choice of friction family and terms, iteration to convergence, replays and breakaway torques.
 """
 
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ USED_S = 120.0  # s, longest part of a recording that is used
 
 @dataclass(frozen=True)
 class ExpectedWidths:
-    """Expected widths of the 95 % intervals.
+    """Expected widths of the 95 % intervals of P parameters.
 
     Attributes:
-        space: the parameters. width: (P,) SI units. share: (P,) ratio of posterior to prior standard deviation.
-        identifiable: (P,) whether the data will determine the value, by the same rule as in `conclude`.
-        late: s, time shift and its standard deviation: by how much measured or motor torque is later than the motion,
-            or the motion is later than commands.
+        space: parameter space. width: (P,), expected widths, SI units. share: (P,), posterior sigma over prior sigma.
+        identifiable: (P,), whether the data will determine each parameter, by the rule of `conclude`.
+        late: s, a time shift and its standard deviation. If the recording has commanded torque, the motion is later
+            than the torque by this shift; measured or motor torque is later than the motion by this shift.
     """
 
     space: ParameterSpace
@@ -48,7 +48,7 @@ class ExpectedWidths:
 def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> Problem:
     """Return the torque problem that an identification with these settings solves, with all terms of the settings.
 
-    For family=auto, the problem has the friction family of the nominal arm.
+    If the setting `family` is "auto", use the friction family of the nominal arm.
     """
     if settings.family != "auto":
         nominal = with_family(nominal, settings.family)
@@ -58,10 +58,10 @@ def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settin
 
 
 def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> ExpectedWidths:
-    """Return the widths to expect from an identification of this recording.
+    """Return the expected widths of an identification from this recording.
 
     Raises:
-        UserError: no trajectory is long enough, or a setting does not fit the arm.
+        UserError: each trajectory in the recording is too short, or a setting does not fit the arm.
     """
     used = spread(recording, USED_S)
     problem = torque_problem(robot, nominal, used, settings)
@@ -71,7 +71,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
     sure = posterior(problem, u, settings.seed)
     found = conclude(problem, space, sure._asdict(), history=pd.DataFrame(), families={}).found
     share = np.minimum(sure.steps.std(0) / problem.prior_width, 1.0)
-    # assume that unused rows have as much information as used ones
+    # assume that unused rows contain as much information as used rows
     more = recording.duration / used.duration
     less = 1.0 / np.sqrt(share**2 + more * (1.0 - share**2))
     seen = found.identifiable | ((more > 1.0) & (Z_95 * less * share < 1.0 / SHARPER))
@@ -84,7 +84,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
 
 
 def _lateness(problem: Problem, u: np.ndarray) -> tuple[float, float]:
-    """Return the time shift of tau, s, that the parameters do not explain, and the shift's standard deviation, s."""
+    """Return the time shift, s, between torque and motion that the parameters do not explain, and its sigma, s."""
     data = problem.torque_data
     r, j = data(problem.space.from_unit(u[None]))[0], data.jacobian(u)
     change = (data.motion.command(0.0, 0.0) - data.motion.command(SIM_DT, 0.0)) / SIM_DT

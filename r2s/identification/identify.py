@@ -1,7 +1,7 @@
 """Real2Sim: estimate the parameters with which the simulated arm reproduces a recording.
 
-`identify` runs STEPS in order. Each step maps an immutable `State` to the next one. The paper's algorithm corresponds
-to search=ga on the replay residual of its eq. (8).
+`identify` runs STEPS in order. Each step computes a new `State` from the previous one. The paper's algorithm
+corresponds to search=ga on the replay residual, eq. (8) of the paper.
 """
 
 import json
@@ -56,19 +56,19 @@ Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
 
 class History:
-    """Progress rows of an identification. Each step stores its progress rows and its arrays for a resumed run."""
+    """Progress rows of an identification, stored with each step's arrays so that an interrupted run can resume."""
 
     def __init__(self, report: Report, memo: Memo):
         self.rows: list[dict] = []
         self._report, self._memo, self._began = report, memo, time.perf_counter()
 
     def add(self, row: dict) -> None:
-        """Append a row, with the seconds since the start, and report it."""
+        """Append a progress row, with the seconds since the start, and report the row."""
         self.rows.append(row | {"seconds": time.perf_counter() - self._began})
         self._report(row)
 
     def step(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays that `make` computes, or those that an interrupted run has stored under `name`."""
+        """Return the arrays that an interrupted run stored under `name`, else the arrays that `make` computes."""
         before = len(self.rows)
         done = self._memo(name, lambda: make() | {"history": json.dumps(self.rows[before:])})
         if len(self.rows) == before:
@@ -78,17 +78,17 @@ class History:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Input and result of each step of an identification.
+    """Intermediate result of an identification: every step reads a `State` and returns a new `State`.
 
     Attributes:
         robot, nominal, recording, searches, settings, ramps: see `identify`. `select_family` sets nominal.family.
-        prior: {parameter: standard deviation, SI units}. terms: model terms that are estimated besides friction.
-        families: {family: error of held-out torque}; empty if the user chose the family.
-        space: the parameter space. `fit_breakaway` adds breakaway commands, `fit_stiction` the stiction model.
+        prior: {parameter: prior standard deviation in SI units}. terms: model terms to estimate besides friction.
+        families: {family: prediction error of held-out torque}; empty if the user chose the friction family.
+        space: the parameter space; `fit_breakaway` adds breakaway commands, and `fit_stiction` a stiction model.
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
         edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
-            sliding (only Stribeck families).
-        refused: whether `fit` discarded a replay fit. dynamics: the fitted arm with its breakaway torques.
+            sliding, only for Stribeck families.
+        refused: whether `fit` discarded the replay fit. dynamics: the fitted arm with its breakaway torques.
     """
 
     robot: Robot
@@ -111,26 +111,26 @@ class State:
 
     @property
     def commanded(self) -> bool:
-        """Whether the recorded torque is a command. Replays, delay and breakaway require commands."""
+        """Whether the recorded torque is the command; replays, delay and breakaway torques require commands."""
         return self.recording.torque == "commanded"
 
     @property
     def slowest(self) -> float:
-        """Joint speed in rad/s above which torque rows are used."""
+        """Speed in rad/s that a joint must exceed in every row of the torque residual."""
         return STANDSTILL if self.commanded else 0.0
 
     @property
     def cross_validation(self) -> CrossValidation:
-        """The cross-validation, with its data and settings, that selects friction family and terms."""
+        """The cross-validation that selects the friction family and the terms."""
         s, data = self.settings, (self.robot, self.nominal, spread(self.recording, SELECTED_S))
         return CrossValidation(*data, s.bounds, self.prior, s.folds, s.cutoff_hz, self.history.add, s.stated)
 
     def fitted(self) -> Dynamics:
-        """Return the dynamics at the solution u."""
+        """Return the dynamics of the fitted arm."""
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Return an arm's motion after breakaway, or None if its friction has no Stribeck effect or has bristles."""
+        """Return the arm's motion after breakaway; None without ramps, without Stribeck effect, or with bristles."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)
@@ -153,10 +153,10 @@ def identify(
         robot: the arm. nominal: start of the searches, and values of all parameters that are not estimated.
         recording: the training motion; only commanded torque allows replay residuals.
         searches: one or more searches; each starts at the solution of the previous one.
-        settings: parameters, bounds, prior, and how residuals are computed.
-        ramps: recordings of the breakaway protocol; without them, a scan on the recording finds breakaway torques.
+        settings: options of the identification, see settings.py.
+        ramps: recordings of the breakaway protocol; without ramps, replays of `recording` find breakaway torques.
         report: function that is called with a row of progress after every step or generation.
-        memo: called as memo(name, make) for a step; returns make(), the step's arrays, or arrays stored under `name`.
+        memo: function memo(name, make) that returns the arrays stored under `name`, else the result of make().
 
     Raises:
         UserError: the recording does not fit the arm or hardly moves.
@@ -174,7 +174,7 @@ def identify(
 
 
 def select_family(s: State) -> State:
-    """Set the friction family: the user's, or with family=auto the one that cross-validation chooses."""
+    """Set the user's friction family or, for family=auto, the family that cross-validation selects."""
     family, families = s.settings.family, {}
     if family == "auto":
         found = s.history.step("family", lambda: compare_families(s.cross_validation, s.terms, s.slowest))
@@ -185,7 +185,7 @@ def select_family(s: State) -> State:
 
 
 def settle_lateness(s: State) -> State:
-    """Choose whether to correct the lateness of link-side torque and of dq; an uncorrected delay is 0."""
+    """Decide whether to correct the lateness of link-side torque and of dq; without a delay, `signal_delay` is 0."""
     nominal = replace(s.nominal, late_alike=False)
     if s.recording.torque != "measured" or DELAY in s.settings.stated:
         return replace(s, nominal=nominal)
@@ -197,8 +197,8 @@ def settle_lateness(s: State) -> State:
 
 
 def add_candidate_terms(s: State) -> State:
-    """Add the candidate terms that improve held-out prediction."""
-    absent = {*optional_friction()} - {*s.nominal.family.optional}  # friction terms of other families
+    """Add the candidate terms that improve the prediction of held-out torque."""
+    absent = {*optional_friction()} - {*s.nominal.family.optional}  # friction terms that the family lacks
     candidates = [name for name in s.settings.candidate_terms if name not in absent]
     if not candidates:
         return s
@@ -208,7 +208,7 @@ def add_candidate_terms(s: State) -> State:
 
 
 def prune_terms(s: State) -> State:
-    """Remove the prunable terms that held-out prediction does not need."""
+    """Remove the prunable terms that are not necessary to predict held-out torque."""
     prunable = [name for name in s.settings.prunable_terms if name in s.terms]
     if not prunable:
         return s
@@ -248,7 +248,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the prior of values in `space` from the user's statements, else from an earlier identification."""
+    """Return the prior that the user states or, for all remaining values, that an earlier identification yields."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated
@@ -284,7 +284,7 @@ def reread_ramps(s: State) -> State:
 
 
 def fit_presliding(s: State) -> State:
-    """Estimate the presliding distance from replays if a friction family with memory was fitted to torque."""
+    """Estimate the presliding distance from replays, after a torque fit of a friction family with memory."""
     if s.problem.uses_replays or not s.commanded or PRESLIDING not in s.space.blocks:
         return s
     how, torque_data = s.settings, s.problem.torque_data
@@ -297,7 +297,7 @@ def fit_presliding(s: State) -> State:
 
 
 def reweight(s: State) -> State:
-    """Repeat a local last search with rows weighted by its residual, and decide whether the data need a lag."""
+    """Repeat the last search, if it is local, with weights from the residual; decide whether to estimate a lag."""
     search = s.searches[-1]
     if not search.local:
         return s
@@ -317,7 +317,7 @@ def reweight(s: State) -> State:
 
 
 def fit_breakaway(s: State) -> State:
-    """Compute breakaway torques: the ramps' commands plus the offset and other torques of the fitted arm."""
+    """Compute breakaway torques: commands at release plus offset, drag and gravity error of the fitted arm."""
     arm, space = s.fitted(), s.space
     if not s.commanded or s.ramps is None:
         return replace(s, dynamics=arm)
@@ -328,7 +328,7 @@ def fit_breakaway(s: State) -> State:
     arm = replace(space, breakaway_command=command).dynamics(space.from_unit(s.u))
     breakaway = StaticFriction(s.robot, s.ramps, edges).breakaway(arm)
     # a direction may lack a usable ramp, for example if the joint slid before its command rose. Stiction is similar
-    # in both directions, so the other direction's value is used
+    # in both directions, so r2s uses the value of the opposite direction
     blind = (edges.count == 0) & (edges.held == 0) & (edges.count[:, ::-1] > 0)
     breakaway = np.where(blind, -breakaway[:, ::-1], breakaway)
     command = np.where((edges.count > 0) | blind, breakaway - arm.offset[:, None], command)
@@ -337,7 +337,7 @@ def fit_breakaway(s: State) -> State:
 
 
 def fit_stiction(s: State) -> State:
-    """Choose the stiction model; without ramps, also scan for the breakaway torques."""
+    """Choose the stiction model and, if no ramps were recorded, scan for the breakaway torques."""
     how, ramped = s.settings, s.ramps is not None
     if not s.commanded or s.nominal.family.has_memory or not (ramped or how.breakaway):
         return s
@@ -358,16 +358,16 @@ STEPS: tuple[Callable[[State], State], ...] = (
 def _run(
     s: State, name: str, search: Search, problem: Problem, u: np.ndarray, report: Report | None = None
 ) -> tuple[np.ndarray, Problem]:
-    """Run a search; return its solution and the problem, with new torque weights if the search fits torque."""
+    """Return the solution of a search, and the problem, which is reweighted if the search fits torque."""
     v = np.asarray(s.history.step(name, lambda: {"u": search(problem, u, report or s.history.add)})["u"])
     return v, problem.torque_reweighted(v) if fits_torque(search) else problem
 
 
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
-    """Return whether values v (P,) explain the torque clearly worse than u (P,), which was fitted to torque.
+    """Return whether values v (P,) explain the torque clearly worse than values u (P,) that were fitted to torque.
 
-    The estimation error of a correct v raises the sum of squares by about P. The sum of squares has the relative
-    error ALIKE, because the number of independent rows is uncertain.
+    If v is correct, its estimation error still raises the sum of squares by about P. The sum of squares has the
+    relative uncertainty ALIKE, because the number of independent rows is uncertain.
     """
     fitted = problem.on_torque.cost(u)
     rise = problem.on_torque.cost(v) - fitted
@@ -375,11 +375,11 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return the solution u (P,) of a local search that estimates the lag u[at] only if the data need it.
+    """Return the solution u (P,) of a local search, with the lag u[at] estimated only if the data require a lag.
 
-    If torque changes slowly, a short lag acts like a delay. The data need the lag if estimating it lowers the cost by
-    more than the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). Both costs omit the
-    block that favors the lag most, because the rows of a block are correlated.
+    If torque changes slowly, a short lag acts like a delay. The data require a lag if it lowers the cost by more than
+    the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The comparison omits the block
+    that favors the lag most, because the rows of a block are correlated.
     """
     having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
     u = start.copy()

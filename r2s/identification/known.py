@@ -1,8 +1,8 @@
 """Represent prior knowledge of an arm's parameters as a normal distribution of named values.
 
-The source is an earlier identification, recordings of another kind of torque, or the user (stated.py). Between two
-dates, friction and offsets drift by w ~ N(0, drift^2), so that x_now = x_then + w. The prior has the covariance of
-the earlier posterior plus diag(drift^2) (the prediction step of a Kalman filter; Kalman 1960). r2s reports an
+Prior knowledge comes from an earlier identification, of any kind of torque, or from the user (stated.py). Between two
+dates, friction and offsets x drift by w ~ N(0, drift^2), so x_now = x_then + w. The prior has the covariance of the
+earlier posterior plus diag(drift^2), as in the prediction step of a Kalman filter (Kalman 1960). r2s reports an
 estimate of the drift w from the data of both dates.
 """
 
@@ -18,7 +18,7 @@ from r2s.identification.posterior import Z_95
 
 BODY = (*OF_LINKS, *PAYLOAD)  # shared by all kinds of torque; friction, offsets and gains differ between kinds
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # parameters that drift besides those of the friction law
-FLOOR = 1e-4  # least standard deviation over `ParameterSpace.usual`, since all draws may be clipped at a bound
+FLOOR = 1e-4  # least standard deviation, relative to `ParameterSpace.usual`; all draws may be clipped at a bound
 FAR = 5.0  # standard deviations in the worst of about thirty directions, above which prior and data disagree
 
 
@@ -27,8 +27,8 @@ class Known:
     """A normal distribution of named values, which a problem uses as an `ExtraResidual`.
 
     Attributes:
-        names: K names such as coulomb[2]. mean: (K,) in SI units, or the logarithm of logarithmic parameters.
-        covariance: (K, K), drift included. drift: (K,) standard deviation of the drift since the earlier date, or 0.
+        names: names of the K values, such as coulomb[2]. mean: (K,) mean values in SI units, or their logarithms.
+        covariance: (K, K), with drift. drift: (K,) standard deviation of the drift between the two dates.
     """
 
     names: tuple[str, ...]
@@ -38,10 +38,10 @@ class Known:
 
     @staticmethod
     def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
-        """Return the prior that an identification with values x (P,) and posterior draws (S, P) yields.
+        """Convert the values x (P,) and posterior draws (S, P) of an earlier identification into a prior.
 
-        drift: standard deviation of the change of friction, offsets and drag since that identification, relative to
-            the larger of the value and its standard deviation among arms (`ParameterSpace.usual`).
+        drift: standard deviation of the change of friction, offsets and drag since the earlier identification,
+            relative to the value or, if larger, to its standard deviation among arms (`ParameterSpace.usual`).
         """
         names, usual = space.names, space.usual
         mean, least = coordinates(names, x), np.where(np.isfinite(usual), usual, 0.0)
@@ -54,13 +54,13 @@ class Known:
         return Known(tuple(names), mean, covariance + np.diag(change**2), change)
 
     def where(self, kept: Callable[[str], bool]) -> "Known":
-        """Return the marginal distribution of the values whose names satisfy `kept`."""
+        """Return the marginal distribution of the values for whose names `kept` returns True."""
         at = [k for k, name in enumerate(self.names) if kept(name)]
         covariance = self.covariance[np.ix_(at, at)]
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return the joint distribution with the independent `other`, which replaces values that both contain."""
+        """Return the joint distribution with the independent prior `other`, which replaces common values."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)
@@ -118,7 +118,7 @@ def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.
     Journal 3(8), 1965) yields w ~ N(G (x - m), G V G^T + P - P S^-1 P), where G = Q S^-1.
 
     Args:
-        known: prior of an identification. space, x, samples: parameters, values (P,) and posterior draws (S, P).
+        known: prior from the earlier date. space, x, samples: parameters, values (P,) and posterior draws (S, P) now.
     """
     known = known.where(lambda name: name in space.names and name not in space.fixed)
     at = [space.names.index(name) for name in known.names]

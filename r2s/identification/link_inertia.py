@@ -53,7 +53,7 @@ def links(robot: Robot, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def log_cholesky(robot: Robot, dynamics: Dynamics) -> np.ndarray:
-    """Return theta (n, 10) of the links of `dynamics`: the inverse of `links`."""
+    """Return the log-Cholesky parameters theta (n, 10) of the links of `dynamics`, relative to nominal links."""
     base = _upper(pseudo_inertia(robot.mass, robot.com, robot.inertia))
     v = np.linalg.solve(base, _upper(pseudo_inertia(dynamics.mass, dynamics.com, dynamics.inertia)))
     scale, v = v[..., 3, 3], v / v[..., 3:, 3:]

@@ -42,7 +42,7 @@ def save_parameters(
 
     Args:
         path: the parameters.yaml to write; posterior.npz, which dr=identified reads, is written to the same folder.
-        space, found: the parameters and their estimate.
+        space: the parameters. found: estimated values, intervals and posterior draws of the parameters.
         source: origin of the estimate (recording, search, run). note: further entries of parameters.yaml.
     """
     robot, fixed = space.robot, space.nominal
@@ -65,7 +65,7 @@ def save_parameters(
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in FIXED}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
-    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; `load_parameters` skips it
+    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for users; not loaded
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
     with atomic_write(path.with_name("posterior.npz")) as part:  # first, so parameters.yaml never exists alone
@@ -79,8 +79,8 @@ def load_parameters(
 ) -> tuple[ParameterSpace, np.ndarray]:
     """Return the parameter space and its values x (P,) from a run folder or a parameters.yaml.
 
-    trust: modules from which a friction family may be imported, besides those that are imported already. option: the
-    option through which the user named the folder, for error messages.
+    trust: modules that r2s may import for a friction family, besides modules that are imported already. option: the
+    user's option that names the folder, for error messages.
 
     Raises:
         UserError: the file is missing or damaged, belongs to another robot, or names an untrusted friction family.
@@ -103,7 +103,7 @@ def load_parameters(
 
 
 def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
-    """Parse the document for `load_parameters`; a malformed one raises KeyError, ValueError or a similar error."""
+    """Parse parameters.yaml; a malformed document raises an error that `load_parameters` catches."""
     found, fixed = document["parameters"], document["fixed"]
 
     def numbers(name: str, value: Any, count: int) -> np.ndarray:
@@ -148,7 +148,7 @@ def load_posterior(folder: str | Path, space: ParameterSpace, option: str = "dr=
     """Return the posterior draws (S, P) of the parameters in `space` from posterior.npz beside parameters.yaml.
 
     Raises:
-        UserError: posterior.npz is missing, damaged, or contains other parameters.
+        UserError: posterior.npz is missing or damaged, or its parameters differ from those of `space`.
     """
     path = Path(folder)
     path = (path if path.is_dir() else path.parent) / "posterior.npz"

@@ -1,9 +1,9 @@
 """The parameter vector of an identification: blocks, bounds, map to the unit cube, and the dynamics it describes.
 
-A block is one parameter: a value per joint or link (a friction coefficient, offset, inertia), or one value for the
-whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are mapped by
-their logarithm. Inertia has two parametrizations: `inertia_scale`, one factor per link as in the paper (Table III:
-NEW is a multiple of OLD), and `link_...`, the ten log-Cholesky parameters of a link (link_inertia.py).
+A block contains one parameter: a value per joint or link (a friction coefficient, offset, inertia), or one value for
+the whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are mapped
+by their logarithm. Link inertia has two parametrizations: `inertia_scale` is one factor per link (paper, Table III),
+and `link_...` are the ten log-Cholesky parameters of a link (link_inertia.py).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s", "signal_delay": "s"}
 OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
 TIMING = ("delay", "lag", "signal_delay")
-# standard deviation of a parameter among arms, by unit; torque-like ones: per Nm of tau_max; logarithms: always 1
+# standard deviation of a parameter among arms, by unit; torque-like parameters: per Nm of tau_max; logarithms: 1
 USUAL = {"Nm": 0.02, "Nm s/rad": 0.02, "kg m^2": 0.002, "kg": 0.02, "1": 0.1, "rad/s": 0.03, "m": 0.1, "s": 2e-3}
 WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
@@ -49,7 +49,7 @@ def torque_like() -> set[str]:
 
 
 def sizes(largest: np.ndarray) -> dict[str, Any]:
-    """Return {parameter: scale}: `largest` (n,) Nm for torque-like parameters, max(largest) for the payload mass."""
+    """Return the scales of torque-like parameters, `largest` (n,) Nm, and of the payload mass, max(largest)."""
     return dict.fromkeys(torque_like(), largest) | {PAYLOAD[0]: largest.max()}
 
 
@@ -58,13 +58,13 @@ class ParameterSpace:
     """The space of the parameter vector x (P,) that an identification estimates.
 
     Attributes:
-        blocks: parameter names in the order of x; each has n values, or one for the whole arm.
+        blocks: parameter names in the order of x; a parameter has n values, or one value for the whole arm.
         n: number of joints.
         lower, upper: (P,) bounds in SI units.
         nominal: dynamics at which a search starts; parameters that are not in x have their nominal value.
         robot: the arm; inertia blocks are relative to its links.
-        breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. A breakaway torque is
-            this command plus the offset. If the command is unknown (NaN or None), the breakaway torque is nominal.
+        breakaway_command: (n, 2) Nm, commands in ramps at which resting joints broke away. A breakaway torque is a
+            breakaway command plus the offset, or nominal if the command is unknown (NaN or None).
         fixed: names of values that the user fixed; their bounds are too narrow for a search (stated.py).
     """
 
@@ -102,7 +102,7 @@ class ParameterSpace:
         return np.clip(x, self.lower, self.upper)
 
     def block(self, x: np.ndarray, name: str) -> np.ndarray:
-        """Return the values of one block of x (..., P): (..., n), or (..., 1) for the whole arm."""
+        """Return the values of a parameter in x (..., P): (..., n), or (..., 1) for a parameter of the whole arm."""
         return x[..., self.where(name)]
 
     def where(self, name: str) -> np.ndarray:
@@ -131,12 +131,12 @@ class ParameterSpace:
 
     @property
     def width(self) -> np.ndarray:
-        """(P,) upper minus lower bound in SI units; for logarithmic coordinates, difference of the logarithms."""
+        """(P,) upper minus lower bound in SI units; for logarithmic coordinates, log(upper) minus log(lower)."""
         return self._warp(self.upper) - self._warp(self.lower)
 
     @property
     def usual(self) -> np.ndarray:
-        """(P,) standard deviation of each value among arms, in the units of `width`; inf if USUAL lacks its unit."""
+        """(P,) standard deviation of each value among arms, in the units of `width`; inf for units not in USUAL."""
         unit, size = units(), sizes(self.robot.tau_max)
         usual = {b: USUAL.get(unit[b], np.inf) * size.get(b, 1.0) for b in self.blocks}
         return np.where(self._log, 1.0, self.expand(usual, np.inf))
@@ -212,8 +212,8 @@ def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequen
     """Return the space of the parameters in `bounds`, {"phi1": [low, high], ...}; a bound is a number or (n,).
 
     Raises:
-        UserError: there is no parameter, an unknown one, or one of another friction family; both parametrizations of
-            inertia are named; or low is not less than high.
+        UserError: `bounds` is empty, or names an unknown parameter, a parameter of a different friction family, or
+            both parametrizations of inertia; or low is not less than high.
     """
     family = nominal.family
     if clash := [name for name in family.names if name in OTHER_UNITS]:
@@ -234,11 +234,11 @@ def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequen
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """Estimate of a parameter vector; arrays are (P,), in SI units.
+    """Estimated parameter vector with arrays (P,) in SI units.
 
     Attributes:
-        x: estimates. low, high: ends of 95 % intervals. identifiable: whether the data determine each value. samples:
-            (S, P), draws of the posterior.
+        x: estimated values. low, high: ends of 95 % intervals of the values. identifiable: whether the data determine
+            a value. samples: (S, P) random draws from the posterior.
     """
 
     x: np.ndarray

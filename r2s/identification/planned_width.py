@@ -1,6 +1,6 @@
-"""Predict the 95 % interval widths that a recording of a planned motion will yield, to choose the motion.
+"""Predict the 95 % interval widths of an identification from a planned motion, to choose the motion.
 
-The prediction assumes the later identification's parameters, bounds and prior, and linearizes at the nominal arm.
+The prediction uses the parameters, bounds and prior of the identification, and linearizes at the nominal arm.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ from r2s.physics.dynamics import Dynamics, with_family
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-MOST_ROWS = 200  # samples of a motion in a search; more of them hardly change the ranking of motions
+MOST_ROWS = 200  # samples per motion in a search; more samples hardly change the ranking of motions
 
 
 class PlannedWidths:
     """Expected 95 % interval widths from planned motions.
 
     Attributes:
-        space: the parameters. information: (P, P) on the unit cube, summed over the motions that `add` received.
+        space: the parameters to identify. information: (P, P), information of all added motions on the unit cube.
 
     Args:
         robot, nominal: the arm, and the dynamics at which the identification will start.
-        settings: settings of the identification; for family=auto the nominal arm's friction family is used.
+        settings: settings of the identification; family=auto stands for the nominal arm's friction family.
         torque: kind of torque that will be recorded.
         noise: torque noise, standard deviation of independent samples at COARSE_HZ, relative to tau_max.
-        chosen: parameters such as "offset" or "offset[3]" whose widths `score` averages; empty: all.
+        chosen: names of the parameters, such as "offset" or "offset[3]", that `score` considers; if empty, all.
 
     Raises:
         UserError: a name in `chosen` is not an estimated parameter.
@@ -90,33 +90,33 @@ class PlannedWidths:
         return (j.transpose(0, 2, 1) @ j) * ((t[-1] - t[0]) * COARSE_HZ / len(t))
 
     def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
-        """Add the information of a motion (T, n) at times t (T,) s to `information`."""
+        """Add the information of one motion q, dq, ddq (T, n) at times t (T,) s to the sum `information`."""
         self.information = self.information + self.of(t, q[None], dq[None], ddq[None])[0]
 
     def half(self, information: np.ndarray) -> np.ndarray:
-        """Return half the 95 % widths (..., P) on the unit cube, from information (..., P, P) and prior."""
+        """Return half the 95 % interval widths (..., P) on the unit cube for information (..., P, P) and prior."""
         covariance = np.linalg.inv(information + self._prior)
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return minus the mean log width (B,) of the chosen values, for each of B motions added to those so far."""
+        """Score each of B candidates for the next motion by minus the mean log width (B,) of the chosen values."""
         some = slice(None, None, 1 + len(t) // MOST_ROWS)
         information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
         return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)
 
     @property
     def width(self) -> np.ndarray:
-        """(P,) expected 95 % widths after the motions so far, in SI units."""
+        """(P,) expected widths of the 95 % intervals after all added motions, in SI units."""
         h = np.where(self._u > 0.5, -STEP, STEP)
         slope = (self.space.from_unit(self._u + h) - self.space.from_unit(self._u)) / h
         return 2 * self.half(self.information) * slope
 
     @property
     def share(self) -> np.ndarray:
-        """(P,) ratio of expected to prior width after the motions so far, at most 1."""
+        """(P,) ratio of expected to prior interval width after all added motions, at most 1."""
         return np.minimum(self.half(self.information) / (Z_95 * self._problem.prior_width), 1.0)
 
     @property
     def identifiable(self) -> np.ndarray:
-        """(P,) whether each value will be identifiable from the motions so far, by the rule of `conclude`."""
+        """(P,) whether each value will be identifiable from all added motions (result.py: SHARPER)."""
         return Z_95 * self.share < 1.0 / SHARPER

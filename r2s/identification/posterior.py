@@ -18,7 +18,7 @@ class Linearized(Protocol):
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each data row."""
+        """(R,) index of the block that contains each data row."""
         ...
 
     def linearize(self, u: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray]]:
@@ -27,7 +27,7 @@ class Linearized(Protocol):
 
 
 class Posterior(NamedTuple):
-    """The fit u (P,) on the unit cube, `steps` (S, P) from u to S draws, and the data's information (P, P)."""
+    """Fit u (P,) on the unit cube, `steps` (S, P) from u to S draws, and information (P, P) from the data."""
 
     u: np.ndarray
     steps: np.ndarray
@@ -37,14 +37,14 @@ class Posterior(NamedTuple):
 def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     """Return draws about the fit u (P,) from a normal distribution with a cluster-robust covariance.
 
-    Errors within a block are correlated. So, with the total information H, the covariance is H^-1 (sum of s s^T +
-    prior) H^-1. A block's score s is its part of the gradient (White, Econometrica 48(4), 1980; clusters: Liang and
-    Zeger, Biometrika 73(1), 1986), minus the mean score, which is not 0 at a bound. With few blocks, the fit adapts
-    to the error of each block and makes the block's residual too small; a factor from the block's share of the
-    information corrects this (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). Student's t widens the
-    draws, because few blocks are a small sample. The covariance is at least that of independent rows, because a
-    direction that one block determines has too little scatter. A bootstrap over blocks would draw samples with hardly
-    any information on a value that few blocks determine, and yield tails that describe no arm.
+    Because errors within a block are correlated, the covariance is H^-1 (sum of s s^T + prior) H^-1, with the total
+    information H and a score s per block. The score is the block's part of the gradient (White, Econometrica 48(4),
+    1980; clusters: Liang and Zeger, Biometrika 73(1), 1986) minus the mean score, which is not 0 at a bound. If there
+    are few blocks, the fit makes each block's residual too small; a factor from the block's share of the information
+    corrects the score (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). For few blocks, Student's t widens
+    the draws. The covariance is at least the covariance for independent rows, because scores vary too little in a
+    direction that one block determines. A bootstrap over blocks would yield unrealistic tails if few blocks determine
+    a value, because many bootstrap samples would lack these blocks.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -66,7 +66,7 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return K blocks' information (K, P, P) and score (K, P), the prior's information (P, P), and the data's RMS.
 
-    The RMS of the data rows, in standard deviations, is raised to at least 1.
+    The RMS of the data rows is in standard deviations; the function replaces an RMS below 1 by 1.
     """
     clusters, p = problem.clusters, len(u)
     count, square, seen, row = int(clusters.max()) + 1, 0.0, 0, 0
@@ -86,20 +86,20 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return a square root (P, P) of the larger of two covariances, root root^T and least least^T, by direction.
+    """Return a square root (P, P) of a covariance: in each direction the larger of root root^T and least least^T.
 
-    Directions are compared, because the sum of two correlated values is known far better than each of these values.
+    A comparison per value would fail, because data can determine the sum of two values far better than each value.
     """
     axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
     return least @ (axes * np.maximum(seen, 1.0))
 
 
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return `steps` (S, P) from u, changed to end in the cube: values outside are clipped, the others adapted.
+    """Return `steps` (S, P) with values changed so that u + steps lies in the unit cube.
 
-    Given the clipped values, the others minimize the sum of squares, whose Hessian is 2 h (P, P). Without this
-    adaptation, sums of correlated values would be biased, for example an offset plus an asymmetry at its bound. The
-    value farthest outside is clipped first, because this often brings correlated values back into the cube.
+    Values outside the cube are clipped. All other values are adapted to minimize the sum of squares with Hessian
+    2 h (P, P); otherwise sums of correlated values would be biased, such as an offset plus an asymmetry at its bound.
+    The value farthest outside is clipped first, because the adaptation often moves correlated values into the cube.
     """
     steps = steps.copy()
     for step in steps:

@@ -1,4 +1,4 @@
-"""Errors of an identified arm on motion that was not fitted: predicted torque, and open-loop simulation."""
+"""Compute torque errors and simulation errors of an identified arm on motion that was not fitted."""
 
 import numpy as np
 
@@ -29,9 +29,9 @@ def prediction_errors(
 ) -> dict:
     """Return the errors of the identified and the nominal arm on a recording, as an entry of summary.json.
 
-    The entry contains the torque RMSE of each joint. For commanded torque, it also contains position_rmse_mrad, over
-    replays of `window_s` (if a trajectory is as long), and ee_error_mm, the mean end-effector distance after each of
-    the HORIZONS that trajectories reach. From a long recording, the errors use parts spread over it.
+    The entry of summary.json contains the torque RMSE of each joint. For commanded torque, the entry also contains
+    position_rmse_mrad from replays of `window_s`, and ee_error_mm, the mean end-effector distance after each of the
+    HORIZONS, as far as trajectories are long enough. r2s evaluates a long recording in parts spread over its length.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}
@@ -52,7 +52,7 @@ def prediction_errors(
 
 
 def open_loop_error(robot: Robot, dynamics: Dynamics, recording: Recording, nthread: int) -> dict[str, float]:
-    """Return {horizon in s: mean distance in mm between simulated and recorded end effector after this time}."""
+    """Return {horizon in s: mean distance in mm between simulated and recorded end effector at the horizon}."""
     errors = {}
     for horizon in HORIZONS:
         if (windows := windows_or_none(recording, horizon, MAX_WINDOWS)) is None:

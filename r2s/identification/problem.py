@@ -1,4 +1,4 @@
-"""The least-squares problem of an identification on the unit cube, and the interface of the searches for it."""
+"""The least-squares problem of an identification on the unit cube, and the interface of searches that solve it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class ExtraResidual(Protocol):
     """Residual rows from sources other than the data: ramps, presliding replays, or prior knowledge (`Known`)."""
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return the K rows for candidates x (C, P) as an array (C, K), in standard deviations."""
+        """Return the residual (C, K), K rows per candidate in x (C, P), in standard deviations."""
         ...
 
 
@@ -38,8 +38,8 @@ class Problem:
     """A least-squares problem on the unit cube, with rows of data, prior and extra residuals in standard deviations.
 
     Attributes:
-        data: the residual to minimize, either of replays or of torque.
-        torque_data: the torque residual, for a fast start; it may be `data` itself.
+        data: the replay residual or the torque residual to minimize.
+        torque_data: the torque residual, which a fast first search minimizes; can be the same object as `data`.
         sigma: (P,) prior standard deviation about the nominal value, or about its logarithm for logarithmic
             coordinates; inf means a flat prior.
         extra: further residual rows, see `ExtraResidual`.
@@ -78,7 +78,7 @@ class Problem:
 
     @property
     def uses_replays(self) -> bool:
-        """Whether the data are replayed windows rather than torques."""
+        """Whether `data` is a replay residual."""
         return self.data is not self.torque_data
 
     @property
@@ -90,7 +90,7 @@ class Problem:
     def prior_width(self) -> np.ndarray:
         """(P,) the prior's standard deviation on the unit cube, for comparison with the posterior's.
 
-        For a flat prior, it is the standard deviation among arms in general (`ParameterSpace.usual`). It is at most
+        The standard deviation among arms in general (`ParameterSpace.usual`) replaces a flat prior. No value exceeds
         UNIFORM, the standard deviation of a uniform distribution over the bounds.
         """
         stated = np.where(np.isinf(self.sigma), self.space.usual, self.sigma)
@@ -102,21 +102,21 @@ class Problem:
         return self.space.width / self.sigma
 
     def fixed(self, at: np.ndarray) -> "Problem":
-        """Return the problem with a very narrow prior that fixes the values with indices `at` at nominal."""
+        """Return the problem with the values at indices `at` fixed at nominal by a very narrow prior."""
         sigma = self.sigma.copy()
         sigma[at] = FIXED * self.space.width[at]
         return replace(self, sigma=sigma)
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with a flat prior for the values `names`, whose prior is an extra residual."""
+        """Return the problem with a flat prior for the values `names`, because an extra residual is their prior."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
-        """Return the problem with another torque residual, which also replaces `data` unless `data` are replays."""
+        """Return the problem with `torque_data` replaced; `data` is also replaced unless it is a replay residual."""
         return replace(self, data=self.data if self.uses_replays else torque_data, torque_data=torque_data)
 
     def torque_reweighted(self, u: np.ndarray) -> "Problem":
-        """Return the problem with its torque residual reweighted at u (P,), a fit to torque."""
+        """Return the problem with its torque residual reweighted at the solution u (P,) of a torque fit."""
         return self.with_torque_data(self.torque_data.reweighted(self.space.from_unit(u), fitted=True))
 
     def reweighted(self, u: np.ndarray, fitted: bool) -> "Problem":
@@ -142,7 +142,7 @@ class Problem:
             yield self.prior_rows(u)
 
     def prior_rows(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prior and extra rows (B,) and their Jacobian (B, P) at u (P,)."""
+        """Return the residual (B,) of prior and extra rows, and the Jacobian (B, P), at u (P,)."""
         return _differences(self._prior, u)
 
     def prior_information(self, u: np.ndarray) -> np.ndarray:
@@ -170,8 +170,8 @@ def _differences(residual: Callable[[np.ndarray], np.ndarray], u: np.ndarray) ->
 class Search(Protocol):
     """A search, which minimizes the sum of squares of `Problem.residual` from `start` (P,).
 
-    After every step or generation it calls `report` with a dict of search, evaluations, cost, done and total. A local
-    search (`local` is true) continues from its start, so it can refine the result of another search.
+    After every step or generation, a search calls `report` with a dict of search, evaluations, cost, done and total.
+    A local search (local = True) improves its start, so it can refine the result of an earlier search.
     """
 
     local: bool
@@ -197,11 +197,11 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 
 
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
-    """Return whether the recording comes from a simulator with implicit friction; u (P,) is a fit to its torque.
+    """Return whether the recording comes from a simulator with implicit friction; u (P,) is a fit to torque.
 
-    Implicit integration evaluates friction at the velocity half a step ahead, unlike a physical arm. Such an effect
-    must exceed `significant` standard deviations. The effect must also have about the expected size, because a rotor
-    inertia that the model lacks has a similar effect that is a hundred times larger.
+    Implicit integration evaluates friction at the velocity half a step ahead; a physical arm does not. The effect of
+    implicit friction must exceed `significant` standard deviations. The effect must also have about the expected
+    size: a rotor inertia missing in the model would have a similar, but a hundred times larger effect.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]

@@ -27,14 +27,14 @@ class IdentificationResult:
     """Result of an identification.
 
     Attributes:
-        space, found: the parameter space, and the estimate of its values.
+        space: the parameter space. found: estimated values and intervals of the parameters.
         history: one row for each step or generation of a search.
         families: {"sigmoid": error of held-out torque relative to the best, ...}; empty if the user chose the family.
-        null_directions: parameter combinations that the prior decides more than the data, widest first, as pairs
-            (ratio of posterior to prior sigma, {name: component}).
+        null_directions: parameter combinations that the prior determines more than the data do, each as a pair
+            (ratio of posterior to prior sigma, {name: component}), largest ratio first.
         unseen: names of the parameters that r2s left at nominal values, because the data hardly determine them.
-        edges: breakaway commands from ramps; None without ramps.
-        refused: whether r2s discarded the replays, because they contradicted the torque fit.
+        edges: breakaway commands estimated from ramps; None if no ramps were recorded.
+        refused: whether r2s discarded the replay fit, because this fit explained torque clearly worse.
         prior_rows: residuals (B,) of prior, ramps and earlier knowledge, and their Jacobian (B, P) on the unit cube.
     """
 
@@ -60,7 +60,7 @@ class IdentificationResult:
 
     @property
     def at_bounds(self) -> list[str]:
-        """One message for each value at a nonzero search bound, because this bound may be too narrow."""
+        """One message for each value that lies at a nonzero search bound, which may be too narrow."""
         s, u, unit, lines = self.space, self.space.to_unit(self.found.x), units(), []
         for block in s.blocks:
             for k, at in enumerate(s.where(block)):
@@ -87,10 +87,10 @@ class IdentificationResult:
 
     @property
     def saved(self) -> tuple[ParameterSpace, ParameterEstimate]:
-        """Parameter space and estimate for parameters.yaml, including the breakaway torques from ramps, if any.
+        """Parameter space and estimate for parameters.yaml, with breakaway torques if ramps were recorded.
 
         The interval of a breakaway torque combines Student's t (friction/repeatability.py) with the uncertainty of
-        the offset. If no ramp moved a joint, its breakaway torque is not identifiable: the interval extends from the
+        the offset. If no ramp moved a joint, the breakaway torque is not identifiable: the interval extends from the
         largest torque without motion to the bound, and all posterior draws equal the estimate.
         """
         if self.edges is None:
@@ -131,7 +131,7 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
     Args:
         problem: the solved problem.
         space: the parameter space, with the breakaway torques and the stiction model estimated after the fit.
-        sure: the fields of `Posterior` by name.
+        sure: the posterior, as a dict with the fields of `Posterior`.
         story: further fields of `IdentificationResult`: history, families, edges, refused.
     """
     u = np.array(sure["u"], dtype=float)
@@ -163,8 +163,8 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
 def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reset poorly determined values of u (P,) to `start`; return the new u, and a mask (P,) of the reset values.
 
-    Data may determine only a combination of values, such as the summed mass of two consecutive links. So a value is
-    reset only if a refit of the other values fits almost as well: all resets raise the sum of squares by at most 1.
+    Data may determine only a combination of values, such as the summed mass of two consecutive links. A value is
+    therefore reset only if all resets, after a refit of all other values, raise the sum of squares by at most 1.
 
     Args:
         u, start: (P,) fitted and nominal values on the unit cube. h: (P, P), half the Hessian of the sum of squares.

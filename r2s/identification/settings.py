@@ -15,25 +15,25 @@ from r2s.physics.friction import family as friction_family
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of `identify`, as in conf/identify, with the terms and prior for the recorded kind of torque.
+    """Settings of `identify` (conf/identify) for the kind of torque in the recording.
 
     Attributes:
         bounds: {"phi1": [low, high], ...} for every parameter that may be fitted; a bound is a number or (n,).
             Bounds of torque-like parameters are relative to the largest torque (terms.py: `scaled_bounds`).
-        prior: {"inertia_scale": sigma or None (flat), ...} in the same units, see `scaled_prior` and `Problem`.
+        prior: {"inertia_scale": sigma or None (flat), ...} in the units of `bounds`, see `scaled_prior`, `Problem`.
         terms: model terms to estimate besides friction, see terms.py.
         family: friction family; auto selects it by cross-validation.
         window_s: s, length of a replayed window; used only with commanded torque.
-        stride: ms, averaging time of the compared angles; used only with commanded torque.
+        stride: ms, averaging time of angles in the replay residual; used only with commanded torque.
         cutoff_hz: cutoff of the zero-phase filter for torque.
-        breakaway: if a recording of commanded torque has no ramps, breakaway torques are searched up to this multiple
-            of the identified friction. None: breakaway torques stay nominal.
+        breakaway: largest breakaway torque, relative to the identified friction, in the scan that replaces missing
+            ramps for commanded torque. None: breakaway torques stay nominal without ramps.
         folds: number of folds of the cross-validation within the recording.
-        candidate_terms: terms to add if they improve held-out prediction; `link` replaces `inertia_scale`.
-        prunable_terms: terms to remove if held-out prediction stays as good without them.
+        candidate_terms: terms to add if they improve prediction of held-out torque; `link` replaces `inertia_scale`.
+        prunable_terms: terms to remove if the model predicts held-out torque equally well without them.
         stated: the user's mean, width or fixed value per parameter (stated.py).
-        known: prior knowledge from an earlier identification, or from another kind of torque (known.py).
-        seed: seed of the posterior's draws.
+        known: prior knowledge from an earlier identification, of any kind of torque (known.py).
+        seed: seed of the random draws from the posterior.
         nthread: threads of the physics; 0 uses all cores.
 
     Raises:

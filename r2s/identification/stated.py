@@ -67,7 +67,7 @@ def _check(where: str, value: Any, count: int | None, positive: bool) -> None:
 
 
 def _values(entry: Mapping[str, Any], key: str, count: int) -> np.ndarray:
-    """Return the values (count,) of the entry's `key`, such as "mean"; nan for joints without a value."""
+    """Return the values (count,) that the user states for `key`, such as "mean"; nan for joints without a value."""
     value = entry.get(key)
     parts = value if isinstance(value, list | tuple) else [value]
     return np.broadcast_to(np.array([np.nan if x is None else x for x in parts], dtype=float), count).copy()
@@ -91,14 +91,14 @@ def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
 def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, ArrayLike]) -> Known | None:
     """Return the user's prior (mean and width) for values in `space`; None if the user states no mean and no width.
 
-    A mean without a width has its width from `prior`; a width without a mean is centered at the nominal value. Widths
-    are standard deviations in SI units; a logarithmic parameter's width is divided by its mean.
+    If the user states only a mean, the width is from `prior`; if only a width, the mean is the nominal value. Widths
+    are standard deviations in SI units; the width of a logarithmic parameter is divided by its mean.
 
     Args:
         space: the searched parameters. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.
 
     Raises:
-        UserError: a stated parameter is not in `space`, a mean is outside its bounds, or a mean has no width.
+        UserError: a stated parameter is not in `space`, a mean is outside the bounds, or a mean lacks a width.
     """
     names, means, widths = [], [], []
     for block, entry in stated.items():
@@ -129,7 +129,7 @@ def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, Arra
 
 
 def with_terms_of(stated: Stated, terms: Sequence[str], blocks_of: Any, every: Sequence[str]) -> list[str]:
-    """Return `terms` plus the terms of the stated parameters; `inertia_scale` and `link` replace each other."""
+    """Return `terms` plus terms of stated parameters; a stated `inertia_scale` replaces `link`, and vice versa."""
     out = list(terms)
     for block in stated:
         own = [t for t in every if block in blocks_of(t)]

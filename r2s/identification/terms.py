@@ -53,7 +53,7 @@ def check_prior(prior: Mapping[str, ArrayLike | None]) -> None:
 
 
 def blocks_of(term: str) -> tuple[str, ...]:
-    """Return the parameter blocks of a term."""
+    """Return the names of a term's parameters."""
     return {"link": tuple(LINK), "payload": PAYLOAD, "drag": ("drag_sin", "drag_cos")}.get(term, (term,))
 
 
@@ -73,10 +73,10 @@ def search_space(
     """Return the parameter space of the friction family and of the terms that affect the recorded kind of torque.
 
     bounds: see `scaled_bounds`; friction parameters without an entry have the bounds of their family, in SI units.
-    stated: the user's values (stated.py), of which only fixed ones are used here.
+    stated: the user's statements (stated.py), of which only fixed values are used here.
 
     Raises:
-        UserError: a term, or the whole family, has no bounds.
+        UserError: a parameter of a term, or every parameter of the friction family, lacks bounds.
     """
     left_out = set(nominal.family.optional) - set(terms)
     own = [name for name in nominal.family.names if name not in left_out]
@@ -98,8 +98,8 @@ def scaled_bounds(
 ) -> dict[str, Sequence[ArrayLike]]:
     """Convert `bounds` to SI units; bounds of torque-like parameters are relative to the largest torque.
 
-    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. So with
-    motor torque, the bounds of torque-like parameters extend at least to the largest torque.
+    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. For motor
+    torque, the bounds of torque-like parameters therefore extend at least to the largest torque.
     """
     out = dict(bounds)
     for name, size in _sizes(robot, recording).items():
@@ -114,10 +114,10 @@ def scaled_bounds(
 def scaled_prior(
     prior: Mapping[str, ArrayLike | None], robot: Robot, recording: Recording, nominal: Dynamics | None = None
 ) -> dict[str, ArrayLike]:
-    """Return the priors' standard deviations in SI units, without flat priors (None).
+    """Convert the standard deviations in `prior` to SI units, and omit flat priors (None).
 
     In `prior`, values of torque-like parameters are relative to the largest torque; logarithmic parameters have no
-    unit. A viscous coefficient of the arm's file is a guess, so its standard deviation is at least its value.
+    unit. The viscous coefficient in the arm's file is a guess, so its standard deviation is at least its value.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():
@@ -131,5 +131,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return `sizes` for each joint's largest torque: its limit or, if larger, its largest recorded torque."""
+    """Return `sizes` for the largest torque of each joint: the torque limit or, if larger, the recorded torque."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

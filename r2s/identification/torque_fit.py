@@ -1,4 +1,4 @@
-"""Test whether the nominal arm explains recorded torque, or whether another joint order, mounting or mass does."""
+"""Test whether recorded torque fits the nominal arm, or only a different joint order, mounting or link mass."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -33,14 +33,14 @@ class Moments(NamedTuple):
 
 
 class Unexplained:
-    """Compute the share of recorded torque that the model does not explain; `seen`: indices of S judged joints."""
+    """Compute the share of recorded torque, in the S joints with indices `seen`, that the model does not explain."""
 
     def __init__(self, robot: Robot, m: Moments, gravity: bool):
         self.robot, self.m = robot, m
         self.seen, self.need = np.arange(robot.n), self.inverse_dynamics(gravity)
 
     def with_need(self, need: np.ndarray) -> "Unexplained":
-        """Return a copy of this object that compares tau with another nominal torque, `need` (T, n) Nm."""
+        """Return a copy of this object that compares tau with `need` (T, n) Nm as the nominal torque."""
         out = copy(self)
         out.need = need
         return out
@@ -55,7 +55,7 @@ class Unexplained:
         return np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0]
 
     def misfit(self) -> float:
-        """Return sum (tau - nominal torque)^2 / sum tau^2, both without each joint's fitted friction and offset."""
+        """Return sum (tau - nominal torque)^2 / sum tau^2 after removal of each joint's friction and offset."""
         left, whole = np.square(np.concatenate(self._apart([self.m.tau - self.need, self.m.tau]))).sum(0)
         return float(left / max(whole, 1e-12))
 
@@ -68,7 +68,7 @@ class Unexplained:
         return np.array(factors), left / whole
 
     def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return, per judged joint, (T, K): the K `torques` over tau_max, minus their fitted friction and offset."""
+        """Return, for each judged joint, K torques over tau_max (T, K), without fitted friction and offset."""
         out = []
         for j in self.seen.tolist():
             own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
@@ -93,15 +93,15 @@ class Unexplained:
         return np.array(shares) if shares else None
 
     def each(self, tau: np.ndarray) -> np.ndarray:
-        """Fit each judged joint's tau (T, n) with that joint's motion, and return the unexplained shares (S,)."""
+        """Fit tau (T, n) of each judged joint with the motion of the same joint; return unexplained shares (S,)."""
         return np.array([self._share(j, tau[:, j]) for j in self.seen.tolist()])
 
     def pairs(self) -> np.ndarray:
-        """Fit every column k of tau with the motion of every joint j; return the unexplained shares [j, k] (S, S)."""
+        """Fit each column k of tau with the motion of each joint j; return unexplained shares (S, S) at [j, k]."""
         return np.array([[self._share(j, self.m.tau[:, k]) for k in self.seen] for j in self.seen.tolist()])
 
     def _share(self, j: int, tau: np.ndarray) -> float:
-        """Fit tau (T,) by nominal torque, rotor, friction and offset of joint j, and return the unexplained share."""
+        """Fit tau (T,) by nominal torque, rotor, friction and offset of joint j; return the unexplained share."""
         most, m = self.robot.tau_max[j], self.m
         slow = [m.ddq[:, j], np.tanh(m.dq[:, j] / WIDTH_DQ), m.dq[:, j]]
         scale = most / np.maximum([np.sqrt((x**2).mean()) for x in slow], 1e-9)
@@ -113,7 +113,7 @@ class Unexplained:
 
 
 def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for tau or all signals in other joint orders: by name, rotated, reversed, swapped."""
+    """Return (misfit, message) for each different joint order, such as alphabetical, of tau and of all signals."""
     robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}
@@ -141,7 +141,7 @@ def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for each link that fits tau only with another mass and, in proportion, inertia."""
+    """Return (misfit, message) for each link that fits tau only if one factor scales its mass and inertia."""
     robot, m, out = left.robot, left.m, []
     y = regressor(robot, m.q, m.dq, m.ddq, robot.gravity if gravity else None)
     standard, names = LinkInertia(robot.mass, robot.com, robot.inertia).standard(), robot.model(gravity=False)
@@ -159,7 +159,7 @@ def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def mounting(left: Unexplained) -> list[tuple[float, str]]:
-    """Fit the direction of gravity to the torque; return [(misfit, message)] for another mounting, otherwise []."""
+    """Fit the direction of gravity; return [(misfit, message)] if it contradicts the nominal mounting, else []."""
     robot, size = left.robot, float(np.linalg.norm(left.robot.gravity))
     inertial = left.inverse_dynamics(False)
     parts = np.array([left.inverse_dynamics(g) - inertial for g in np.eye(3)])

@@ -1,9 +1,9 @@
 """Check a recording's units, signs, joint order, gravity and clock against the arm's model.
 
 r2s compares dq with the slope of q, the integral of dq with q (r2s/recordings/clock.py), and tau with nominal torque.
-The checks are coarse on purpose. They accept a nominal arm that is wrong by a factor of 3, an undeclared payload, any
-friction, and sensor offsets. The checks refuse a signal that is wrong by a factor of 1000, 57.3 or -1, and another
-joint order or mounting. Most checks refuse only if a correction removes at least three quarters of the misfit.
+The checks accept a nominal arm that is wrong by a factor of 3, an undeclared payload, any friction, and sensor
+offsets. The checks refuse a signal that is wrong by a factor of 1000, 57.3 or -1, and a wrong joint order or
+mounting. Most checks refuse only if correcting one error removes at least three quarters of the misfit.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ class DataError(UserError):
 
 @dataclass(frozen=True)
 class Judged:
-    """Measured values of `check_units`; nan or None for a value that the motion does not determine.
+    """Values that `check_units` measures; a value that the motion does not determine is nan or None.
 
     Attributes:
         clock: (n,) ratio of the change of q to the integral of dq. scale: (n,) ratio of dq to the slope of q.
@@ -61,10 +61,10 @@ class Judged:
 
 
 def check_units(robot: Robot, recording: Recording) -> Judged | None:
-    """Check the clock, dq and tau of a recording; return the measured values, or None for too few rows.
+    """Check the clock, dq and tau of a recording; return measured values, or None if there are too few rows.
 
     Raises:
-        DataError: dq or tau has another unit, sign or joint order, tau is implausible, or the clock is wrong.
+        DataError: dq or tau has a wrong unit, sign or joint order, tau is implausible, or the clock is wrong.
     """
     moved = np.ptp(recording.q, axis=0) > STILL
     dead = np.flatnonzero(moved & (np.ptp(recording.tau, axis=0) == 0))
@@ -146,7 +146,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the joints whose motion fits other joints' columns far better, and these columns, or else None."""
+    """Return joints whose motion fits columns of different joints far better, with these columns, or None."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():
@@ -222,7 +222,7 @@ def _check_torque(
 
 
 def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, str, str]]:
-    """Return (remaining misfit, check, description) for swapped columns, and for the other sign in some joints."""
+    """Return (remaining misfit, check, description) for swapped columns, and for opposite signs in some joints."""
     seen, out, pairs = left.seen, [], left.pairs()
     if (swap := _swapped(pairs, own)) is not None:
         order = np.arange(len(seen))

@@ -59,7 +59,7 @@ class Verdict:
 
     @property
     def fails(self) -> list[Line]:
-        """Results of the checks that refuse the recording."""
+        """Results of the checks that the recording fails."""
         return [line for line in self.lines if line.verdict == FAIL]
 
     @property
@@ -97,7 +97,7 @@ def judge(robot: Robot, nominal: Dynamics, recording: Recording, settings: Setti
 
     Args:
         robot, nominal: the arm, and the dynamics from which an identification starts.
-        recording: the recording, with its period if the motion repeats (`Recording.in_phase`).
+        recording: the recording; if the motion repeats, `Recording.in_phase` must have found the period.
         settings: settings of the identification.
     """
     lines, judged = _file(recording), None
@@ -260,7 +260,7 @@ def _span(x: np.ndarray, form: str = "{:.3g}") -> str:
 
 
 def with_validation(verdict: Verdict, error: UserError | None, name: str = "") -> Verdict:
-    """Add the result of the validation file `name` to a verdict: it fails if there is an `error`, else it passes."""
+    """Add a line for the validation file `name` to a verdict: FAIL if the file has an `error`, else PASS."""
     check = f"validation {name}".strip()
     line = Line(check, FAIL, str(error)) if error else Line(check, PASS, "holds other motion")
     return replace(verdict, lines=(*verdict.lines, line))

@@ -1,1 +1,1 @@
-"""Policies: the training environment, randomization, one file per algorithm, the training loop, evaluation."""
+"""Train and evaluate policies: environment, domain randomization, algorithms (one per file) and training loop."""

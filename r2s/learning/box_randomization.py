@@ -16,18 +16,18 @@ RANGES = "mass", "table", "friction", "damping", "bristle"
 
 @dataclass(frozen=True, kw_only=True)
 class BoxRandomization(UniformRandomization):
-    """Draw arms from `UniformRandomization`, each with its own random box.
+    """Draw random arms from `UniformRandomization` and a random box for each arm.
 
-    Mass and stiffness are log-uniform, the other ranges uniform. The box's place deviates from the nominal place by
-    x, y ~ U(-spread, spread) and yaw ~ U(-yaw, yaw).
+    Mass and stiffness are log-uniform; all remaining ranges are uniform. The initial pose of the box deviates from
+    the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's normal.
 
     Attributes:
         size: (3,) m, edges of the box. mass (kg), table, friction (coefficients at table and tip), stiffness (N/m),
-            damping (s/m), bristle (m): ranges [least, most], see `Surface`.
-        spread: m. yaw: degrees. point, normal: (3,) m and (3,), plane of the table; None: see `table_frame`.
+            damping (s/m), bristle (m): ranges [least, most], see `Surface`. spread: m, range of the box's position.
+        yaw: degrees, range of the box's rotation. point, normal: (3,) m and (3,), table plane, see `table_frame`.
 
     Raises:
-        UserError: a range is malformed, the box would tilt, or there is no tool.
+        UserError: a range is malformed, the box would tilt, or the robot has no tool.
     """
 
     size: Sequence[float]
@@ -56,7 +56,7 @@ class BoxRandomization(UniformRandomization):
         check_number("dr.yaw", self.yaw, "[0, 180]")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return random dynamics of m arms, each with a random box."""
+        """Return m random dynamics, each of an arm with a box."""
 
         def drawn(low: float, high: float) -> np.ndarray:
             return rng.uniform(low, high, m)

@@ -1,9 +1,9 @@
 """Checkpoints of a training: the state in one file, and the transitions of the replay buffer in files called chunks.
 
-Each checkpoint writes only the new transitions, as one chunk. The file of the state lists the chunks that belong to
-it, so an interrupted write does not damage the previous checkpoint. A chunk is deleted after the replay buffer
-has overwritten all its transitions; until then, the oldest chunk can also contain overwritten transitions. All files
-contain only tensors, numbers and names, so torch.load(weights_only=True) can read them.
+Each checkpoint writes only the new transitions, as one chunk. The state file lists the chunks of the checkpoint, so
+an interrupted write does not damage the previous checkpoint. A chunk is deleted after the replay buffer has
+overwritten all transitions of the chunk. The oldest chunk can therefore contain some overwritten transitions. All
+files contain only tensors, numbers and names, so torch.load(weights_only=True) can read the files.
 """
 
 import errno
@@ -20,7 +20,7 @@ from r2s.learning.replay import Replay
 
 
 class Checkpoint:
-    """The checkpoint of one training, in a separate folder."""
+    """The checkpoint of one training run, in a separate folder."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -33,7 +33,7 @@ class Checkpoint:
         return load_tensors(path, "resume")["seen"] if path.is_file() else 0
 
     def save(self, state: dict[str, Any], replay: Replay) -> None:
-        """Write the state and the transitions since the last call; delete chunks that the buffer no longer needs."""
+        """Write the state and the new transitions; delete chunks whose transitions the buffer has overwritten."""
         self.folder.mkdir(parents=True, exist_ok=True)
         seen, first = replay.seen, replay.seen - len(replay)
         begin = max(self._chunks[-1] if self._chunks else 0, first)
@@ -47,7 +47,7 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill `replay`, an empty buffer, with the saved transitions and return the state; None without a checkpoint.
 
-        Every transition has the same row as before, so a restored random generator draws the same batches.
+        Every transition returns to its row in the buffer, so a restored random generator draws the same batches.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.
@@ -66,7 +66,7 @@ class Checkpoint:
         return state
 
     def _path(self, end: int) -> Path:
-        """Return the file of the chunk whose last transition has the number `end` - 1."""
+        """Return the path of the chunk that ends with transition number `end` - 1."""
         return self.folder / f"replay_{end:012d}.pt"
 
     def clear(self) -> None:

@@ -1,8 +1,8 @@
 """Deep Deterministic Policy Gradient (Lillicrap et al. 2016, arXiv:1509.02971).
 
-The losses equal those of `torchrl.objectives.DDPGLoss` with target networks for actor and critic; the tests compare
-them. This version differs from the paper in two ways: the critics have LayerNorm instead of batch norm, and the
-exploration noise is white. Fujimoto et al. 2018 found white noise as good as the paper's Ornstein-Uhlenbeck process.
+Tests verify that the losses equal the losses of `torchrl.objectives.DDPGLoss` with target networks for actor and
+critic. This version differs from the paper: the critic has LayerNorm instead of batch norm, and exploration noise is
+white. Fujimoto et al. 2018 found white noise as good as the Ornstein-Uhlenbeck process of the DDPG paper.
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ class DDPG(DeterministicLearner):
         return {"loss_critic": critic, "loss_actor": actor}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step; return the losses."""
+        """Take one gradient step and return the losses."""
         out, gradients = self.gradients(batch)
         self.descend(out, self.trained, gradients)
         polyak(self.targets, self.critics, self.tau)

@@ -1,7 +1,7 @@
 """Demonstrations: a model-based controller with noise fills the replay buffer before the first update.
 
 Off-policy learners can learn from any good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random
-torques hardly ever bring an arm to its goal and stop it there. A controller does so, and noise varies the motion.
+torques hardly ever stop an arm at the goal. A controller reaches the goal, and noise varies the motion.
 """
 
 import math
@@ -22,7 +22,7 @@ KEPT = 0.9  # correlation of the noise between steps; white noise hardly moves a
 
 
 class Demonstrator:
-    """A model-based controller with noise; its standard deviation rises from 0 (first arm) to NOISE (last arm).
+    """A model-based controller plus noise with a standard deviation from 0 (first arm) to NOISE (last arm).
 
     Args:
         reference: the controller, with the interface of `r2s.learning.networks.Policy`.

@@ -35,8 +35,8 @@ class TaskEnv(EnvBase):
         draw: domain randomization, called at every reset; a `Pushes` also applies joint torques at every step.
         nsim: number of arms. nthread: number of threads; 0: all cores.
         seed: seed of goals, starts and dynamics.
-        stagger: whether the arms, in GROUPS groups, end their first episodes at different times.
-        reward: reward terms and weights; None: the terms and `paper_weights` of the task.
+        stagger: whether first episodes end at a different time in each of GROUPS groups of arms.
+        reward: reward terms and weights; None selects the terms and `paper_weights` of the task.
     """
 
     batch_locked = True
@@ -84,9 +84,9 @@ class TaskEnv(EnvBase):
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights for the spent share of a training, 0 to 1; for training loops of other libraries.
+        """Set the reward weights for training progress from 0 to 1, if an external library runs the training loop.
 
-        `Reward.adapt` computes the factor of the weights from the steps since the last call, as in `train`.
+        As in `train`, `Reward.adapt` computes the factor of the weights from the steps since the last call.
         """
         if self._seen_steps:
             mean = self._seen / self._seen_steps
@@ -95,7 +95,7 @@ class TaskEnv(EnvBase):
         self.weights = self.reward.weights(self.task, progress, self._factor)
 
     def place(self, q: np.ndarray, goal: np.ndarray, ids: np.ndarray | None = None) -> State:
-        """Start episodes of the arms `ids` (all by default) at rest at q (m, n) rad with goals (m, ...)."""
+        """Start episodes of m arms (default: all) at rest with joint angles q (m, n) rad and goals (m, ...)."""
         state = self.arms.place(q, ids=ids)
         at = slice(None) if ids is None else ids
         self.goal[at], self._dq[at], self._count[at] = goal, 0.0, 0
@@ -132,7 +132,7 @@ class TaskEnv(EnvBase):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Run one step, reset truncated episodes, and return the step and the initial state of the next step.
 
-        EnvBase's method also makes checks and copies; with 32 arms, these take a fifth of a step's time.
+        The method of EnvBase also checks and copies tensors, which takes a fifth of a step's time with 32 arms.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)
@@ -175,7 +175,7 @@ class TaskEnv(EnvBase):
         return own | {"arms": self.arms.state(), "rng": self.rng.bit_generator.state, "_stagger": self._stagger}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a result of `state`; the same actions then lead to the same steps, bit for bit."""
+        """Restore a saved `state`, from which equal actions produce equal steps, bit for bit."""
         for name in ("goal", "_dq", "_count", "_scale"):
             getattr(self, name)[:] = state[name]
         self.arms.set_state(state["arms"])
@@ -202,7 +202,7 @@ class TaskEnv(EnvBase):
         return after
 
     def _forces(self, draw: Pushes) -> np.ndarray:
-        """Return (nsim, n) Nm, the external joint torques of the next control step."""
+        """Return the external joint torques (nsim, n) Nm of the next control period."""
         return draw.forces(self.rng, self.nsim)
 
     def _set_seed(self, seed: int | None) -> None:

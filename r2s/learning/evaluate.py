@@ -1,8 +1,8 @@
 """Evaluation in simulation: 200 deterministic episodes, the same for every policy.
 
-The seed sets the goals, starts and dynamics of the episodes. A training selects its best policy on episodes of the
-seed SELECTION. The reported measures come from episodes of the seed REPORT, which select no policy. However, they
-helped to choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
+The seed sets the goals, starts and dynamics of the episodes. Episodes of the seed SELECTION determine the best policy
+of a training run. Episodes of the seed REPORT yield the reported results and select no policy. REPORT was used to
+choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
 """
 
 from collections.abc import Callable

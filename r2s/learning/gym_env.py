@@ -26,7 +26,7 @@ SEEDS = 2**63  # number of seeds for an arm's episodes
 
 
 class SeparateArms(VectorArms):
-    """`VectorArms` with a random generator per arm, `streams`, for sensor noise and for the torques of `Pushes`."""
+    """`VectorArms` with one random generator per arm, in `streams`, for sensor noise and the torques of `Pushes`."""
 
     def seed(self, seed: int | np.random.SeedSequence) -> None:
         """Restart the random generators of all arms from this seed."""
@@ -63,14 +63,14 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     """Simulate `num_envs` arms that perform a task, and step them together.
 
     Observations (num_envs, d) float32 are normalized and clipped to [-10, 10]. Actions (num_envs, a) are clipped to
-    [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal, m. `info["reward_terms"]` (num_envs, k) are
-    the unweighted terms of the reward, 0 for an arm that has just restarted. Episodes are truncated after
+    [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal in m. `info["reward_terms"]` (num_envs, k)
+    contains the unweighted terms of the reward, 0 for an arm that has just restarted. Each episode is truncated after
     `task.steps` steps.
 
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
         num_envs: number of arms. nthread: number of threads; 0: all cores.
-        reward: reward terms and weights, None: as in `TaskEnv`. Weights are initial weights until `set_progress`.
+        reward: reward terms and weights, see `TaskEnv`; weights have initial values before `set_progress`.
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
@@ -104,7 +104,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.observation_space, self.action_space = (gym.vector.utils.batch_space(s, num_envs) for s in spaces)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights for the spent share of a training, 0 to 1; see `TaskEnv.set_progress`."""
+        """Set the reward weights for training progress from 0 to 1; see `TaskEnv.set_progress`."""
         self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
@@ -116,7 +116,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes of all arms, or of the arms of `options["reset_mask"]` (num_envs,) bool.
 
-        seed: a number: arm i has seed + i. A list: one seed per arm. None: the random generators are not restarted.
+        seed: number, to which r2s adds i for arm i, or list of one seed per arm; None: no generator is restarted.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
@@ -177,7 +177,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
 
 
 class ArmEnv(gym.Env):
-    """A single simulated arm: an `ArmVectorEnv` of one arm without automatic resets; its arguments are the same."""
+    """A single simulated arm: an `ArmVectorEnv`, with the same arguments, of one arm without automatic resets."""
 
     def __init__(self, robot: Robot, task: Task, draw: Draw, *, reward: Reward | None = None):
         self.batch = ArmVectorEnv(robot, task, draw, nthread=1, reward=reward, autoreset_mode=AutoresetMode.DISABLED)

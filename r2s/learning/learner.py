@@ -25,14 +25,14 @@ class Learner(nn.Module, ABC):
 
     Args:
         scale: mean and standard deviation (d,) that normalize an observation.
-        action_scale: (a,), factor from an action in [-1, 1] to SI units; part of the policy.
-        critics: (number of critics, outputs per critic).
-        hidden: units per hidden layer of actor and critics.
+        action_scale: (a,), factor from an action in [-1, 1] to SI units; saved with the policy.
+        critics: (number of critics, number of outputs per critic).
+        hidden: number of units in each hidden layer of actor and critics.
         gamma: discount. tau: Polyak step of the target networks. lr: learning rate of Adam.
-        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
-            critics hardly distinguish actions, the policy then prefers small actions to alternating full torque.
-        explore_correlation: correlation of an arm's exploration noise between two steps; 0: white. The noise is a
-            first-order process of constant variance. For the same displacement, correlated noise needs smaller
+        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). In states in
+            which critics hardly distinguish actions, this weight favors small actions over alternating full torque.
+        explore_correlation: correlation of an arm's exploration noise between two steps; 0 means white noise. The
+            noise is a first-order process of constant variance. Correlated noise moves an arm as far with smaller
             accelerations (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
 
     Raises:
@@ -83,9 +83,9 @@ class Learner(nn.Module, ABC):
 
     @abstractmethod
     def losses(self, batch: Mapping[str, Tensor], *noise: Any) -> dict[str, Tensor]:
-        """Return the losses of a batch, with names that begin with loss_, and other scalars to log.
+        """Return the losses of a batch, with names that begin with loss_, and further scalars to log.
 
-        The random draws are arguments, so that the tests can compare the losses with TorchRL's.
+        Random draws are arguments, so that tests can compare the losses with the losses of TorchRL.
 
         Args:
             batch: as for `update`, but with normalized observations.
@@ -94,16 +94,16 @@ class Learner(nn.Module, ABC):
 
     @abstractmethod
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step and return the scalars to log, detached.
+        """Take one gradient step and return detached scalars to log.
 
         Args:
-            batch: observation, next_observation (B, d) in SI units; action (B, a); reward, terminated (B,).
+            batch: B transitions; observation, next_observation (B, d) in SI units; action (B, a); reward, terminated.
         """
 
     def gradients(self, batch: Mapping[str, Tensor], *noise: Any) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
-        """Return `losses` of a batch in SI units, and the gradient of their sum with respect to each of `trained`.
+        """Return the `losses` of a batch in SI units, and the gradient of their sum for all `trained` parameters.
 
-        Losses and gradient are in one function, so that torch compiles one graph; `backward` would need a second one.
+        One function computes losses and gradient, so that torch compiles one graph; `backward` would need two graphs.
         """
         return differentiate(self.losses(self.normalized(batch), *noise), self.trained)
 
@@ -122,7 +122,7 @@ class Learner(nn.Module, ABC):
         self.explore_share = share
 
     def noise(self, like: Tensor) -> Tensor:
-        """Draw standard normal noise (B, a) for the exploration in the next step; row i is for arm i."""
+        """Draw standard normal exploration noise (B, a) for the next step of B arms."""
         fresh = torch.randn_like(like)
         if self._noise is not None and self._noise.shape == like.shape:
             kept = self.explore_correlation
@@ -199,7 +199,7 @@ class Learner(nn.Module, ABC):
         return {"optimizer": self.optimizer.state_dict(), "updates": self.updates, "noise": self._noise}
 
     def set_extra_state(self, state: dict) -> None:
-        """Restore a result of `get_extra_state`."""
+        """Restore a state that `get_extra_state` returned."""
         # torch stores references to the loaded moments: without a copy, two learners would share and overwrite them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         noise = state.get("noise")  # older checkpoints have none
@@ -267,7 +267,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Change the target entropy as a Gaussian's entropy changes when its standard deviations scale by `share`."""
+        """Change the target entropy as the entropy of a Gaussian with standard deviations multiplied by `share`."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -277,31 +277,31 @@ class EntropyLearner(Learner):
 
         Args:
             batch: as for `update`, but with normalized observations.
-            noise: two standard normal draws (B, a): for the next action, and for the action in the actor's loss.
+            noise: two standard normal draws (B, a): one for the next action, one for the action in the actor's loss.
         """
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
-        """Return sampled actions (B, a) for observations (B, d)."""
+        """Return random actions (B, a) of the stochastic policy for observations (B, d)."""
         loc, scale = self.actor(self.normalizer(observation))
         return torch.tanh(loc + scale * self.noise(loc))
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step; return losses, entropy and alpha."""
+        """Take one gradient step and return losses, entropy and alpha."""
         out, gradients = self.gradients(batch, (torch.randn_like(batch["action"]), torch.randn_like(batch["action"])))
         self.descend(out, self.trained, gradients)
         polyak(self.targets, self.critics, self.tau)
         return out | {"alpha": self.log_alpha.detach().exp()}
 
     def entropy_losses(self, alpha: Tensor, value: Tensor, action: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        """Return actor and alpha losses and the entropy; value, log_prob (B,): value, log-density of the actions."""
+        """Return actor loss, alpha loss and entropy for actions of `value` (B,) and log-density `log_prob` (B,)."""
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.entropy_goal)).mean()
         return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}
 
 
 def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Return tanh(loc + scale * noise) (B, a) and its log-density (B,) for a Gaussian (loc, scale); noise ~ N(0, 1).
+    """Return the action tanh(loc + scale * noise) (B, a) and the log-density (B,) of the action; noise ~ N(0, 1).
 
     The identity log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) keeps the density finite where tanh saturates.
     """
@@ -313,7 +313,7 @@ def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor,
 
 
 def total(losses: Mapping[str, Tensor]) -> Tensor:
-    """Return the sum of the scalars whose names begin with loss_."""
+    """Return the sum of all losses: scalars with names that begin with loss_."""
     return torch.stack([v for k, v in losses.items() if k.startswith("loss_")]).sum()
 
 

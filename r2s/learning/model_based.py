@@ -1,6 +1,6 @@
 """Model-based baselines: minimum-jerk joint motion, computed torque, friction compensation.
 
-Baselines have the interface, observations and rate of a policy. Their model is the center of the randomization.
+Baselines have the interface, observations and rate of a policy. Baselines use the center of the randomization.
 """
 
 import mujoco
@@ -24,10 +24,10 @@ PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (15 / 8)
 
 
 class Oracle:
-    """A policy for B arms: minimum-jerk motion under computed torque; `action` as in `r2s.learning.networks.Policy`.
+    """A policy for B arms, with the interface of `Policy`: minimum-jerk motion under computed torque.
 
     Args:
-        robot, task: the arm and its task, under control=torque. dynamics: model of one arm.
+        robot, task: the arm and its task with control=torque. dynamics: dynamics of one arm, for computed torque.
         move_s: s, duration of a motion; r2s prolongs it if a joint would exceed the share FAST of its speed limit.
     """
 
@@ -46,7 +46,7 @@ class Oracle:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d); an observed effort of 0 starts a new motion."""
+        """Return actions (B, n) in [-1, 1] for observations (B, d); a new motion starts if the effort is 0."""
         rows, n = observation.numpy().astype(np.float64), self.robot.n
         out = np.empty((len(rows), n))
         for i, row in enumerate(rows):
@@ -73,7 +73,7 @@ class Oracle:
     def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
         """Return q (n,) near `start`, within limits, that brings the end effector to `goal` (3,) m.
 
-        The method is damped least squares. Joints whose friction exceeds the torque limit do not move.
+        Damped least squares solves the kinematics. Joints whose friction exceeds the torque limit do not move.
         """
         q, jacobian = start.copy(), np.empty((3, self.robot.n))
         low, high = self.robot.q_min + 0.15, self.robot.q_max - 0.15
@@ -126,7 +126,7 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     """Return the baseline `algo=hybrid_force`: zero actions under control=hybrid.
 
-    The controller alone touches the surface and exerts a force f in open loop: J^T f plus modeled friction torque.
+    Without a policy, the controller exerts a force f on the surface in open loop: J^T f plus modeled friction torque.
 
     Raises:
         UserError: the controller is not control=hybrid, or the task has no contact.

@@ -30,8 +30,8 @@ class Normalizer(nn.Module):
 class Actor(nn.Module):
     """Map observations (B, d) to loc and scale (B, a) of a Gaussian whose tanh is the action.
 
-    Deterministic algorithms use only `mode` and do not train the scale. They still have the outputs for the scale, so
-    that the policies of all algorithms have the same file format and network size.
+    Deterministic algorithms use only `mode` and do not train the scale. The network still has outputs for the scale,
+    so that the policies of all algorithms have the same file format and network size.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, hidden: tuple[int, ...]):
@@ -56,8 +56,8 @@ class Policy(nn.Module):
     """A deterministic policy: observation (B, d) -> action (B, a), both in SI units.
 
     Args:
-        normalizer, actor: networks. scale, offset: (a,), convert an action in [-1, 1] to SI units: offset + scale x
-            action, see `r2s.control.controller.Controller`; None: offset 0.
+        normalizer, actor: networks. scale, offset: (a,), convert actions from [-1, 1] to SI units, offset + scale x
+            action, as in `r2s.control.controller.Controller`; without an offset, the offset is 0.
     """
 
     action_scale: Tensor
@@ -99,7 +99,7 @@ class Critics(nn.Module):
         return _outputs(observation, action, self.weight, self.bias, self.norm_scale, self.norm_shift)
 
     def frozen(self, observation: Tensor, action: Tensor, count: int | None = None) -> Tensor:
-        """Return the outputs (C, B, outputs) of the first `count` critics (None: all) for an actor's loss.
+        """Return the outputs (C, B, outputs) of the first `count` critics, by default of all, for the actor's loss.
 
         The outputs have a gradient with respect to the action, but not to the critics' parameters.
         """

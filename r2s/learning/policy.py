@@ -41,7 +41,7 @@ def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
     """Load the policy of a run folder.
 
     Raises:
-        UserError: policy.pt is missing, damaged, or made for another arm or task.
+        UserError: policy.pt is missing, damaged, or made for a different arm or task.
     """
     path = Path(folder) / "policy.pt"
     if not path.is_file():

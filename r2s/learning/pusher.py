@@ -1,9 +1,9 @@
-"""A baseline without learning for `task=push`: the model-based pusher `algo=pusher`.
+"""Push a box without learning: the model-based baseline `algo=pusher` for `task=push`.
 
-The pusher's model is quasi-static and independent of the box's mass and friction. A frictionless push at a face point
-p along the inward normal n moves the box with v = n and w = (p x n) / r^2 (limit surface of r2s/physics/sliding.py).
-Among many face points, the pusher selects the one with the steepest descent of the error |e|^2 + r^2 e_yaw^2, minus a
-cost for the tip's way to it. The pusher has no memory and plans anew in every control period.
+The pusher's model is quasi-static and independent of the box's mass and friction. In this model, a frictionless push
+at a face point p along the inward normal n moves the box with velocity n and yaw rate (p x n) / r^2, up to a common
+factor (limit surface of r2s/physics/sliding.py). The pusher selects the face point with the steepest descent of the
+error |e|^2 + r^2 e_yaw^2, minus a cost for the tip's way to this point, and plans anew in every control period.
 """
 
 import numpy as np
@@ -21,18 +21,18 @@ from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
 POINTS, EDGE = 9, 0.75  # number of points per face; share of a half edge that the points span
 CLEAR = 0.02  # m, clearance between tip and box while the tip moves around the box
 NEAR = 0.012  # m, lateral error of the tip in front of a face, below which the tip pushes
-WAY = 0.4  # 1/m, cost of a point per m of the tip's way to it, as a share of the steepest possible descent
+WAY = 0.4  # 1/m, cost of a face point per m from the tip to this point, relative to the steepest possible descent
 DONE = 0.008  # m, error below which the pusher stops
-SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, elsewhere; m, error below which a push is slower
+SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, between pushes; m, error below which a push slows
 GAIN = 0.25  # tip speed feedback over damping of the impedance law; 25 Hz and the latency allow little more
 
 
 class Pusher:
-    """Push boxes with B arms; the `action` has the interface of `r2s.learning.networks.Policy`.
+    """Push boxes with B arms, through the interface of `r2s.learning.networks.Policy`.
 
     Args:
-        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm, for
-            compensation of its friction.
+        robot, task: the arm and its task with control=cartesian_impedance.
+        dynamics: model of one arm; the pusher compensates the friction of this model.
 
     Raises:
         UserError: the task or its controller is not supported.
@@ -83,7 +83,7 @@ class Pusher:
         return np.einsum("bnk,bn->bk", inverse, torque)
 
     def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip velocity (3,) m/s along the table, and the unit direction (2,) of the push; 0: no push."""
+        """Return the tip velocity (3,) m/s along the table, and the unit push direction (2,), or 0 for no push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
         at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), self._reach * error[2]])
@@ -110,7 +110,7 @@ class Pusher:
         return np.array([*(rotation.T @ way), 0.0]), push
 
     def _around(self, at: np.ndarray, to: np.ndarray) -> np.ndarray:
-        """Return the next point of a way from `at` to `to` around the box; points (2,) m are in the box's frame."""
+        """Return the next waypoint (2,) m, in the box's frame, from `at` to `to` around the box."""
         edge = self._half + self._task.tip_radius
         clear = edge + CLEAR
         corners = clear * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])

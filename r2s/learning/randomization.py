@@ -21,7 +21,7 @@ from r2s.physics.tip import nominal_plane, tilted
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or one for all arms
 
 DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # random fields of a `Surface`
-TRIES = 64  # largest number of draws of a tensor; if all are rejected, the link has the center's tensor
+TRIES = 64  # largest number of draws per tensor; a link whose draws are all rejected has the center's tensor
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class UniformRandomization:
 
     Each friction parameter phi is center * U(1 - phi_relative, 1 + phi_relative); the paper uses phi_relative = 0.10.
     Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws
-    are independent, but an unphysical tensor is drawn again, because the tensor of a slender link can violate the
-    triangle inequality. At 5 %, every draw is valid for the Panda's links 4 and 7, 47 to 63 % of the draws for links
-    2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). Rejection correlates elements: I_xx and I_yy of
-    link 1 by 0.97, elements of other links by at most 0.6. Each element still spans +-5 %.
+    are independent. A drawn tensor that violates the triangle inequality, as can happen for a slender link, is drawn
+    again. With inertia_relative = 0.05, 100 % of the draws are valid for the Panda's links 4 and 7, 47 to 63 % for
+    links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate I_xx and I_yy of
+    link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Each tensor element still spans its full +-5 %.
 
     Attributes:
         robot: the arm.
@@ -79,8 +79,8 @@ class UniformRandomization:
 class PosteriorRandomization:
     """Draw from an identification's posterior: each arm has a random row of `samples` (S, P) in `space`.
 
-    A whole row preserves the values' correlations. Every row is physically valid: tensor scales are positive, and the
-    full inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
+    Whole rows preserve correlations between parameters. Every row is physically valid: tensor scales are positive,
+    and the full inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
     """
 
     space: ParameterSpace
@@ -98,7 +98,7 @@ class PosteriorRandomization:
 
 @runtime_checkable
 class Pushes(Protocol):
-    """A randomization that applies random joint torques at every control step of a training, not of an evaluation."""
+    """Randomization that applies random joint torques at every control step in training, but not in evaluation."""
 
     def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
         """Draw the torques (m, n) Nm for the next control step of m arms."""
@@ -109,8 +109,8 @@ class Pushes(Protocol):
 class ForceRandomization:
     """Apply random joint torques instead of random dynamics (Valassakis et al. 2020, arXiv 2008.06686).
 
-    tau ~ U(-1, 1) * share * friction level of the joint, drawn at every control step. Like friction, the torque acts
-    on the joint itself, so the safety filter does not change it.
+    At every control step, each joint receives a torque U(-1, 1) * share * friction level of the joint. Like friction,
+    this torque acts on the joint itself, so the safety filter does not change this torque.
 
     Attributes:
         robot: the arm. center: nominal dynamics of the arm, without a batch dimension.
@@ -128,7 +128,7 @@ class ForceRandomization:
         check_number("dr.share", self.share, "[0, inf)")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return the center: all arms have the same dynamics."""
+        """Return the dynamics `center`, which all arms share."""
         return self.center
 
     def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
@@ -137,7 +137,7 @@ class ForceRandomization:
 
 
 def check_pair(name: str, pair: Any, allowed: str) -> None:
-    """Raise UserError unless dr.NAME is [least, most], both in the interval `allowed`, such as "[0, inf)"."""
+    """Raise UserError unless the option dr.NAME is a range [least, most] within `allowed`, such as "[0, inf)"."""
     if not isinstance(pair, list | tuple) or len(pair) != 2:
         raise UserError(f"dr.{name}: expected [least, most], got {pair!r}")
     for value in pair:
@@ -148,16 +148,16 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ContactRandomization(UniformRandomization):
-    """Draw arms from `UniformRandomization`, each with its own random plane near a nominal plane.
+    """Draw arms as `UniformRandomization` does, and for each arm a random surface near a nominal plane.
 
-    Stiffness is log-uniform, the exponent is either end of its range, and damping, friction and bristle are uniform.
-    The plane is displaced by U(-place, place) along its normal and tilted by U(0, tilt) about a random axis.
+    The exponent is the lower or the upper end of its range. Stiffness is log-uniform; damping, friction and bristle
+    are uniform. U(-place, place) displaces the plane along its normal, and U(0, tilt) tilts it about a random axis.
 
     Attributes:
-        point, normal: (3,) m and (3,), nominal plane; None: a table below the tip at home.
+        point, normal: (3,) m and (3,), of the nominal plane; None: a table below the tip at home.
         stiffness (N/m), exponent, damping (s/m), friction, bristle (m): ranges [least, most], see `Surface`.
-        place: m, largest displacement along the normal. tilt: degrees, largest tilt.
-        surface: run folder of an identified surface, to draw from its posterior; None: draw from the ranges.
+        place: m, largest displacement of the plane along its normal. tilt: degrees, largest tilt of the plane.
+        surface: run folder of an identified surface, whose posterior replaces the ranges; None: use the ranges.
 
     Raises:
         UserError: a range is malformed or outside what a surface allows, or the robot has no tool.
@@ -176,7 +176,7 @@ class ContactRandomization(UniformRandomization):
 
     @cached_property
     def _identified(self) -> Surface | None:
-        """All posterior draws of the identified surface, as one `Surface` with a batch axis; None: no `surface`."""
+        """All posterior draws of the identified surface, as a `Surface` with a batch axis; None without `surface`."""
         if not self.surface:
             return None
         draws = load_contact(self.surface, "dr.surface").draws
@@ -218,10 +218,10 @@ class ContactRandomization(UniformRandomization):
 def posterior_randomization(
     robot: Robot, center: Dynamics, calibration: str | Path | None, payload: Sequence[float] | None = None
 ) -> PosteriorRandomization:
-    """Return the randomization with the posterior in the run folder `calibration`; `center` is ignored.
+    """Return a randomization that draws from the posterior in the run folder `calibration`, and ignores `center`.
 
     Raises:
-        UserError: no folder is named, it does not exist, or it contains no posterior draws.
+        UserError: `calibration` is empty, or the folder does not exist or contains no posterior draws.
     """
     if not calibration:
         raise UserError("dr: identified draws from a posterior; give calibration=RUN_FOLDER as well")
@@ -230,7 +230,7 @@ def posterior_randomization(
 
 
 def check_payload(payload: Sequence[float] | None, robot: Robot) -> None:
-    """Raise UserError unless the payload is None, or [least, most] kg that the arm may carry."""
+    """Raise UserError unless the payload is None or a range [least, most] of masses, kg, that the arm may carry."""
     if payload is None:
         return
     if not isinstance(payload, list | tuple) or len(payload) != 2:
@@ -244,10 +244,10 @@ def check_payload(payload: Sequence[float] | None, robot: Robot) -> None:
 def with_payloads(
     robot: Robot, dynamics: Dynamics, payload: Sequence[float] | None, rng: np.random.Generator, m: int
 ) -> Dynamics:
-    """Return the dynamics of m arms, each with a random payload of [least, most] kg; None: no payload.
+    """Return the dynamics of m arms, each with a random payload of [least, most] kg; payload=None: no payload.
 
-    The mass is uniform. The center of mass is uniform in a ball about the end effector, with half the radius that
-    `payload_max` allows. The tensor is that of a ball of water. Gravity compensation does not include the payload.
+    The mass of a payload is uniform. The center of mass is uniform in a ball about the end effector, with half the
+    radius that `payload_max` allows. The tensor is that of a ball of water. Gravity compensation ignores the payload.
     """
     if payload is None:
         return dynamics

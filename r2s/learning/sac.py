@@ -1,7 +1,7 @@
 """Soft Actor-Critic (Haarnoja et al. 2018, arXiv:1801.01290) with the automatic temperature of arXiv:1812.05905.
 
 The losses equal those of `torchrl.objectives.SACLoss` without a value network and with squared errors, as in the
-papers; the tests compare them.
+papers. Tests compare both implementations.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class SAC(EntropyLearner):
-    """Learner of a stochastic policy; the smallest value of several critics limits overestimation.
+    """Learn a stochastic policy; the smallest value of several critics limits overestimation.
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.

@@ -2,7 +2,7 @@
 
 TD3 differs from DDPG in three ways: the target uses the smaller value of two critics, the target's action has noise,
 and only every other update changes the actor and the target networks. The losses equal those of
-`torchrl.objectives.TD3Loss` with the paper's squared error; the tests compare them.
+`torchrl.objectives.TD3Loss` with the paper's squared error; tests compare both implementations.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from r2s.learning.learner import DeterministicLearner, differentiate, polyak
 
 
 class TD3(DeterministicLearner):
-    """Learner of a deterministic policy; the smallest value of several critics limits overestimation.
+    """Learn a deterministic policy; the smallest value of several critics limits overestimation.
 
     Args:
         scale, action_scale, shared: see `DeterministicLearner`.
@@ -52,12 +52,12 @@ class TD3(DeterministicLearner):
 
         Args:
             batch: see `Learner.update`, with normalized observations.
-            noise: a standard normal draw (B, a) for the next action.
+            noise: (B, a), standard normal noise for the next action.
         """
         return {"loss_critic": self._critic_loss(batch, noise), "loss_actor": self._actor_loss(batch)}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step; return the losses. Without an actor update, the actor loss is the previous one."""
+        """Do one gradient step; return the losses. Steps without an actor update return the previous actor loss."""
         critics, actor = list(self.critics.parameters()), list(self.actor.parameters())
         out, gradients = self._critic_gradients(batch, torch.randn_like(batch["action"]))
         due = self.updates % self.policy_delay == 0  # true in the first update, so every logged row has an actor loss

@@ -1,7 +1,7 @@
 """Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
 
-The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). For speed, the
-critics are one batched network instead of a vmap over networks.
+The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). For speed, one
+batched network represents all critics, instead of a vmap over networks.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class TQC(EntropyLearner):
-    """Learner of a stochastic policy with quantile critics; the target omits the highest atoms.
+    """Learn a stochastic policy with quantile critics; the target omits the highest atoms.
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.

@@ -1,13 +1,13 @@
-"""The training loop of all algorithms: act, step all arms, store, update, evaluate at intervals.
+"""Train any algorithm: act, step all arms, store transitions, update, and evaluate at intervals.
 
-The budget limits wall-clock minutes, environment steps, or both; its spent share sets the curriculum. With only
-env_steps, runs with equal seeds and numbers of threads are equal bit for bit, even if stopped and resumed. With
-minutes, the curriculum depends on the clock.
+The budget limits wall-clock minutes, env steps, or both; the share of the budget used so far sets the curriculum. If
+only env_steps is limited, runs with equal seeds and equal numbers of threads agree bit for bit, even after a stop and
+resumption. If minutes are limited, the curriculum depends on the clock.
 
 The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
-one core, steps and updates alternate, with the same result. OpenMP threads shared by both would make both slower.
-After an update, OpenMP threads spin for milliseconds on the cores that the physics needs, and on a busy machine each
-OpenMP barrier waits for a thread that the system has suspended.
+one core, steps and updates alternate, with the same result. If physics and updates shared OpenMP threads, both would
+be slower, because OpenMP threads spin after an update for milliseconds on the cores that the physics needs, and
+because on a busy machine each OpenMP barrier waits for a thread that the system has suspended.
 """
 
 import copy
@@ -37,7 +37,7 @@ LOG_UPDATES = 1000  # updates between two rows of metrics.csv
 
 @dataclass(frozen=True)
 class Budget:
-    """The length of a training: it ends after `minutes` of wall-clock time or `env_steps`, whichever is first.
+    """Length of a training, which ends after `minutes` of wall-clock time or `env_steps`, whichever is first.
 
     Raises:
         UserError: neither minutes nor env_steps is set, or a value is not positive.
@@ -67,15 +67,15 @@ class Loop:
 
     Attributes:
         batch_size: transitions per update. updates_per_step: updates per step of all arms.
-        learning_starts: environment steps before the first update, with actions of the demonstrator or random ones.
+        learning_starts: env steps before the first update, with random actions or actions of the demonstrator.
         replay_size: capacity of the replay buffer in transitions.
         lr_decay, lr_end: after the share lr_decay of the budget, the learning rate falls linearly to lr_end times its
             initial value.
         explore_end: ratio of final to initial exploration noise, which falls geometrically over the budget.
-        eval_env_steps: environment steps between two evaluations; a training ends with one more evaluation.
-        compile: compile the losses first, within the budget. concurrent: step the arms in a separate thread.
-        matmul: precision of float32 matrix products in updates, as in torch.set_float32_matmul_precision: "medium"
-            allows bfloat16 factors; "auto" selects the precision by `fastest_matmul`.
+        eval_env_steps: env steps between two evaluations; a training ends with one more evaluation.
+        compile: whether to compile the losses, within the budget. concurrent: whether arms step in a separate thread.
+        matmul: precision of float32 matrix products in updates, for torch.set_float32_matmul_precision: "medium"
+            allows bfloat16 factors; "auto" selects the result of `fastest_matmul`.
 
     Raises:
         UserError: a value is out of range.
@@ -114,7 +114,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Callbacks:
-    """Functions that a training calls.
+    """Functions that `train` calls to report rows and progress.
 
     Attributes:
         log: called with each row of metrics.csv. evaluated: called with each row of evaluations.csv.
@@ -140,13 +140,13 @@ def train(
     """Train `algo` in place.
 
     Args:
-        env: arms, task and reward.
+        env: environment with arms, task and reward.
         algo: a learner, for example r2s.learning.tqc.TQC.
-        evaluate: policy -> Episodes, see r2s/learning/evaluate.py.
-        loop, budget: settings of the loop, and length of the training.
-        demonstrator: acts in the first loop.learning_starts environment steps; None: uniform random actions.
-        checkpoint: where to save the training after every evaluation; a saved training continues.
-        callbacks: functions for logs and progress.
+        evaluate: function that runs a policy and returns `Episodes`, see r2s/learning/evaluate.py.
+        loop, budget: settings of the training loop, and length of the training.
+        demonstrator: source of the actions in the first loop.learning_starts env steps; None: uniform random actions.
+        checkpoint: `Checkpoint` to which every evaluation saves the training; a saved training resumes.
+        callbacks: functions that receive logs and progress.
 
     Raises:
         FloatingPointError: an action, observation, reward or loss is not finite.
@@ -178,10 +178,10 @@ def train(
 
 
 class Training:
-    """The state of a training: arms, learner, replay buffer and counters; the arguments are those of `train`.
+    """State of a training: arms, learner, replay buffer and counters; the arguments are those of `train`.
 
     Attributes:
-        env_steps, updates: counters. next_eval: value of env_steps at which the next evaluation is due.
+        env_steps, updates: numbers of env steps and updates so far. next_eval: env_steps at the next evaluation.
         factor: `Reward.factor`, then the last result of `Reward.adapt`. evaluation: last row of evaluations.csv.
     """
 
@@ -211,12 +211,12 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time of the training, s, including the time before it was resumed."""
+        """Wall-clock time of the training, s, including the time before a resumption."""
         return time.perf_counter() - self._began
 
     @contextmanager
     def step(self, spent: float) -> Iterator[None]:
-        """Step all arms while the `with` block runs, then store their transitions; spent: spent share of budget."""
+        """Step all arms while the `with` block runs, then store the transitions; spent: used share of the budget."""
         env, state = self._env, self._state
         state["action"] = self._action(state["observation"])
         with self._dated_errors():
@@ -231,7 +231,7 @@ class Training:
         self.env_steps += env.nsim
 
     def _action(self, observation: Tensor) -> Tensor:
-        """Return the actions (nsim, a) for the next step: of the learner, of the demonstrator, or random actions."""
+        """Return the next actions (nsim, a): at first the demonstrator's or random actions, then the learner's."""
         if self.env_steps >= self._loop.learning_starts:
             return self._algo.explore(observation.to(self._device)).cpu()
         return self._demonstrator.action(observation) if self._demonstrator else self._env.action_spec.rand()
@@ -299,7 +299,7 @@ class Training:
 
 
 def run_now(function: Callable[..., Any], *given: Any) -> Future:
-    """Call the function at once; return its result as a future, like an executor's `submit`."""
+    """Call `function` at once and return a future with the result; this replaces `submit` of an executor."""
     done: Future = Future()
     done.set_result(function(*given))
     return done
@@ -312,14 +312,14 @@ def generators(device: torch.device) -> dict[str, torch.Tensor]:
 
 
 def set_generators(states: Mapping[str, Any], device: torch.device) -> None:
-    """Restore a result of `generators`, except generators that this device does not use."""
+    """Restore the generator states that `generators` returned, as far as this device uses the generators."""
     torch.set_rng_state(states["torch"])
     if device.type == "cuda" and "cuda" in states:
         torch.cuda.set_rng_state(states["cuda"], device)
 
 
 def keep_memory() -> None:
-    """Set glibc to reuse freed memory; by default it returns large blocks to the system, which slows every update."""
+    """Set glibc to reuse freed memory, because returning large blocks to the system would slow every update."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
@@ -329,10 +329,10 @@ def keep_memory() -> None:
 
 
 def fastest_matmul(device: torch.device) -> str:
-    """Return the precision for the fastest updates: "medium" (bfloat16) if the device has bfloat16 units.
+    """Return the fastest matrix precision: "medium" (bfloat16) if the device has bfloat16 units, else "highest".
 
-    A CPU with AVX-512 but without bfloat16 units saves no time with networks of 128 to 256 units, because rounding
-    the factors takes as long as the faster products save (benchmarks/results/speed.md).
+    On a CPU with AVX-512 but without bfloat16 units, "medium" saves no time with networks of 128 to 256 units:
+    rounding the factors takes as long as the faster products save (benchmarks/results/speed.md).
     """
     units = device.type == "cuda" or torch.cpu.get_capabilities().get("amx_bf16", False)
     return "medium" if units else "highest"
@@ -340,7 +340,7 @@ def fastest_matmul(device: torch.device) -> str:
 
 @contextmanager
 def matmul_precision(precision: str) -> Iterator[None]:
-    """Set the precision of float32 matrix products in a `with` block; elsewhere the precision is "highest"."""
+    """Set the precision of float32 matrix products inside a `with` block, and "highest" after the block."""
     torch.set_float32_matmul_precision(precision)
     try:
         yield

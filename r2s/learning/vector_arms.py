@@ -18,18 +18,18 @@ NOISES = "_sigma", "_noise", "_pose_noise"
 class VectorArms:
     """Simulate `width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
-    Stages in every ms of a control period: control law, soft start, low-pass, clip, rate limit, safety filter, delay
-    and lag, physics. Kinematics follow after the period. A `State` has true speeds and, separately, sensor noise.
+    Each ms of a control period has these stages: control law, soft start, low-pass, clip, rate limit, safety filter,
+    delay and lag, physics. Kinematics are computed once per period. A `State` contains true speeds and their noise.
 
     Attributes:
-        speeds: None, because simulated speeds are exact, without noise to smooth out.
+        speeds: None, because simulated speeds are exact and need no smoothing.
 
     Args:
         robot, task: the arm, and the task with its controller.
-        dynamics: dynamics of `width` arms, or of one arm for all arms.
+        dynamics: dynamics of `width` arms, or of one arm that represents all arms.
         nthread: number of threads; 0: all cores.
         soft_start_s: s, time over which the torque of an episode fades in.
-        seed: seed of the sensor noise; the noise restarts whenever all arms are placed.
+        seed: seed of the sensor noise; the noise restarts when `place` resets all arms.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class VectorArms:
         self.sim.push(tau)
 
     def place(self, starts: np.ndarray, first: int = 0, ids: np.ndarray | None = None) -> State:
-        """Reset the arms `ids` (None: all) to rest at starts (m, n) rad; return the state of all arms."""
+        """Reset the arms `ids` (None: all) to rest at angles `starts` (m, n) rad; return the state of all arms."""
         self.sim.reset(starts, np.zeros_like(starts), ids)
         at = slice(None) if ids is None else ids
         self._steps[at], self._limited[at] = 0, 0.0
@@ -84,11 +84,11 @@ class VectorArms:
         return self.read()
 
     def seed(self, seed: int | np.random.SeedSequence) -> None:
-        """Restart the sensor noise from this seed."""
+        """Restart the sensor noise from `seed`."""
         self._seed, self._rng = seed, np.random.default_rng(seed)
 
     def _sense(self, at: np.ndarray | slice = ALL) -> None:
-        """Draw the sensor noise of the arms `at` for the current state."""
+        """Draw new sensor noise for the arms with the indices `at`."""
         if self._sigma.any():
             sigma = self._sigma[at]
             self._noise[at] = sigma * self._rng.standard_normal(sigma.shape)
@@ -96,7 +96,7 @@ class VectorArms:
             self._pose_noise[at] = self._pose_sigma * self._rng.standard_normal(self._pose_noise[at].shape)
 
     def read(self) -> State:
-        """Return the current state of all arms; its arrays are views."""
+        """Return the current state of all arms, with views of the simulator's arrays instead of copies."""
         sim, t = self.sim, self._steps * self._period
         limited = (sim.limited - self._limited) / self._substeps
         noise = self._noise if self._sigma.any() else None
@@ -106,7 +106,7 @@ class VectorArms:
         return State(t, *arm, self._stopped, limited, noise, force, box)
 
     def step(self, command: np.ndarray) -> State:
-        """Run one control period with commands (width, c) of the controller; return the state after it.
+        """Run one control period with commands (width, c) of the controller; return the final state.
 
         Raises:
             FloatingPointError: a command is not finite.
@@ -125,12 +125,12 @@ class VectorArms:
         return self._stopped
 
     def state(self) -> dict:
-        """Return a copy of the state of simulation and noise for `set_state`."""
+        """Return a copy of the simulation state and the noise state for `set_state`."""
         own = {name: getattr(self, name).copy() for name in ("_steps", "_limited", *NOISES)}
         return {"sim": self.sim.state()} | own | {"_rng": self._rng.bit_generator.state}
 
     def set_state(self, state: Mapping) -> None:
-        """Restore a result of `state`; the same commands then lead to the same states, bit for bit."""
+        """Restore a state from `state`; the same commands then lead to the same arm states, bit for bit."""
         self.sim.set_state(state["sim"])
         self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
         for name in NOISES:
@@ -139,7 +139,7 @@ class VectorArms:
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:
-    """Raise FloatingPointError unless `rows` (m, k) are finite; `steps` (m,): steps of the episodes so far."""
+    """Raise FloatingPointError, with arm and episode step from `steps` (m,), unless `rows` (m, k) are finite."""
     finite = np.isfinite(rows)
     if not finite.all():
         arm = int((~finite.all(-1)).argmax())

@@ -1,8 +1,8 @@
-"""The path from target torque to joint torque, in steps of 1 ms: soft start, low-pass, clip, rate limit, motor delay.
+"""Convert target torque to joint torque in steps of 1 ms: soft start, low-pass, clip, rate limit, motor delay.
 
-Training, evaluation and hardware share this code, so a policy has the same latency on the arm as in simulation. The
-safety filter (safety_filter.py) acts between rate limit and delay: in a simulation within the physics step
-(mujoco_callback.py), on an arm in r2s/arm/driver.py.
+Training, evaluation and hardware share the functions of this module, so a policy has the same latency on the arm as
+in simulation. The safety filter (safety_filter.py) acts between rate limit and delay. The filter runs in the
+physics step of a simulation (mujoco_callback.py), and in the driver of an arm (r2s/arm/driver.py).
 """
 
 import math
@@ -20,11 +20,11 @@ def low_pass_factor(cutoff_hz: float, dt: float = SIM_DT) -> float:
 
 @njit(cache=True, error_model="numpy", inline="always")
 def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step_max):
-    """Return one joint's low-pass state and effort, Nm, after one cycle: soft start, low-pass, clip, rate limit.
+    """Return a joint's low-pass state and effort, Nm, after one cycle of soft start, low-pass, clip and rate limit.
 
     Args:
-        target: Nm, target torque. filtered, effort: Nm, of the previous cycle. cycle: current cycle, from 1.
-        factor: gain of the low-pass. fade: duration of the soft start in cycles.
+        target: Nm, target torque. filtered, effort: Nm, low-pass state and effort of the previous cycle.
+        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: soft start, cycles.
         tau_max: Nm, largest effort. step_max: Nm, largest change of the effort per cycle.
     """
     faded = target
@@ -41,8 +41,8 @@ def condition(target, state, settings, nstep, out):
     """Apply `condition_joint` to m arms; write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`.
 
     Args:
-        target: (m, n) Nm. state: low-pass state (m, n) Nm, effort (m, n) Nm, cycle count (m,); all are updated.
-        settings: factor, fade, tau_max (n,) Nm and step_max (n,) Nm per cycle of `condition_joint`.
+        target: (m, n) Nm, target torques. state, updated: low-pass states and efforts (m, n) Nm, cycle numbers (m,).
+        settings: arguments of `condition_joint`: factor, fade, tau_max (n,) Nm and step_max (n,) Nm per cycle.
     """
     filtered, effort, cycle = state
     factor, fade, tau_max, step_max = settings
@@ -60,7 +60,7 @@ class Actuation:
     """Convert the target torques of m arms to efforts, by soft start, low-pass, clip and rate limit.
 
     Attributes:
-        last: (m, n) Nm, last effort. filtered: (m, n) Nm, state of the low-pass.
+        last: (m, n) Nm, efforts of the last cycle. filtered: (m, n) Nm, states of the low-pass.
 
     Args:
         robot: the arm with its torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
@@ -81,7 +81,7 @@ class Actuation:
             array[at] = 0
 
     def __call__(self, target: np.ndarray, nstep: int) -> np.ndarray:
-        """Return the efforts (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm."""
+        """Return the efforts (m, nstep, n) Nm of the next `nstep` ms for constant target torques (m, n) Nm."""
         out = np.empty((len(target), nstep, target.shape[1]))
         target = np.ascontiguousarray(target, dtype=np.float64)
         settings = self._factor, self._fade, self._tau_max, self._step_max
@@ -90,8 +90,8 @@ class Actuation:
 
 
 MAX_DELAY = 0.02  # s, longest pure delay of the model
-# Number of steps by which a semi-implicit simulation responds too early: in it, q(k+1) - 2 q(k) + q(k-1) = h^2 a(k),
-# whereas on an arm the torques of steps k - 1 and k contribute half each.
+# Number of steps by which a semi-implicit simulation responds too early. In a simulation, q(k+1) - 2 q(k) + q(k-1) =
+# h^2 a(k). On an arm, the torques of steps k - 1 and k contribute half each.
 EARLY = 0.5
 SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 
@@ -100,12 +100,12 @@ SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    A command that arrives during a step acts for the rest of the step. The motor torque m follows the command u with
-    dm/dt = (u - m) / lag, so its mean over a time s is u + (m - u) (1 - exp(-s / lag)) lag / s.
+    If a command arrives within a step, the previous command acts until the arrival. The motor torque m follows the
+    command u with dm/dt = (u - m) / lag, so the mean of m over a time s is u + (m - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
-        line: (SLOTS, n) Nm, recent commands: that of cycle k is in row k % SLOTS. motor: (n,) Nm, motor torque.
-        cycle: number of the newest command, at least SLOTS. delay, lag: in steps.
+        line: (SLOTS, n) Nm, recent commands; row k % SLOTS is the command of cycle k. motor: (n,) Nm, motor torques.
+        cycle: cycle of the newest command, at least SLOTS. delay, lag: pure delay and lag in steps.
     """
     whole = int(delay)
     late = delay - whole
@@ -122,7 +122,7 @@ def motor_torque(line, motor, cycle, delay, lag, out):
 
 @njit(cache=True)
 def delayed(tau, delay, lag, steps, line, motor, cycle, out):
-    """Write each arm's mean torque per step for commands that pass a delay and a lag, both in steps."""
+    """Write into `out` the mean motor torques in each step after a delay and a lag, both in steps."""
     for i in range(tau.shape[0]):
         for k in range(steps):
             line[i, cycle[i] % SLOTS] = tau[i, k]
@@ -140,7 +140,7 @@ class Motors:
     """Convert the commands of m simulated arms to joint torques, by a pure delay and then a first-order lag.
 
     Delay and lag act in continuous time, as on an arm. The simulation responds half a step too early (EARLY), so this
-    class delays torques by another half step.
+    class adds half a step of delay.
     """
 
     def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):
@@ -150,12 +150,12 @@ class Motors:
         self.set(delay, lag)
 
     def set(self, delay: np.ndarray | float, lag: np.ndarray | float, ids: np.ndarray | None = None) -> None:
-        """Set delay and lag, s, of the arms `ids` (all by default): one value for all, or (m,)."""
+        """Set delay and lag, s, of the arms `ids` (all by default), each as one value or as one per arm (m,)."""
         at = slice(None) if ids is None else ids
         self._delay[at], self._lag[at] = steps_late(delay, lag)
 
     def reset(self, ids: np.ndarray | None = None, tau: np.ndarray | float = 0.0) -> None:
-        """Reset the arms `ids` (all by default) to the steady state of a constant torque `tau` (m, n) Nm."""
+        """Reset the arms `ids` (all by default) to the steady state under constant torques `tau` (m, n) Nm."""
         at = slice(None) if ids is None else ids
         self._motor[at] = tau
         self._line[at] = np.asarray(tau)[..., None, :] if np.ndim(tau) else tau

@@ -12,8 +12,8 @@ from r2s.physics.tip import default_plane, nominal_plane
 
 SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; the tip pushes below the hand
 PUSHED_AT = 0.4  # height at which the tip pushes, as a share of the box's height
-SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal place, to either side
-FORWARD = 0.25  # offset of the nominal place ahead of the tip at home, over the tip's distance from the base
+SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal pose, to either side
+FORWARD = 0.25  # distance of the nominal box ahead of the tip at home, as a share of the tip's distance from the base
 # Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
 # from a carton on a smooth table to a block of wood on a dry table
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)
@@ -23,10 +23,10 @@ EXPECTED = {"mass": 0.8, "table": 0.35, "friction": 0.3, "stiffness": 2.5e4, "da
 
 @dataclass(frozen=True)
 class TableFrame:
-    """A coordinate frame on a table, at the nominal place of a box.
+    """Coordinate frame on a table, at the nominal position of a box.
 
     Attributes:
-        origin: (3,) m, origin in the base frame. axes: (3, 3), axes in rows: ahead (away from the arm), left, up.
+        origin: (3,) m, in the base frame. axes: (3, 3), unit vectors ahead (away from the arm), left and up, in rows.
     """
 
     origin: np.ndarray
@@ -53,7 +53,7 @@ class TableFrame:
         return np.concatenate([centre, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1) @ self.axes], axis=-1)
 
     def moved(self, pose: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Displace poses (m, 6) of a box by `by` (m, 3): x m, y m and yaw rad in the table frame."""
+        """Return poses (m, 6) of boxes, displaced in the table frame by `by` (m, 3): x m, y m and yaw rad."""
         c, s = np.cos(by[:, 2:]), np.sin(by[:, 2:])
         first, up = pose[:, 3:], self.axes[2]
         turned = c * first + s * np.cross(up, first)  # `first` is perpendicular to `up`
@@ -61,7 +61,7 @@ class TableFrame:
 
 
 def table_frame(robot: Robot, point: Any = None, normal: Any = None) -> TableFrame:
-    """Return the frame of a table at a point (3,) m with a normal (3,); None: below and ahead of the tip at home."""
+    """Return a table's frame from a point (3,) m and a normal (3,); None: below and ahead of the tip at home."""
     place, up = nominal_plane(robot, point, normal)
     across = place - (place @ up) * up
     size = float(np.linalg.norm(across))
@@ -75,8 +75,8 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
     """Return boxes that stand on a table.
 
     Args:
-        frame: table frame. planar: (..., 3), x m, y m and yaw rad of the box in it. size: (3,) m, edges.
-        law: mass, table, friction, stiffness, damping, bristle and exponent of `Surface`.
+        frame: frame of the table. planar: (..., 3), x m, y m and yaw rad of boxes in `frame`. size: (3,) m, edges.
+        law: fields mass, table, friction, stiffness, damping, bristle and exponent of `Surface`.
     """
     half = 0.5 * np.array(size, dtype=float)
     pose, up = frame.pose(planar, half[2]), frame.axes[2]
@@ -86,9 +86,9 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
 
 
 def check_size(name: str, size: Any, table: float) -> np.ndarray:
-    """Return the edges (3,) m of a box; raise UserError if a push at PUSHED_AT of its height tilts it.
+    """Return a box's edges (3,) m; raise UserError if a push at PUSHED_AT times its height would tilt the box.
 
-    A push at the height h must overcome the table friction mu m g, so it tilts a box with half edge a if mu h > a.
+    A push must overcome the table friction mu m g, so a push at height h tilts a box with half edge a if mu h > a.
     """
     if not isinstance(size, list | tuple | np.ndarray) or len(size) != 3:
         raise UserError(f"{name}: expected three edges in m, got {size!r}")

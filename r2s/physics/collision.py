@@ -1,12 +1,12 @@
 """Compiled collision check of many arms: each arm with itself, the table and obstacles.
 
-r2s checks the geoms of the robot's file, without planes and height fields. If the file enables collision for some
-geoms, r2s ignores the others. As in MuJoCo, convex hulls replace meshes. Bounding spheres replace signed distance
-fields. The check omits two kinds of pairs:
+r2s checks the geoms of the robot's file, except planes and height fields. If the file enables collision only for some
+geoms, r2s checks only these geoms. Convex hulls replace meshes, as in MuJoCo, and bounding spheres
+replace signed distance fields. The check omits two kinds of pairs:
 
-- A geom and the table, if only vertical joints or no joints move the geom, because its height never changes.
-- Geoms of neighboring links, which touch at their joint, and geoms closer than HOUSING_M at q_home. Such close geoms
-  are parts of one joint's housing on links two joints apart, as in the Panda's shoulder.
+- A geom and the table, if the geom's height is constant, because no joint or only vertical joint axes move the geom.
+- Two geoms of neighboring links, which touch at their joint, and two geoms closer than HOUSING_M at q_home, which can
+  belong to one joint's housing on links two joints apart, as in the Panda's shoulder.
 """
 
 from collections.abc import Collection
@@ -32,10 +32,10 @@ LINK, LOCAL, WIDTH = BODY, BODY + 1, BODY + 1 + POSE  # columns of a body: link 
 
 @dataclass(frozen=True)
 class CollisionPairs:
-    """The pairs of geoms that the collision check compares.
+    """Pairs of geoms whose distance the collision check computes.
 
     Attributes:
-        above: geoms to check against the table. pairs: pairs of geoms; pairs with an obstacle come first.
+        above: geoms to compare with the table. pairs: pairs of geoms, beginning with pairs that contain an obstacle.
         link: (ngeom,) number of each geom's link, from 1; 0: the base.
     """
 
@@ -47,9 +47,9 @@ class CollisionPairs:
 def collision_pairs(
     robot: Robot, model: mujoco.MjModel, *, table: bool = True, may_touch: Collection[tuple[str, str]] = ()
 ) -> CollisionPairs:
-    """Return the pairs of geoms to check; table: whether to check geoms against the table.
+    """Return the pairs of geoms to check; table: whether to check for collisions with the table.
 
-    may_touch: pairs of body names, or of a body name and "table", to omit.
+    may_touch: pairs that the check omits: two body names, or a body name and "table".
     """
     link = np.searchsorted(model.jnt_bodyid, model.body_weldid[model.geom_bodyid], side="right")
     box = np.array([model.geom(g).name.startswith(PREFIX) for g in range(model.ngeom)], dtype=bool)
@@ -86,7 +86,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Geometry for the compiled check: bodies, hull vertices, rows of bodies to check, and the table's height, m."""
+    """Geometry for the compiled check: bodies, hull vertices, rows of `bodies` to check, and table height, m."""
 
     bodies: np.ndarray
     vertices: np.ndarray
@@ -103,10 +103,10 @@ class CollisionCheck:
         links, scene: arrays for the compiled functions `body_poses` and `pair_distance`.
 
     Args:
-        robot: the arm; its file contains the geoms.
-        table: m, height of the table in the base frame; -inf: no table. None: TABLE_M, but no table for an arm that
-            reaches below TABLE_M at q_home, such as a hanging arm.
-        may_touch: pairs of body names, or of a body name and "table", to omit.
+        robot: the arm, whose file contains the geoms.
+        table: m, height of the table in the base frame; -inf: no table. None: a table at TABLE_M or, if the arm
+            reaches below TABLE_M at q_home, as a hanging arm does, no table.
+        may_touch: pairs that the check omits: two body names, or a body name and "table".
 
     Raises:
         UserError: a checked pair touches at q_home.
@@ -150,7 +150,7 @@ class CollisionCheck:
         return out
 
     def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances (m, K) m of the pairs in `names` at q (m, n) rad; 0 or less if they overlap."""
+        """Return the distances (m, K) m of the pairs in `names` at q (m, n) rad, 0 or less for overlapping pairs."""
         q = np.ascontiguousarray(q, dtype=float)
         out = np.empty((len(q), len(self.names)))
         _distances(q, self.links, self.scene, out)
@@ -158,7 +158,7 @@ class CollisionCheck:
 
 
 def empty_scene() -> Scene:
-    """Return a scene without bodies and pairs, in which no arm collides."""
+    """Return a scene without bodies and pairs, so that no arm collides."""
     none = np.zeros((0, 2), dtype=int)
     return Scene(np.zeros((0, WIDTH)), np.zeros((0, 3)), np.zeros(0, dtype=int), none, -np.inf)
 
@@ -166,7 +166,7 @@ def empty_scene() -> Scene:
 def _bodies(
     robot: Robot, model: mujoco.MjModel, geoms: list[int], link: np.ndarray, links: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the geoms as rows of `Scene.bodies` (G, WIDTH), and the vertices (V, 3) of their convex hulls."""
+    """Return the geoms as rows (G, WIDTH) of `Scene.bodies`, and the vertices (V, 3) m of their convex hulls."""
     data = mujoco.MjData(model)
     data.qpos[:] = np.zeros(robot.n)
     mujoco.mj_kinematics(model, data)
@@ -215,7 +215,7 @@ def _shape(model: mujoco.MjModel, g: int) -> tuple[int, float, np.ndarray, np.nd
 
 @njit(cache=True, error_model="numpy")
 def body_poses(links, bodies, q, frames, poses):
-    """Write each body's pose (G, POSE) at q (n,) rad; frames: (n, POSE), work array."""
+    """Write the poses (G, POSE) of the bodies at q (n,) rad; `frames` (n, POSE) is a scratch array."""
     link_frames(links, q, frames, np.empty((len(links), 3)))
     for g in range(len(bodies)):
         body, link = bodies[g], int(bodies[g, LINK])
@@ -231,7 +231,7 @@ def body_poses(links, bodies, q, frames, poses):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
-    """Return the distance, m, of pair k, or a lower bound if this exceeds `enough` m; work: (10, 3), work array."""
+    """Return the distance, m, of pair k, or a lower bound above `enough` m; `work` (10, 3) is a scratch array."""
     bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]

@@ -1,19 +1,19 @@
-"""Contact of a tool's tip with a surface in one step of 1 ms, implicit in stiffness, damping and friction.
+"""Solve the contact of a tool's tip with a surface in a step of 1 ms, implicit in stiffness, damping and friction.
 
-Normal force: the law of Hunt and Crossley (surface.py), averaged over the tip's path in a step. The mean of K d^e is
-(V(d1) - V(d0)) / (d1 - d0), where V is the potential of K d^e. This discrete gradient (Gonzalez, J. Nonlinear Science
-6, 1996) conserves the energy of a bounce at any stiffness, even if the tip touches or lifts within the step. After a
-semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions. So the path begins at depth d0 =
-d - h rate / 2 and ends at d1 = d0 + h (rate + rate1) / 2, for penetration rates rate and rate1 before and after it.
+The normal force is the mean of the law of Hunt and Crossley (surface.py) over the step. The mean of K d^e from the
+depth d0 to the depth d1 is (V(d1) - V(d0)) / (d1 - d0), where V is the potential of K d^e. This discrete gradient
+(Gonzalez, J. Nonlinear Science 6, 1996) conserves the energy of a bounce at any stiffness, even if contact begins or
+ends within the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions, so d0
+= d - h rate / 2 and d1 = d0 + h (rate + rate1) / 2 for penetration rates rate and rate1 before and after the step.
 
-Tangential force: bristles have a stiffness proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
-1995). The deflection z follows dz/dt = v - |v| z / z_s, in backward Euler; z_s is `bristle`. The friction force
+The stiffness of tangential bristles is proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
+1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with z_s = `bristle`. The friction
 -mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; in sliding it is mu F.
 
-The unknowns are the joint velocities at the end of the step. Both forces are linearized about a guess of these
-velocities; the constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law
-solves this system, so contact forces can start a joint at rest. `start_guess` makes the first guess. `add_contact`,
-the solution and `next_guess` repeat until the guess is accurate, usually once. `finish_contact` ends the step.
+The unknowns are the joint velocities at the end of the step. Both contact forces are linearized about a guess of the
+unknowns; the constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law solves
+the linearized equations, so contact forces can start a joint at rest. `start_guess` writes the first guess. Then
+`add_contact`, `coming_velocity` and `next_guess` repeat until the guess is accurate, usually once.
 """
 
 import numpy as np
@@ -74,7 +74,7 @@ SHORT = 1e-6  # path over depth, below which V(d1) - V(d0) is round-off and the 
 def mean_force(contact, begin, rate, coming, h):
     """Return a step's mean normal force, N, and its derivative with respect to `coming`, N s/m.
 
-    begin: m, depth at the beginning. rate, coming: m/s, penetration rates at the beginning and end of the step.
+    begin: m, penetration depth at the beginning. rate, coming: m/s, penetration rates at the beginning and end.
     """
     middle = 0.5 * (rate + coming)
     span = h * middle
@@ -103,7 +103,7 @@ def mean_force(contact, begin, rate, coming, h):
 def _from_box(contact, x, y, z):
     """Return the distance, m, from a box's surface to a point at x, y, z m from the box's center; negative: inside.
 
-    Also write the surface's normal at the point, and project the bristle deflection onto the tangential plane.
+    Also write the surface normal at the point, and project the bristle deflection onto the tangent plane.
     """
     axes, half, normal = contact[AXES : AXES + 9], contact[HALF : HALF + 3], contact[NORMAL : NORMAL + 3]
     square, face, least, side = 0.0, 0, -np.inf, 1.0
@@ -132,12 +132,12 @@ def _from_box(contact, x, y, z):
 def near(contact, place, anchor, axis, dq, h, jacobian):
     """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch within the step.
 
-    Call `near` once per step, because it also moves a sliding box that the tip cannot touch.
+    Call `near` only once per step: if the tip cannot touch the box, `near` also moves a sliding box by one step.
 
     Args:
-        contact: (COLUMNS,), updated; if the tip cannot touch, force and deflection become 0.
-        place: position (3,) m and rotation (9,) of the link that carries the tool, in the base frame.
-        anchor, axis: (n, 3), position, m, and direction of each joint axis. dq: (n,) rad/s.
+        contact: (COLUMNS,), updated in place; force and deflection become 0 if the tip cannot touch the surface.
+        place: position (3,) m and rotation (9,), in the base frame, of the link that carries the tool.
+        anchor, axis: (n, 3) m and (n, 3), position and direction of each joint axis. dq: (n,) rad/s, joint speeds.
     """
     position, R = place
     rate = 0.0
@@ -193,7 +193,7 @@ def _box_rate(contact):
 def _bristles(contact, force, speed, h):
     """Return the friction's spring, N/m, and damper, N s/m, for a normal force, N, and a sliding speed, m/s.
 
-    Friction is -(spring z + damper v), with deflection z at the beginning and velocity v at the end of a step.
+    The friction force is -(spring z + damper v), with the deflection z before and the velocity v after the step.
     """
     reach = max(contact[BRISTLE], RIGID)
     late = MICRO_DAMPING * np.exp(-((speed / SLIP) ** 2)) / h
@@ -204,7 +204,7 @@ def _bristles(contact, force, speed, h):
 
 @njit(cache=True, error_model="numpy")
 def _velocity(jacobian, dq, slide):
-    """Return a tip's penetration rate and sliding speed, m/s; write its tangential velocity to `slide` (3,) m/s."""
+    """Return a tip's penetration rate and sliding speed, m/s; write the tangential velocity to `slide` (3,) m/s."""
     rate = 0.0
     slide[:] = 0.0
     for j in range(len(dq)):
@@ -216,7 +216,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Return rate and speed, m/s, relative to a box whose contact point moves at `point` (3,) m/s; update `slide`."""
+    """Subtract a box's velocity `point` (3,) m/s from `slide` and `rate`; return relative rate and speed, m/s."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]
@@ -228,7 +228,7 @@ def _relative(contact, rate, slide, point):
 
 @njit(cache=True, error_model="numpy")
 def start_guess(contact, jacobian, dq, h, guess):
-    """Write the first guess (GUESS,): after the step, the joint velocities are still dq (n,) rad/s."""
+    """Write the first guess (GUESS,), which assumes that the joint velocities dq (n,) rad/s stay constant."""
     rate, speed = _velocity(jacobian, dq, guess[SLIDE : SLIDE + 3])
     if contact[MASS] > 0.0:
         point = np.empty(3)
@@ -243,7 +243,7 @@ def start_guess(contact, jacobian, dq, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def add_contact(contact, jacobian, h, guess, mass, drive):
-    """Add the contact, linearized about the guess, to a packed mass matrix, kg m^2, and a driving torque (n,) Nm."""
+    """Add the linearized contact force to a packed mass matrix, kg m^2, and to a driving torque (n,) Nm."""
     spring, damper = _bristles(contact, guess[NORMAL_FORCE], guess[SPEED], h)
     guess[SPRING], guess[DAMPER], slope = spring, damper, guess[SLOPE]
     force = guess[NORMAL_FORCE] + slope * (guess[RATE] - guess[NEXT])
@@ -265,7 +265,7 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
-    """Add the contact with a box; held: N, normal and minus tangential force (3) for a box of constant velocity."""
+    """Add the contact with a movable box; held: N, normal and negated tangential force (3) at fixed box velocity."""
     n, at = contact[NORMAL : NORMAL + 3], np.empty(3)
     for k in range(3):
         at[k] = held[0] * n[k] - held[1 + k]
@@ -286,7 +286,7 @@ def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def next_guess(contact, jacobian, h, coming, guess):
-    """Update the guess from the solution `coming` (n,) rad/s; return whether the old guess was accurate enough."""
+    """Update the guess from the solved joint velocities `coming` (n,) rad/s; return whether the guess was good."""
     force, fast = guess[NORMAL_FORCE], guess[SPEED]
     rate, speed = _velocity(jacobian, coming, guess[SLID : SLID + 3])
     box_late = 0.0
@@ -320,7 +320,7 @@ def finish_contact(contact, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _deflect(contact, slide, speed, h, terms):
-    """Write the contact force and the deflection after h s; terms: normal force N, spring N/m, damper N s/m."""
+    """Write contact force and bristle deflection after h s; terms: normal force, N, spring, N/m, damper, N s/m."""
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0
     z = contact[DEFLECTION : DEFLECTION + 3]
@@ -334,7 +334,7 @@ def _deflect(contact, slide, speed, h, terms):
 
 @njit(cache=True, error_model="numpy")
 def explicit_contact(contact, jacobian, dq, h):
-    """Write force and deflection for an explicit step of h s, much shorter than the contact's oscillation period."""
+    """Do an explicit contact step of h s, which must be much shorter than the contact's oscillation period."""
     tangent = np.empty(3)
     rate, speed = _velocity(jacobian, dq, tangent)
     if contact[MASS] > 0.0:
@@ -350,7 +350,7 @@ def explicit_contact(contact, jacobian, dq, h):
 
 @njit(cache=True, error_model="numpy")
 def contact_torque(contact, jacobian, out):
-    """Write the joint torques (n,) Nm of the contact force."""
+    """Write the joint torques (n,) Nm due to the contact force."""
     x, y, z = contact[FORCE], contact[FORCE + 1], contact[FORCE + 2]
     normal = contact[NORMAL] * x + contact[NORMAL + 1] * y + contact[NORMAL + 2] * z
     for j in range(len(out)):
@@ -359,11 +359,11 @@ def contact_torque(contact, jacobian, out):
 
 @njit(cache=True, error_model="numpy")
 def contact_velocity(touch, mass, damping, h, forces, dq_min, work, coming):
-    """Solve a step in contact: write the final velocities (n,) to `coming`, force and deflection to the contact.
+    """Solve a step in contact: write final joint velocities (n,) rad/s to `coming`, contact results to `contact`.
 
     Args:
-        touch: contact (COLUMNS,) and Jacobian, as from `near`. work: work array, at least (2 n + 6, n).
-        mass, damping, h, forces, dq_min, coming: as for `coming_velocity`.
+        touch: arrays `contact` (COLUMNS,) and `jacobian` (ROWS, n) of `near`. work: (2 n + 6, n), scratch array.
+        mass, damping, h, forces, dq_min, coming: see `coming_velocity`.
     """
     contact, jacobian = touch
     n, size, guess = len(coming), len(mass), np.empty(GUESS)

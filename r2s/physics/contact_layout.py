@@ -1,4 +1,4 @@
-"""Layout of the arrays `contact` and `guess` (contact.py, sliding.py), and conversion of a `Surface` to `contact`."""
+"""Define the columns of the arrays `contact` and `guess` (contact.py, sliding.py), and fill `contact`."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from r2s.physics.surface import Surface
 
 # Columns of `contact`: the surface (see `Surface`), the tool, and the results of a step
 K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
-# HALF: half edges, 0 for a plane. AXES: matrix, row by row. NORMAL: for a box, the surface normal at the tip
+# HALF: half edges of a box, 0 for a plane. AXES: box axes, row by row. NORMAL: for a box, the normal at the tip
 HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
 # Columns for a box that slides on a table (sliding.py). MASS: 0 for a fixed surface. WEIGHT: N. TABLE: friction
 # coefficient. REACH: m, moment over force of table friction. UP: table normal. VELOCITY (3): m/s, of center. SPIN:
@@ -31,7 +31,7 @@ GUESS = BOX_SPEED + 1
 
 
 def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
-    """Return the array `contact` (..., COLUMNS) for a surface and the robot's tool, before the first step.
+    """Return the initial array `contact` (..., COLUMNS) for a surface and the robot's tool.
 
     Raises:
         UserError: the robot has no tool, or a value of the surface is out of its range.
@@ -65,5 +65,5 @@ def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
 
 
 def box_pose(contact: np.ndarray) -> np.ndarray:
-    """Return a box's pose (..., 6), center m and first axis, from `contact` (..., COLUMNS)."""
+    """Return box poses (..., 6), each a center, m, and a first axis, from `contact` (..., COLUMNS)."""
     return np.concatenate([contact[..., POINT : POINT + 3], contact[..., AXES : AXES + 9 : 3]], axis=-1)

@@ -1,17 +1,17 @@
-"""Stop of an arm whose tip presses on a surface: the driver holds the contact force, releases it, or retreats.
+"""Stop an arm whose tip presses on a surface: hold the contact force, release the tip, or retreat.
 
-If a stop only removed the command, the surface would return its elastic energy F^2 / 2k and push the tip off by up to
-F / k, or joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver has three stops:
+If a stop only removed the command, the surface's elastic energy F^2 / 2k would push the tip off by up to F / k, or
+joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver has three kinds of stop:
 
-- hold: the target torque is J^T R, with the contact force R that the push limit estimated when the stop began.
+- hold: the target torque is J^T R, where R is the contact force that the push limit estimated at the stop's start.
 - release: the tip moves outward at the speed LEAVE until the contact force F is gone. A velocity loop tracks the
-  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains R and the modeled friction; an
-  integral adds at most as much again, for an arm with more friction. In this motion, joint friction pushes the tip
-  inward with a force h, so R = F - h. The motion ends at R = RELEASED - SLIDES h, with the modeled h. The remaining F
-  is at most RELEASED + (1 - SLIDES) h if the true friction is at most h, or RELEASED if it is SLIDES h.
-- retreat: the arm releases the tip, then moves it RETREAT_M farther outward.
+  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains R and the modeled friction force
+  h; for an arm with more friction, an integral adds at most h. During the outward motion, joint friction pushes the
+  tip inward by h, so R = F - h. This motion ends when R falls to RELEASED - SLIDES h. The remaining contact force is
+  at most RELEASED + (1 - SLIDES) h for a true friction of at most h, and RELEASED for a true friction of SLIDES h.
+- retreat: the arm releases the tip, then moves the tip RETREAT_M farther outward.
 
-Every stop obeys the limits of push, speed and acceleration, and any outward motion ends after LEAVES_S.
+Every stop obeys the limits of push, speed and acceleration, and every outward motion ends after LEAVES_S.
 """
 
 import numpy as np
@@ -33,11 +33,11 @@ BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
 @njit(cache=True, error_model="numpy")
 def stop_torque(limit, arm, kinematics, friction, limits, held, target):
-    """Write the target torque (n,) Nm of a stop in one cycle; return the largest requested share of an allowed speed.
+    """Write a stop's target torque (n,) Nm for a cycle; return the largest requested share of an allowed joint speed.
 
     Args:
         limit, arm, kinematics, friction: see `push_bound`. limits: see `filter_limits`.
-        held: (n,) Nm, torque with which an adapter holds a load; this function subtracts it from R.
+        held: (n,) Nm, an adapter's torque against a load; this function subtracts the load's force from R.
     """
     n = len(target)
     root, row, lever, ddq = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

@@ -4,13 +4,13 @@ A control law is a compiled function `law(q, dq, command, parameters, memory, ou
 
     q, dq: (n,) rad, rad/s, measured in this cycle.
     command: (c,), constant in a control period: the policy's action in SI units, then the setpoint of the task.
-    parameters: (p,), constant in a motion.
-    memory: (k,), state of the law; 0 when a motion begins.
+    parameters: (p,), parameters of the law, constant during a motion.
+    memory: (k,), state of the law, 0 at the beginning of a motion.
     out: (n,) Nm, target torque that the law computes, without gravity.
 
-The same compiled law runs during training in MuJoCo's callback (mujoco_callback.py), on every arm in the driver
-(r2s/arm/driver.py), and in an exported bundle. The package r2s/control selects the control law and its parameters.
-The laws are in r2s/physics because MuJoCo's callback contains them and numba caches compiled code per folder.
+Training runs a control law in MuJoCo's callback (mujoco_callback.py), and every arm runs the same law in the driver
+(r2s/arm/driver.py) or in an exported bundle. The package r2s/control selects the control law and its parameters.
+The laws share the folder r2s/physics with MuJoCo's callback, because numba caches compiled code per folder.
 """
 
 from collections.abc import Callable
@@ -24,10 +24,10 @@ from r2s.physics.user_laws import call_control, control_address
 
 
 class ControlLaw(Protocol):
-    """A control law with its parameters; `Controller` in r2s/control/controller.py implements it.
+    """Interface of a control law with parameters, which `Controller` in r2s/control/controller.py implements.
 
     Attributes:
-        law: the compiled function. parameters: (p,). command_size, memory_size: lengths of command and memory.
+        law: compiled function. parameters: (p,), of the law. command_size, memory_size: sizes of command and memory.
     """
 
     @property
@@ -51,11 +51,11 @@ def torque_law(q, dq, command, parameters, memory, out):
 def computed_torque_law(q, dq, command, parameters, memory, out):
     """Write the computed torque: feedforward plus a critically damped PD law, weighted with the mass matrix.
 
-    tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)), updated every `hold` cycles.
+    Every `hold` cycles, tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)).
 
-    command: torque (n) and feedforward (n) Nm, q_d (n) rad, dq_d (n) rad/s, mass matrix M (n n) kg m^2.
-    parameters: w, rad/s, and `hold`, cycles.
-    memory: cycles since the last update, and torque (n) Nm of this update.
+    command: command torque (n) and feedforward (n) Nm, q_d (n) rad, dq_d (n) rad/s, mass matrix M (n n) kg m^2.
+    parameters: bandwidth w, rad/s, and number `hold` of cycles between two updates of tau.
+    memory: number of cycles since the last update of tau, and tau (n) Nm.
     """
     n = len(q)
     if memory[0] == 0.0:
@@ -103,7 +103,7 @@ def _run_built_in(number, q, dq, command, parameters, memory, out):
 
 
 def run_law(law: Callable, q: np.ndarray, dq: np.ndarray, command: np.ndarray, parameters: np.ndarray, memory: int):
-    """Return the torques (m, n) Nm of m arms in the first cycle of a motion, for q, dq (m, n) and command (m, c)."""
+    """Return a law's torques (m, n) Nm in the first cycle of a motion, at q, dq (m, n) with commands (m, c)."""
     out = np.empty(q.shape)
     q, dq = np.ascontiguousarray(q), np.ascontiguousarray(dq)  # one array type, so that numba compiles once
     if law in BUILT_IN:

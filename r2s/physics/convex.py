@@ -1,8 +1,8 @@
-"""Compiled distance of two convex bodies: spheres, capsules, cylinders, boxes, ellipsoids and convex hulls.
+"""Compute the distance of two convex bodies: spheres, capsules, cylinders, boxes, ellipsoids or convex hulls.
 
-A body consists of all points within a radius of its core, and a support function describes the core. The distance of
-two cores is computed by the algorithm of Gilbert, Johnson and Keerthi (IEEE Journal of Robotics and Automation 4(2),
-1988), with the simplex cases of Ericson (Real-Time Collision Detection, 2005, ch. 5).
+A body consists of all points within a radius of its core, and a support function describes the core. The algorithm of
+Gilbert, Johnson and Keerthi (IEEE Journal of Robotics and Automation 4(2), 1988) computes the distance of two cores,
+with the simplex cases of Ericson (Real-Time Collision Detection, 2005, ch. 5).
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ ITERATIONS = 64
 
 @njit(cache=True, error_model="numpy")
 def support_point(body, vertices, pose, dx, dy, dz):
-    """Return the support point (x, y, z) of a body's core in a direction; pose: a row (POSE,) of `link_frames`."""
+    """Return the support point (x, y, z) m of a body's core in the direction dx, dy, dz; pose: body pose (POSE,)."""
     x = pose[3] * dx + pose[6] * dy + pose[9] * dz
     y = pose[4] * dx + pose[7] * dy + pose[10] * dz
     z = pose[5] * dx + pose[8] * dy + pose[11] * dz
@@ -54,7 +54,7 @@ def support_point(body, vertices, pose, dx, dy, dz):
 
 @njit(cache=True, error_model="numpy")
 def separation(enough, a, pose_a, b, pose_b, vertices, work):
-    """Return the distance of two bodies, m, 0 or less in overlap; above `enough` m, a lower bound of the distance."""
+    """Return the distance, m, of two bodies (0 or less in overlap) or, above `enough` m, a lower bound of it."""
     around = a[RADIUS] + b[RADIUS]
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return np.sqrt(_segments(a, pose_a, b, pose_b)) - around
@@ -81,7 +81,7 @@ def separation(enough, a, pose_a, b, pose_b, vertices, work):
 
 @njit(cache=True, error_model="numpy")
 def _segments(a, p, b, r):
-    """Return the squared distance, m^2, of the cores of two bodies: segments or points."""
+    """Return the squared distance, m^2, of two cores, each a segment or a point."""
     la = a[SIZE + 2] if a[KIND] == SEGMENT else 0.0
     lb = b[SIZE + 2] if b[KIND] == SEGMENT else 0.0
     x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
@@ -98,9 +98,9 @@ def _segments(a, p, b, r):
 
 @njit(cache=True, error_model="numpy")
 def _nearest(s, count, t):
-    """Return a simplex's point nearest to the origin and the number of corners that span it, 4 for an origin inside.
+    """Return the simplex point x, y, z nearest to the origin, and the number of corners that span this point.
 
-    s: (4, 3), the `count` corners; the spanning corners move to the front. t: (6, 3), scratch array.
+    The number is 4 for an origin inside the simplex. s: (4, 3), corners; the spanning corners move first. t: scratch.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1

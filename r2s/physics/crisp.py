@@ -1,4 +1,4 @@
-"""Export of friction parameters to the YAML of crisp_controllers (ROS 2), in the form of the paper's eq. (5).
+"""Export friction parameters to a YAML file for crisp_controllers (ROS 2), in the form of the paper's eq. (5).
 
 The controllers (github.com/utiasDSL/crisp_controllers) add fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
 fp3)) to each joint's torque. r2s fits this law to an arm's friction; a sigmoid without viscous term needs no fit.
@@ -25,7 +25,7 @@ def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
 
 
 def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters (n, 3) of `sigmoid_law`, fitted to an arm's friction up to dq_max, and RMS errors (n,) Nm."""
+    """Fit `sigmoid_law` to an arm's friction up to dq_max; return its parameters (n, 3) and RMS errors (n,) Nm."""
     share = np.geomspace(SLOWEST, 1.0, SPEEDS)
     dq = np.concatenate([-share[::-1], share])[:, None] * robot.dq_max
     true = dynamics.friction(dq, np.sign(dq))
@@ -46,7 +46,7 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
 
 
 def write_crisp(path: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write a YAML file with the friction in `ros__parameters`, and the fit's error as a comment."""
+    """Write a YAML file with the friction parameters in `ros__parameters` and the fit error in a comment."""
     phi, rms = fit_sigmoid(robot, dynamics)
     level = np.maximum(dynamics.family.level(dynamics.phi, robot.dq_max), 1e-9)
     errors = ", ".join(f"{e:.3g} ({100 * e / x:.0f} %)" for e, x in zip(rms, level, strict=True))

@@ -1,8 +1,8 @@
-"""Writers of robot descriptions in MJCF, URDF and SDF, with the same links, limits and friction.
+"""Write an arm as MJCF, URDF or SDF, with the same links, limits and friction.
 
-Masses, centers of mass, inertia tensors, rotor inertias and friction are those of `dynamics`; all other values are
-those of `robot`. In URDF and SDF a link's frame is its joint's frame at angle zero, so inertia tensors need
-no rotation (ignition-physics 5.1 of Gazebo Fortress misreads a rotated inertial frame).
+Masses, centers of mass, inertia tensors, rotor inertias and friction come from `dynamics`, all other values from
+`robot`. In the URDF and SDF files, a link's frame is the joint's frame at angle zero, so that no inertial frame is
+rotated, because ignition-physics 5.1 of Gazebo Fortress misreads a rotated inertial frame.
 """
 
 from dataclasses import dataclass
@@ -30,9 +30,9 @@ class Link:
         name, joint: names of the link and of its joint.
         origin: (4, 4) pose of the joint in the parent link's frame, at angle zero.
         axis: (3,) joint axis, in the joint's frame.
-        mass: kg. com: (3,) m, in the link's frame. inertia: (3, 3) kg m^2 about `com`, link axes.
-        damping: (3,) polynomial coefficients, the first in Nm s/rad. friction: Nm, Coulomb. armature: kg m^2.
-        stiffness: (3,) coefficients of the joint's spring, the first in Nm/rad. springref: rad, zero-torque angle.
+        mass: kg, of the link. com: (3,) m, center of mass, link frame. inertia: (3, 3) kg m^2 about `com`, link axes.
+        damping: (3,) damping coefficients, first in Nm s/rad. friction: Nm, Coulomb. armature: kg m^2, rotor inertia.
+        stiffness: (3,) spring coefficients, first in Nm/rad. springref: rad, joint angle without spring torque.
     """
 
     name: str
@@ -50,11 +50,11 @@ class Link:
 
 
 def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[list[Link], np.ndarray]:
-    """Return the arm's links, from the base outwards, and the pose (4, 4) of the end effector in the last link.
+    """Return the arm's links, from the base outwards, and the end effector's pose (4, 4) in the last link's frame.
 
     Args:
-        robot: the arm. dynamics: masses, centers of mass, inertia tensors, rotor inertias, friction.
-        friction: whether the links contain Coulomb and viscous friction (`coulomb_viscous`) or none.
+        robot: the arm. dynamics: source of masses, centers of mass, inertia tensors, rotor inertias and friction.
+        friction: whether the joints have Coulomb and viscous friction (`coulomb_viscous`) or no friction.
     """
     model = robot.model(gravity=True)
     bodies, moving = Bodies(model), model.jnt_bodyid
@@ -90,7 +90,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
 
 
 def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return Coulomb (n,) Nm and viscous coefficients (n,) Nm s/rad from the friction at 0.3 dq_max and dq_max."""
+    """Return Coulomb torques (n,) Nm and viscous coefficients (n,) Nm s/rad for the friction at 0.3 and 1 dq_max."""
     fast, slow = (dynamics.family.level(dynamics.phi, share * robot.dq_max) for share in (1.0, 0.3))
     viscous = np.maximum((fast - slow) / (0.7 * robot.dq_max), 0.0)
     return np.maximum(fast - viscous * robot.dq_max, 0.0), viscous
@@ -99,7 +99,7 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf; return a message for each format that cannot represent the arm.
 
-    For an arm with armature, as most arms, there is no arm.sdf and no message, because SDF has no rotors.
+    An arm with armature, like most arms, has neither arm.sdf nor a message about it, because SDF has no rotors.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
@@ -143,7 +143,7 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as URDF, with a link `ee` at the end effector and armature in Drake's rotor_inertia element.
 
-    URDF itself has no element for armature. r2s and Drake read Drake's element; other readers ignore it.
+    URDF itself has no element for armature. r2s and Drake read Drake's element, which other readers ignore.
 
     Raises:
         UserError: a joint has a spring or nonlinear damping, which URDF cannot represent.
@@ -219,12 +219,12 @@ def write_world(
 ) -> None:
     """Write the SDF world that r2s/engines/gazebo.py and gazebo_classic.py simulate.
 
-    The physics step is 1 ms, and steps follow without delay. The world has no gravity (libfranka's convention), no
-    limits of velocity or torque (the driver enforces them), and no friction (r2s applies it as a torque). As SDF has
-    no rotors, joint damping of armature / 1 ms represents them, and r2s/engines cancels the torque of this damping.
+    The physics step is 1 ms; simulated time runs as fast as possible. The world has no gravity (libfranka's
+    convention), no limits of velocity or torque (the driver enforces these limits), and no friction (r2s applies the
+    friction torque). Joint damping of armature / 1 ms replaces rotors, which SDF lacks; r2s/engines cancels it.
 
     Args:
-        path: file. robot, dynamics: the arm. plugin: the world's plugin element. version: version of SDF.
+        path: file to write. robot, dynamics: the arm. plugin: the world's plugin element. version: SDF version.
         physics: type of the physics engine; gz-sim ignores it.
     """
     links, tip = chain(robot, dynamics, friction=False)
@@ -280,7 +280,7 @@ def _polynomial(coefficients: np.ndarray) -> str:
 
 
 def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
-    """Raise UserError if a joint has nonlinear damping, a nonlinear spring or, with springs=False, any spring."""
+    """Raise UserError for a joint with nonlinear damping or spring and, if springs=False, a joint with any spring."""
     for link in links:
         nonlinear = link.damping[1:].any() or link.stiffness[1:].any()
         if nonlinear or (link.stiffness.any() and not springs):
@@ -324,12 +324,12 @@ def pose_words(pose: np.ndarray) -> str:
 
 
 def words(values: np.ndarray) -> str:
-    """Return numbers as text that represents them exactly."""
+    """Return numbers as text without loss of precision."""
     return " ".join(repr(float(v)) for v in values)
 
 
 def add_text(element: ET.Element, /, **children: object) -> None:
-    """Append one child element per keyword, with the value as its text."""
+    """Append a child element for each keyword argument, with the argument's value as text."""
     for name, value in children.items():
         ET.SubElement(element, name).text = str(value)
 

@@ -23,29 +23,29 @@ class Dynamics:
     """Parameters that identification estimates and domain randomization samples; arrays may have batch axes.
 
     Attributes:
-        phi: (..., n, K) parameters of `family`; Nm, s/rad, rad/s for eq. (5) of the paper.
-        offset: (..., n) Nm, added to every command.
-        breakaway: (..., n, 2) Nm, negative and positive breakaway torque, the edges of stiction.
+        phi: (..., n, K), parameters of the friction law `family`; for eq. (5) of the paper in Nm, s/rad, rad/s.
+        offset: (..., n) Nm, constant torque added to every command.
+        breakaway: (..., n, 2) Nm, negative and positive breakaway torque.
         dq_min: rad/s, speed below which a joint can stick.
-        mass: (..., n) kg, com: (..., n, 3) m, link frame.
-        inertia: (..., n, 3, 3) kg m^2 about each link's center of mass, link axes.
-        armature: (..., n) kg m^2, rotor inertia reflected to the joint; not visible to a link-side torque sensor.
+        mass: (..., n) kg, link masses. com: (..., n, 3) m, centers of mass, link frames.
+        inertia: (..., n, 3, 3) kg m^2, inertia tensor of each link about its center of mass, link axes.
+        armature: (..., n) kg m^2, rotor inertia reflected to the joint; link-side torque sensors do not measure it.
         load: (..., n) Nm/Nm, ratio of load-dependent friction to the gravity torque at the joint.
         drag: (..., n, 2) Nm, coefficients of sin q and cos q in an angle-dependent offset, such as a cable's torque.
-        gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; it
+        gain: (..., n), relative error of the link-side torque sensor or of the motor's torque constant; this error
             changes the recorded torque, but not the arm's motion.
-        signal_delay: (...) s, delay of a recording's torque (measured or motor) after its joint angles.
-        late_alike: whether identification assumes that a recording's measured torque and dq are equally late, and
-            then uses dq as logged.
+        signal_delay: (...) s, time by which a recording's torque (measured or motor) is later than its joint angles.
+        late_alike: whether a recording's measured torque and dq are treated as equally late, so that identification
+            uses dq as logged.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: the friction law.
-        stiction_model: "command" (eq. (6) of the paper): a command and offset within the breakaway edges do not move
-            a joint at rest. "net": a joint sticks while the sum of all torques on it, with the coupling to other
-            joints, lies within the edges (r2s/physics/stick_slip.py).
+        stiction_model: "command" (eq. (6) of the paper): a joint at rest sticks while command plus offset is between
+            the breakaway torques. "net": a joint sticks while the sum of all torques on the joint, including the
+            coupling to other joints, is between the breakaway torques (r2s/physics/stick_slip.py).
         delay, lag: (...) s, pure delay and first-order lag of the actuation. After `Simulator.drive`, the simulator
             applies delay and lag; otherwise, `Motors` (r2s/physics/actuation.py) applies them.
-        declared_payload: (..., 4) kg and kg m, mass and first moment, in the last link's frame, of the payload
-            declared to gravity compensation (r2s/physics/payload.py); the last link includes the real payload.
+        declared_payload: (..., 4), mass, kg, and first moment, kg m, in the last link's frame, of the payload that is
+            declared to gravity compensation (r2s/physics/payload.py). The real payload is part of the last link.
         surface: surface that `Robot.tool` may touch (r2s/physics/contact.py), one or a batch; None: no surface.
     """
 
@@ -77,7 +77,7 @@ class Dynamics:
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
-        """Return dynamics with nominal links and rotors, and friction parameters phi (..., n, K); the rest is 0."""
+        """Return dynamics with nominal links and rotors, friction parameters phi (..., n, K), and otherwise zeros."""
         n = robot.n
         return Dynamics(
             phi=phi,
@@ -110,12 +110,12 @@ class Dynamics:
 
     @property
     def level(self) -> np.ndarray:
-        """(..., n) Nm, magnitude of the friction at 1 rad/s or -1 rad/s, the smaller of both."""
+        """(..., n) Nm, the smaller of the friction magnitudes at 1 rad/s and -1 rad/s."""
         n = self.phi.shape[-2]
         return np.minimum(self.friction(np.full(n, 1.0)), -self.friction(np.full(n, -1.0))).clip(0.0)
 
     def one(self, k: int) -> "Dynamics":
-        """Return the k-th arm of a batch (m, ...); fields without a batch shape stay unchanged."""
+        """Return the dynamics of arm k of a batch (m, ...); fields without a batch axis stay unchanged."""
         values = {name: (getattr(self, name), axes) for name, axes in AXES.items()}
         single = {name: v[k] for name, (v, axes) in values.items() if np.ndim(v) > axes}
         return replace(self, **single, surface=None if self.surface is None else self.surface.one(k))
@@ -141,15 +141,15 @@ def nominal_dynamics(
     stiction_model: str = "command",
     inertia_scale: Sequence[float] | float = 1.0,
 ) -> Dynamics:
-    """Return the dynamics that `conf/friction` and `conf/inertia` describe; values: one per joint, or one for all.
+    """Return the dynamics that `conf/friction` and `conf/inertia` describe; a scalar value applies to all joints.
 
-    phi1, phi2 and phi3 are the parameters of a sigmoid. With phi1=None, the law is Coulomb and viscous
-    friction from frictionloss and damping in the robot's file; for a joint without both, phi1 is PHI1 tau_max. A
-    family other than "auto" is matched to the law's friction at 1 rad/s. The file's frictionloss replaces a breakaway
-    torque of None.
+    phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). With phi1=None, frictionloss and damping in
+    the robot's file are Coulomb and viscous friction; for a joint without both, phi1 is PHI1 tau_max. If `family` is
+    not "auto", its parameters are chosen for the same friction at 1 rad/s. If a breakaway torque is
+    None, the file's frictionloss replaces this torque.
 
     Raises:
-        UserError: a list of the wrong length, or a value out of its physical range.
+        UserError: a list has the wrong length, or a value is out of its physical range.
     """
 
     def joints(name: str, value: ArrayLike) -> np.ndarray:
@@ -189,6 +189,6 @@ def nominal_dynamics(
 
 
 def with_family(dynamics: Dynamics, name: str) -> Dynamics:
-    """Return the dynamics with another friction family and the same friction at 1 rad/s."""
+    """Return the dynamics with the friction family `name` and the same friction at 1 rad/s."""
     named = friction_family(name)
     return replace(dynamics, family=named, phi=named.matched_to(dynamics.family, dynamics.phi))

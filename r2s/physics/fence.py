@@ -1,13 +1,13 @@
-"""The driver's fence stops an arm before it touches itself or the table; the compiled check takes microseconds.
+"""Stop an arm in the driver before it touches itself or the table; the compiled check takes microseconds.
 
 The fence predicts the posture in which the arm would rest if it braked now. In the predicted posture, the bodies of
 each pair of `CollisionCheck` must be FENCE_M apart. At full speed, the bodies must be FENCE_M (1 + SPREAD) apart,
 because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and the joint
-speeds lag the ramp by LAG_S. A joint slower than the ramp keeps its speed until the ramp has fallen to this speed.
-The predicted posture moves continuously with the arm, so it cannot pass through an obstacle between two cycles.
+speeds lag the ramp by LAG_S. A joint slower than the ramp moves at constant speed until the ramp falls to this speed.
+The predicted posture moves continuously with the arm, so the posture cannot skip an obstacle between two cycles.
 
-If a pair of bodies starts closer, the arm may move them apart: the required distance is half of their largest
-distance in the motion so far, at most FENCE_M. Bodies that overlap at the start are ignored until they separate.
+If two bodies start closer, the arm may move them apart: the required distance is half of their largest distance in
+the motion so far, at most FENCE_M. The fence ignores bodies that overlap at the start until they separate.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from r2s.physics.collision import CollisionCheck, Scene, body_poses, pair_distan
 from r2s.physics.kinematics import POSE
 from r2s.physics.safety_filter import BRAKE_S, DQ_ALLOWED, LATENCY_S, RATE
 
-FENCE_M = 0.01  # m
+FENCE_M = 0.01  # m, required distance
 SPREAD = 3.0  # in simulation, stops from full speed end up to 0.02 m from the predicted posture
 LAG_S = 1 / RATE + LATENCY_S  # s, lag of a joint's speed behind the ramp
 
@@ -32,9 +32,9 @@ class Fence(NamedTuple):
 
 
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return, for E motions q, dq (E, T, n), the indices (E,) of the pairs at which the driver stops; -1: none.
+    """Return the index (E,) of the pair that stops the driver in each of E motions q, dq (E, T, n); -1: no stop.
 
-    limits: (n, COLUMNS) from `filter_limits`.
+    limits: (n, COLUMNS), limits of the joints from `filter_limits`.
     """
     fence, out = Fence(check.links, check.scene), np.full(len(q), -1)
     for e in range(len(q)):
@@ -47,12 +47,12 @@ def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq:
 
 @njit(cache=True, error_model="numpy")
 def breached(fence, limits, q, dq, least):
-    """Return the number of the first pair that would come too close if the arm braked now, -1 for none.
+    """Return the index of the first pair of bodies that would come too close if the arm braked now; -1: no pair.
 
     Args:
-        fence: `Fence`. limits: (n, COLUMNS) of `filter_limits`.
-        q, dq: (n,) rad, rad/s, finite.
-        least: (K,) m, smallest allowed distance of each pair, -inf before a motion begins; this function updates it.
+        fence: geometry. limits: (n, COLUMNS) of `filter_limits`.
+        q, dq: (n,) rad, rad/s, finite joint angles and velocities.
+        least: (K,) m, required distance of each pair, -inf before a motion; updated in place.
     """
     if len(least) == 0:
         return -1

@@ -1,7 +1,7 @@
-"""Joint friction: four laws, called families, with one interface; users can add their own.
+"""Joint friction laws, called families; r2s contains four families, and users can add families.
 
-A family contains its law twice: in NumPy, and compiled for the physics step (mujoco_callback.py). `friction.family=`
-selects one of the four families by name, or a user's own family by a dotted path such as my_module.MY_FAMILY.
+A family contains its law in NumPy and, for the physics step (mujoco_callback.py), in a compiled version.
+`friction.family=` selects a family by name, or a user's family by a dotted path such as my_module.MY_FAMILY.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,27 +22,27 @@ VISCOUS = "viscous"  # name of the viscous parameter in every family that has on
 
 @dataclass(frozen=True)
 class Family:
-    """A friction law of one joint with K parameters; its torque is 0 at rest and positive for positive velocity.
+    """Friction law of a joint with K parameters; the torque is 0 at rest and positive for positive velocity.
 
     Attributes:
-        name: shown in tables.
+        name: name of the family in tables.
         names, units: names and units of the K parameters.
         logarithmic: names of positive parameters that span decades; their search space is logarithmic.
-        bounds: (low, high), search range of each parameter; `identify.bounds` overrides it.
-        optional: the last `names`; these parameters are 0 and not estimated unless `identify.terms` lists them.
-        formula: the law in one line.
-        law: (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n). `sign` is
-            tanh(dq / 0.01), or the bristle deflection of a family with a memory, in [-1, 1].
-        native: the law of one joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
+        bounds: search ranges (low, high) of the parameters; `identify.bounds` overrides these ranges.
+        optional: last entries of `names`, parameters that are 0 and not estimated unless `identify.terms` lists them.
+        formula: text of the law in one line.
+        law: function (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n).
+            `sign` is tanh(dq / 0.01), or the bristle deflection of a family with a memory, in [-1, 1].
+        native: law of a joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
             torque and its derivative at v. `memory` is the state of the joint's friction, 0 after a reset.
-        sharp: `native` with a discontinuous torque at v = 0, for stiction_model="net"; None for a law that is
+        sharp: version of `native` whose torque is discontinuous at v = 0, for stiction_model="net"; None: the law is
             continuous at rest.
         start: function that maps friction (..., n) Nm at 1 rad/s to start values (a list) of the required parameters.
-        held: for a law with a memory, function that maps phi (..., n, K) to breakaway torques (..., n, 2) Nm,
-            negative and positive; None for a law without stiction, which eq. (6) or stick_slip.py then adds.
+        held: function that maps phi (..., n, K) to negative and positive breakaway torques (..., n, 2) Nm of a law
+            with memory; None: the law has no stiction, so that eq. (6) or stick_slip.py adds stiction.
 
     Raises:
-        UserError: the parts are inconsistent.
+        UserError: the attributes are inconsistent.
     """
 
     name: str
@@ -72,13 +72,13 @@ class Family:
 
     @property
     def has_memory(self) -> bool:
-        """Whether the law has a memory, and therefore stiction of its own."""
+        """Whether the law has a memory; such a law contains stiction."""
         return self.held is not None
 
     def at_rest(self, phi: np.ndarray) -> np.ndarray:
-        """Return the kinetic friction (..., n, 2) Nm at zero speed, negative and positive; 0 for a continuous law.
+        """Return the negative and positive limit (..., n, 2) Nm of friction at zero speed; 0 for a continuous law.
 
-        phi: (..., n, K).
+        phi: (..., n, K), parameters of the law.
         """
         if self.sharp is None:
             return np.zeros((*phi.shape[:-1], 2))
@@ -93,9 +93,9 @@ class Family:
         """Return the friction torque (..., n) Nm.
 
         Args:
-            dq: (..., n) rad/s.
-            phi: (..., n, K), in the order of `names`; optional parameters may be missing.
-            bristle: (..., n) bristle deflection in [-1, 1], as `presliding` returns it; default: tanh(dq / 0.01).
+            dq: (..., n) rad/s, joint velocities.
+            phi: (..., n, K), parameters in the order of `names`; optional parameters may be missing.
+            bristle: (..., n), bristle deflections in [-1, 1] from `presliding`; None: tanh(dq / 0.01).
         """
         columns = [phi[..., k] for k in range(phi.shape[-1])] + [np.zeros(())] * (len(self.names) - phi.shape[-1])
         return self.law(dq, columns, np.tanh(dq / WIDTH_DQ) if bristle is None else bristle)
@@ -105,9 +105,9 @@ class Family:
         return 0.5 * (self.torque(dq_max, phi) - self.torque(-dq_max, phi))
 
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
-        """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of another family.
+        """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of the family `other`.
 
-        If both families have a viscous parameter, the result keeps the viscous friction of `other`.
+        If both families have a viscous parameter, the viscous friction is also the same.
         """
         if other == self:
             return phi
@@ -243,7 +243,7 @@ STRIBECK = Family(
 
 @njit(cache=True)
 def _bristle_native(p, v, h, memory):
-    """Return Dahl's friction (1968) with LuGre damping: z replaces sign(v), with dz/dt = (v - |v| z) / presliding."""
+    """Return Dahl's friction (1968) with LuGre damping; z with dz/dt = (v - |v| z) / presliding replaces sign(v)."""
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
@@ -283,7 +283,7 @@ _imported: dict[str, Family] = {}  # by dotted path
 
 
 def known_families() -> tuple[Family, ...]:
-    """Return the built-in families and all families that `family` has imported."""
+    """Return the built-in families and all families that the function `family` has imported."""
     return (*FAMILIES, *_imported.values())
 
 
@@ -291,7 +291,7 @@ def family(name: str) -> Family:
     """Return a built-in family by its name, or import one by its dotted path.
 
     Raises:
-        UserError: the family is unknown, or a parameter's unit or scale differs from that in another family.
+        UserError: the family is unknown, or a known family has a parameter of the same name in another unit or scale.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:
@@ -323,7 +323,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if the family `name` in a file would be imported from a module that is not in `trust`."""
+    """Raise UserError if a file names a family, `name`, whose module is neither imported nor in `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(
@@ -333,14 +333,14 @@ def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
 
 
 def family_path(one: Family) -> str:
-    """Return the string for which `family` returns the family `one`: a name or a dotted path."""
+    """Return the name or dotted path by which the function `family` finds the family `one`."""
     return next((path for path, f in _imported.items() if f is one), one.name)
 
 
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
-    """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s, steps of dt s and `distance`, rad.
+    """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s in steps of dt s.
 
-    The deflection z replaces sign(v) in friction: dz/dt = (v - |v| z) / distance (Dahl 1968), integrated exactly.
+    z replaces sign(v) in friction; dz/dt = (v - |v| z) / distance (Dahl 1968) is integrated exactly. distance: rad.
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 

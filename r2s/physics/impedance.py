@@ -1,16 +1,16 @@
-"""Building blocks of the compiled impedance laws (impedance_laws.py); layout of their parameters and memory.
+"""Functions for the compiled impedance laws (impedance_laws.py), and layout of the laws' parameters and memory.
 
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
 With the damping D = 2 zeta (M # K_q), every mode has the damping ratio zeta. Here M is the mass matrix, K_q = J^T K J
-+ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. This D is the double
-diagonalization of Albu-Schaeffer et al. (ICRA 2003), without eigenvectors. The null-space projector N is dynamically
-consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring has a potential, even where its force is
-clipped. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy that the springs
-gain; damping refills the tank. This tank ignores the work of moving targets and of the null-space spring (Dietrich et
-al., RA-L 2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured
-angle, other friction at the reference speed dq_r. Friction feedforward above the true friction would drive the arm.
-Canceling a bristle stiffness k with a delay d adds the damping k sin(w d) / w, positive for frequencies w < pi / d.
++ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. This D equals the
+double diagonalization of Albu-Schaeffer et al. (ICRA 2003) without eigenvectors. The null-space projector N is
+dynamically consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force has a potential, even if
+clipped. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs;
+damping refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al.,
+RA-L 2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured angle,
+other friction at the reference speed dq_r. A feedforward above the true friction would drive the arm. Canceling a
+bristle stiffness k with a delay d adds the damping k sin(w d) / w, which is positive for frequencies w < pi / d.
 """
 
 import numpy as np
@@ -67,7 +67,7 @@ MOBILITY = 1e-3  # 1/kg, 1/(kg m^2): directions with less mobility, near a singu
 
 @njit(cache=True, error_model="numpy")
 def arm_pose(q, parameters, frames, jacobian, place):
-    """Write link poses (n, POSE), the tip's Jacobian (6, n), translation first, and the tip's position (3,) m."""
+    """Write link poses (n, POSE), the tip's Jacobian (6, n), translation rows first, and the tip position (3,) m."""
     n = len(q)
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     x, y, z = 0.0, 0.0, 0.0
@@ -86,7 +86,7 @@ def arm_pose(q, parameters, frames, jacobian, place):
 
 @njit(cache=True, error_model="numpy")
 def arm_tips(q, parameters):
-    """Return a tip's position (m, 3) m and Jacobian (m, 3, n) at q (m, n) rad; parameters: of an impedance law."""
+    """Return tip positions (m, 3) m and Jacobians (m, 3, n) at q (m, n) rad from an impedance law's parameters."""
     m, n = q.shape
     places, out = np.empty((m, 3)), np.empty((m, 3, n))
     frames, jacobian = np.empty((n, POSE)), np.empty((6, n))
@@ -124,7 +124,7 @@ def mass_matrix(parameters, frames, jacobian, mass):
 
 @njit(cache=True, error_model="numpy")
 def invert(matrix, n):
-    """Replace the symmetric positive definite matrix (n, n) by its inverse: Gauss-Jordan elimination."""
+    """Replace a symmetric positive definite matrix (n, n) by the inverse, with Gauss-Jordan elimination."""
     for k in range(n):
         pivot = 1.0 / matrix[k, k]
         matrix[k, k] = 1.0
@@ -142,8 +142,8 @@ def invert(matrix, n):
 def geometric_mean(K, mobility, out):
     """Write the geometric mean K # M = M (M^-1 K)^(1/2), (n, n), of positive definite matrices; mobility: M^-1.
 
-    The iteration is P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2 from P = K and Q = M^-1, that of Denman and Beavers
-    (Higham, Functions of Matrices, 2008, eq. 6.28) multiplied by M, so that all iterates stay symmetric.
+    From P = K and Q = M^-1, iterate P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2. Denman and Beavers' iteration (Higham,
+    Functions of Matrices, 2008, eq. 6.28) is multiplied by M here, so that all iterates stay symmetric.
     """
     n = len(K)
     scale = 0.0  # mean squared frequency
@@ -173,8 +173,8 @@ def geometric_mean(K, mobility, out):
 def spring(s, limit):
     """Return the energy U, J, of a saturating spring for s = e^T K e / 2, J, and the factor on its force K e.
 
-    The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. As U depends on s alone, the spring's force has a
-    potential for every K, which rises with K. The force is at most sqrt(2 K limit), so limit = clip^2 / (2 K_high).
+    The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. As U depends on s alone, U is a potential of the
+    force for every K, and U rises with K. The force is at most sqrt(2 K limit), so limit = clip^2 / (2 K_high).
     """
     if s <= limit:
         return s, 1.0
@@ -184,14 +184,14 @@ def spring(s, limit):
 
 @njit(cache=True, error_model="numpy")
 def task_energy(K, error, tilt, parameters):
-    """Return the energy, J, of the springs K (4,); error: (3,) m; tilt: 1 - cosine of the rotation error."""
+    """Return the energy, J, of springs K (4,) at a position error (3,) m; tilt: 1 - cosine of the rotation error."""
     s = 0.5 * (K[0] * error[0] ** 2 + K[1] * error[1] ** 2 + K[2] * error[2] ** 2)
     return spring(s, parameters[FORCE_LIMIT])[0] + spring(K[3] * tilt, parameters[MOMENT_LIMIT])[0]
 
 
 @njit(cache=True, error_model="numpy")
 def refill(q, n, parameters, memory, at):
-    """Fill the tank with the energy, J, that damping dissipated since the last cycle; at: index of dq_r in memory."""
+    """Add the energy, J, that damping dissipated since the last cycle to the tank; at: index of dq_r in `memory`."""
     if memory[BEGUN] == 0.0:
         memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
         for j in range(n):
@@ -208,7 +208,7 @@ def refill(q, n, parameters, memory, at):
 def friction_at(v, row, load):
     """Return a joint's friction, Nm, at v rad/s, including load-dependent friction of `load` Nm.
 
-    `row` contains the friction at the speeds FIRST_DQ 4^k; the function interpolates and extrapolates it linearly.
+    `row` contains friction at the speeds FIRST_DQ 4^k; this function interpolates and extrapolates linearly.
     """
     side, k = FRICTION if v >= 0.0 else FRICTION + NODES, 0
     sign = 1.0 if v >= 0.0 else -1.0
@@ -223,10 +223,10 @@ def friction_at(v, row, load):
 def friction_ahead(v, q, j, load, parameters, memory, at):
     """Return the friction feedforward, Nm, of joint j at q rad; v: reference speed of the joint, rad/s.
 
-    With bristles, the feedforward is the deflection z times the friction at reference or measured speed, whichever is
-    smaller; dz/dt = (dq - |dq| z) / presliding at the measured dq (Dahl 1968). Without bristles, the feedforward has
-    the sign of v, and is the breakaway torque at rest. While the tip approaches a surface (APPROACH = 1), the
-    feedforward is the friction at v. load: Nm, load-dependent friction. at: index of dq_r in memory.
+    With bristles, the feedforward is the deflection z times the smaller of the frictions at reference and at measured
+    speed; the measured dq drives dz/dt = (dq - |dq| z) / presliding (Dahl 1968). Without bristles, the feedforward is
+    the friction at v while the tip approaches a surface (APPROACH = 1). Otherwise, the feedforward has the sign of v,
+    and equals the breakaway torque at rest. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
@@ -250,7 +250,7 @@ def friction_ahead(v, q, j, load, parameters, memory, at):
 
 @njit(cache=True, error_model="numpy")
 def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
-    """Return the gravity torque, Nm, about joint j on a body of mass `mass`, kg, and first moment x, y, z, kg m."""
+    """Return gravity's torque, Nm, about joint j on a body with mass `mass`, kg, and first moment x, y, z, kg m."""
     x, y, z = x - mass * frames[j, 0], y - mass * frames[j, 1], z - mass * frames[j, 2]
     a, b, c = parameters[GRAVITY], parameters[GRAVITY + 1], parameters[GRAVITY + 2]
     a, b, c = y * c - z * b, z * a - x * c, x * b - y * a
@@ -259,7 +259,7 @@ def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def feedforward(q, parameters, frames, jacobian, memory, at, out):
-    """Add torques that cancel friction, gravity errors, offset and drag to `out`; at: index of dq_r in memory."""
+    """Add the torques that cancel friction, gravity errors, offset and drag to `out`; at: index of dq_r in memory."""
     n = len(q)
     m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all links beyond a joint
     M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # mass and first moment of these links

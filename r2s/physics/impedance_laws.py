@@ -1,4 +1,4 @@
-"""Compiled laws of `control=joint_impedance`, `cartesian_impedance` and `hybrid`, with functions of impedance.py."""
+"""Compiled control laws for `control=joint_impedance`, `cartesian_impedance` and `hybrid`."""
 
 import numpy as np
 
@@ -63,8 +63,8 @@ from r2s.physics.newton_euler import product, rotate_about
 def joint_impedance_law(q, dq, command, parameters, memory, out):
     """Write the torque of `control=joint_impedance`: K (q_t - q) - D (dq - dq_r) + feedforward.
 
-    The command contains the action's optional displacement q_t - q_r (n) rad and stiffness (n) Nm/rad, then q_r (n)
-    rad and dq_r (n) rad/s of the task's trajectory. Without a trajectory, q_r is home and dq_r is 0.
+    The command contains the action's optional displacement q_t - q_r (n) rad and stiffness (n) Nm/rad, then the
+    task's trajectory q_r (n) rad and dq_r (n) rad/s. Without a trajectory, q_r is the home posture and dq_r is 0.
     """
     n, begins = len(q), memory[BEGUN] == 0.0
     K, at = memory[STIFFNESS : STIFFNESS + n], STIFFNESS + n
@@ -81,7 +81,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
             asked[j] = min(max(command[stiff + j], row[K_JOINT + 1]), row[K_JOINT + 2])
         K[j] = asked[j] if begins else K[j]
     share, pays = 1.0, False
-    while not pays:  # a rise is halved until the tank has its energy; a fall needs none
+    while not pays:  # halve a rise until the tank can supply the energy; a fall needs no energy
         raised = 0.0
         for j in range(n):
             out[j] = asked[j] if asked[j] <= K[j] else K[j] + share * (asked[j] - K[j])
@@ -113,7 +113,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
 
 @njit(cache=True, error_model="numpy")
 def task_stiffness(command, error, tilt, begins, parameters, memory):
-    """Set the stiffness (4,) in `memory` to the requested value; a rise is limited by the energy in the tank."""
+    """Set the stiffness (4,) in `memory` to the requested value; the energy in the tank limits a rise."""
     K, asked, new = memory[STIFFNESS : STIFFNESS + SPRINGS], np.empty(SPRINGS), np.empty(SPRINGS)
     at, given = int(parameters[STIFFNESS_AT]), 4 if parameters[TASK_AXES] == 6.0 else 3
     for k in range(SPRINGS):
@@ -122,7 +122,7 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
             asked[k] = min(max(command[at + k], parameters[K_LOW + k]), parameters[K_HIGH + k])
         K[k] = asked[k] if begins else K[k]
     before, share, pays = task_energy(K, error, tilt, parameters), 1.0, False
-    while not pays:  # a rise is halved until the tank has its energy; a fall needs none
+    while not pays:  # halve a rise until the tank can supply the energy; a fall needs no energy
         for k in range(SPRINGS):
             new[k] = asked[k] if asked[k] <= K[k] else K[k] + share * (asked[k] - K[k])
         raised = task_energy(new, error, tilt, parameters) - before
@@ -135,10 +135,10 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
 
 @njit(cache=True, error_model="numpy")
 def rotation_error(R, command, parameters, error):
-    """Write the rotation error (3,): axis times sine of the angle to the target; return 1 - cosine of the angle.
+    """Write the rotation error (3,), axis times sine of the angle to the target; return 1 - cosine of this angle.
 
-    The target orientation is home, rotated by the action's rotation vector plus the task's. The rotation error is
-    that of Luh, Walker and Paul (IEEE TAC 1980, eq. 22).
+    The sum of the action's and the task's rotation vectors rotates the home orientation to the target orientation.
+    Luh, Walker and Paul define this rotation error (IEEE TAC 1980, eq. 22).
     """
     x, y, z = 0.0, 0.0, 0.0
     if parameters[DISPLACED] >= 0.0:
@@ -164,7 +164,7 @@ def rotation_error(R, command, parameters, error):
 
 @njit(cache=True, error_model="numpy")
 def update(velocity, parameters, frames, jacobian, memory):
-    """Update D, N^T (n, n) and dq_r (n,) rad/s in `memory`; velocity: (3,) m/s, of the target."""
+    """Update damping D, projector N^T (n, n) and dq_r (n,) rad/s in `memory`; velocity: (3,) m/s, of the target."""
     n, a, at = len(frames), int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     K = memory[STIFFNESS : STIFFNESS + SPRINGS]
     D = memory[at + ROWS * n : at + ROWS * n + n * n].reshape((n, n))
@@ -211,10 +211,10 @@ def update(velocity, parameters, frames, jacobian, memory):
 
 @njit(cache=True, error_model="numpy")
 def normal_force(command, shift, parameters, memory):
-    """Return the desired force, N, of the tip against the normal: reference plus integral of the force error.
+    """Return the desired tip force, N, against the normal: the reference plus an integral of the force error.
 
-    The command contains the normal (3,), the reference and measured force, N, and whether a force is measured. The
-    action's displacement against the normal, times stiffness, raises the reference. Saturation stops the integral.
+    The command contains the normal (3,), reference and measured force, N, and a flag for a measured force. Stiffness
+    times the action's displacement against the normal adds to the reference. Saturation stops the integral.
     """
     at = int(parameters[TARGET_AT]) + int(parameters[TARGET_SIZE])
     asked = command[at + 3]
@@ -234,11 +234,11 @@ def normal_force(command, shift, parameters, memory):
 
 @njit(cache=True, error_model="numpy")
 def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
-    """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's path.
+    """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's motion.
 
-    The gradient method (Widrow and Hoff, 1960) fits the slope g: tip speed along the normal = g . target velocity.
-    The function adds the rise of the surface to `velocity` (3,) m/s. The correcting force is a clamped integral
-    of the position error along the path, where friction acts, plus a clamped integral of the error across the path.
+    The gradient method (Widrow and Hoff, 1960) fits the slope g in: tip speed along the normal = g . target velocity.
+    This function adds the rise of the surface to `velocity` (3,) m/s. The correcting force is the sum of two clamped
+    integrals of the position error, one along the motion, where friction acts, and one across the motion.
     """
     up, rises, fast = 0.0, 0.0, SLIDING * SLIDING
     for k in range(3):
@@ -271,11 +271,11 @@ def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
 def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     """Write the torque of `control=cartesian_impedance` or, with a force along the normal, of `control=hybrid`.
 
-    The command begins with optional parts of the action: target displacement (3) m, with six axes also rotation (3)
-    rad; stiffness (3) N/m, with six axes also (1) Nm/rad. The task's target follows: position (3) m, optionally
-    velocity (3) m/s and rotation vector from home (3) rad. For hybrid control, `normal_force` lists the entries that
-    follow. With APPROACH > 0, stiffness times the depth of the target below the tip bounds the normal force. With
-    APPROACH = SLIDES, the target is that of mid-period, and the command ends with a feedforward force (3) N.
+    The command begins with optional parts of the action: target displacement (3) m and, for six axes, (3) rad;
+    stiffness (3) N/m and, for six axes, (1) Nm/rad. The task's target is next: position (3) m, optionally velocity
+    (3) m/s and rotation vector from home (3) rad. `normal_force` describes the next entries, for hybrid control only.
+    If APPROACH > 0, stiffness times the depth of the target below the tip bounds the normal force. If APPROACH is
+    SLIDES, the target is valid for the middle of the control period; a feedforward force (3) N ends the command.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     frames, jacobian, place, velocity = np.empty((n, POSE)), np.empty((6, n)), np.empty(3), np.zeros(3)

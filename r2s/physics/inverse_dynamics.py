@@ -18,7 +18,7 @@ class InverseDynamics:
     """Inverse dynamics of one arm that compensates gravity.
 
     Attributes:
-        robot: the arm; its gravity compensation uses the nominal links.
+        robot: the arm, which compensates the gravity torque of its nominal links.
         dynamics: estimated dynamics of the arm.
     """
 
@@ -31,7 +31,7 @@ class InverseDynamics:
         return links_of(r, d.mass, d.com, d.inertia), links_of(r, r.mass, r.com, r.inertia)
 
     def rigid(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n) Nm of links and rotors at q, dq, ddq (m, n) rad, rad/s, rad/s^2.
+        """Return the torque (m, n) Nm that links and rotors need for q, dq, ddq (m, n) rad, rad/s, rad/s^2.
 
         The torque is M ddq + C dq + g, minus the nominal links' gravity torque, which the arm compensates.
         """
@@ -48,7 +48,7 @@ class InverseDynamics:
         return out
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
-        """Return the command (m, n) Nm, without gravity, of a motion; friction is that at `sliding` (m, n) rad/s."""
+        """Return the command (m, n) Nm, without gravity, for a motion, with friction at `sliding` (m, n) rad/s."""
         d = self.dynamics
         out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
         if d.drag.any():
@@ -58,7 +58,7 @@ class InverseDynamics:
         return out
 
     def load_friction(self, q: np.ndarray) -> np.ndarray:
-        """Return the level (m, n) Nm of load-dependent friction at q (m, n) rad."""
+        """Return the magnitude (m, n) Nm of load-dependent friction at q (m, n) rad."""
         nominal, none, gravity = self._links[1], np.zeros(q.shape), np.empty(q.shape)
         _rigid(nominal, nominal, self.robot.gravity, none[0], (np.array(q), none, none), gravity, True)
         return self.dynamics.load * np.abs(gravity)
@@ -66,7 +66,7 @@ class InverseDynamics:
 
 @njit(cache=True, error_model="numpy")
 def _rigid(links, nominal, gravity, armature, motion, out, full_gravity):
-    """Write the torque (m, n) Nm of a motion (q, dq, ddq); full_gravity: whether the arm compensates no gravity."""
+    """Write the torque (m, n) Nm for a motion (q, dq, ddq); full_gravity: whether to include all gravity torque."""
     q, dq, ddq = motion
     m, n = q.shape
     mass, bias, compensated, at_rest = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

@@ -17,7 +17,7 @@ MAX_STEP = 0.3  # rad per joint and Newton step
 
 
 class HandKinematics:
-    """End-effector kinematics of the nominal arm."""
+    """Kinematics of the end effector with nominal link geometry."""
 
     def __init__(self, robot: Robot):
         self.links = links_of(robot, robot.mass, robot.com, robot.inertia)
@@ -34,8 +34,8 @@ class HandKinematics:
     def follow(self, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
         """Return postures (T, n) rad with the end effector at points (T, 3) m, and the largest position error, m.
 
-        For each point, the solver starts at the previous posture, first at `start` (n,). In the null space of the end
-        effector, the arm moves toward home. The solver ignores position limits.
+        The solver starts at `start` (n,) rad for the first point, and at the previous posture for later points. In
+        the null space of the end effector, the arm moves toward home. The solver ignores position limits.
         """
         out = np.empty((len(points), len(start)))
         return out, _follow(self.links, self._tip, self._home, start, np.ascontiguousarray(points), out)
@@ -43,7 +43,7 @@ class HandKinematics:
 
 @njit(cache=True, error_model="numpy")
 def link_frames(links, q, frames, axes):
-    """Write the pose (n, POSE) of each link and the axis (n, 3) of its joint in the base frame, at q (n,) rad."""
+    """Write link poses (n, POSE) and joint axes (n, 3) in the base frame, at q (n,) rad."""
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     x, y, z = 0.0, 0.0, 0.0
     for i in range(len(q)):
@@ -71,7 +71,7 @@ def pose_axes(pose):
 def hand_kinematics(links, tip, q, frames, place, jacobian):
     """Write the end-effector position (3,) m and its Jacobian (3, n) m/rad at q (n,) rad.
 
-    tip: (3,) m in the last link's frame. frames: (n, POSE), scratch array.
+    tip: (3,) m, end effector in the last link's frame. frames: (n, POSE), scratch array.
     """
     n = len(q)
     link_frames(links, q, frames, jacobian.T)
@@ -92,7 +92,7 @@ def _places(links, tip, q, out):
 
 @njit(cache=True, error_model="numpy")
 def _follow(links, tip, home, start, points, out):
-    """Write the posture for each point into `out`; return the largest position error, m, of the end effector."""
+    """Write the posture (n,) rad for each point into `out`; return the largest end-effector position error, m."""
     n, worst = len(start), 0.0
     q, place, jacobian, error = start.copy(), np.empty(3), np.empty((3, n)), np.empty(3)
     gram, null_step, frames = np.empty((3, 3)), np.empty(n), np.empty((n, POSE))

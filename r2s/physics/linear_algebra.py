@@ -1,9 +1,9 @@
-"""Cholesky factorization and solution of small symmetric positive definite systems, for compiled code.
+"""Factor and solve small symmetric positive definite systems by Cholesky's method, in compiled code.
 
-For 7 joints, compiled loops are faster than a LAPACK call. The root of a matrix A = L L^T is the lower triangle L
-with 1 / L[i, i] on the diagonal, so `solve` multiplies instead of divides (Golub and Van Loan, Matrix Computations,
-4th ed. 2013, section 4.2). A packed matrix contains its lower triangle row by row, (n (n + 1) / 2,), as MuJoCo stores
-the mass matrix of a serial arm.
+For 7 joints, compiled loops are faster than a LAPACK call. Here, the root of a matrix A = L L^T is L with 1 / L[i, i]
+on the diagonal, so `solve` multiplies instead of divides (Golub and Van Loan, Matrix Computations, 4th ed. 2013,
+section 4.2). A packed matrix is an array (n (n + 1) / 2,) of the lower triangle, row by row, as MuJoCo stores the
+mass matrix of a serial arm.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def packed_element(packed, i, k):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def unpack(packed, scale, diagonal, out):
-    """Write the lower triangle of a packed matrix plus scale diag(diagonal (n,)) into `out` (n, n)."""
+    """Write the lower triangle of a packed matrix, plus scale * diag(diagonal), into `out` (n, n)."""
     for i in range(len(diagonal)):
         row = i * (i + 1) // 2
         for k in range(i):
@@ -29,9 +29,9 @@ def unpack(packed, scale, diagonal, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def factor(matrix, root, active=None):
-    """Write the root of a matrix (n, n), given by its lower triangle; `root` may be `matrix` itself.
+    """Write the root of a matrix (n, n) from the lower triangle of `matrix`; `root` may be `matrix` itself.
 
-    active: (n,), 0 for rows and columns to leave out; None leaves out no row.
+    active: (n,), 0 for rows and columns that the factorization omits; None: omit no row.
     """
     for i in range(len(root)):
         if active is not None and active[i] == 0.0:
@@ -52,7 +52,7 @@ def factor(matrix, root, active=None):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def solve(root, x, active=None):
-    """Replace x (n,) by the solution y of A y = x; y is 0 in rows that `active` (see `factor`) leaves out."""
+    """Replace x (n,) by the solution y of A y = x, given the root of A; y is 0 in rows where `active` is 0."""
     n = len(x)
     for i in range(n):
         s = 0.0

@@ -1,14 +1,14 @@
-"""The compiled callback that adds friction, control law, safety filter and motors to MuJoCo's physics step.
+"""Add friction, control law, safety filter and motors to MuJoCo's physics step, by a compiled callback.
 
-`install()` registers a native control callback that reads its parameters in `jnt_user`, so `mujoco.batch.Batch` can
-simulate a different arm in each row at full speed. The callback computes friction (friction.py) and, after
+`install()` registers a native control callback that reads an arm's parameters in `jnt_user`, so `mujoco.batch.Batch`
+can simulate a different arm in each row at full speed. The callback computes friction (friction.py) and, after
 `Simulator.drive`, control law (control_laws.py), safety filter (safety_filter.py) and motor delay (actuation.py),
-which need feedback every millisecond. As stiction (stick_slip.py) and contact (contact.py) depend on all other
-forces, r2s uses the control callback, which MuJoCo calls last before it computes accelerations.
+which need feedback every millisecond. Stiction (stick_slip.py) and contact (contact.py) need the sum of all other
+forces. Therefore, r2s uses the control callback, which MuJoCo calls last before it computes accelerations.
 
-The friction torque tau_f is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity v, the callback
-adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. The step is
-accurate to first order, and stable even for the steep friction of real wrists, 3-10 Nm s/rad on 0.004-0.012 kg m^2.
+The step treats the friction torque tau_f linearly implicitly. With D = d tau_f / dv >= 0 at the current velocity v,
+the callback adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. A step
+is accurate to first order, and stable even for friction slopes of real wrists, 3-10 Nm s/rad on 0.004-0.012 kg m^2.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ from r2s.physics.safety_filter import STEP as TAU_STEP
 from r2s.physics.stick_slip import TINY, JointForces, any_reversal, coming_velocity
 from r2s.physics.user_laws import as_doubles, call_friction, friction_address, stack
 
-# Columns of jnt_user. MARK identifies models of r2s: the callback is global in a process and must ignore all others.
+# Columns of jnt_user. MARK identifies models of r2s: the callback is global in a process and ignores other models.
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether masses are summed up
@@ -45,8 +45,8 @@ NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: use stick_slip.p
 GRAVITY = REST_POS + 1  # 3 wide
 DELAY, LAG, LEVEL = range(GRAVITY + 3, GRAVITY + 6)  # LEVEL: friction level for the safety filter
 LIMITS = LEVEL + 1  # limits of the safety filter, COLUMNS wide; 0: no filter
-# The path of a command: number of the control law (NO_CONTROL: `rollout` sets efforts), cycles of the soft start,
-# factor of the low-pass, largest target Nm, and the sizes of command, memory and parameters of the law in `userdata`
+# Settings of the control: number of the law (NO_CONTROL: `rollout` sets efforts), cycles of the soft start, factor
+# of the low-pass, largest target Nm, and the sizes of command, memory and parameters of the law in `userdata`
 CONTROL, FADE, LOW_PASS, TARGET_MAX, COMMANDS, MEMORIES, PARAMETERS = range(LIMITS + COLUMNS, LIMITS + COLUMNS + 7)
 # First index in `userdata` of the contact (contact.py) and of the push limit (push_limit.py); 0: none
 CONTACT, PUSH = PARAMETERS + 1, PARAMETERS + 2
@@ -74,7 +74,7 @@ def number(family: Family, hold: str) -> int:
 
 
 def _either(number: int, own: Callable, others: Callable) -> Callable:
-    """Return a compiled function that calls `own` if its first argument is `number`, else `others`."""
+    """Return a compiled function that calls `own` if the first argument is `number`, and otherwise `others`."""
 
     @njit(inline="always")
     def law(asked, p, v, h, memory):
@@ -92,7 +92,7 @@ for _k in reversed(range(len(BUILT_IN))):
 
 @njit(inline="always")
 def _weight(mass, hx, hy, hz, anchor, axis, gravity):
-    """Return the gravity torque, Nm, about a joint: axis . ((h - mass anchor) x gravity), h: first moment, kg m."""
+    """Return the gravity torque, Nm, about a joint, axis . ((h - mass anchor) x gravity); h: kg m, first moment."""
     x, y, z = hx - mass * anchor[0], hy - mass * anchor[1], hz - mass * anchor[2]
     level = gravity[0] * (axis[1] * z - axis[2] * y) + gravity[1] * (axis[2] * x - axis[0] * z)
     return level + gravity[2] * (axis[0] * y - axis[1] * x)
@@ -100,7 +100,7 @@ def _weight(mass, hx, hy, hz, anchor, axis, gravity):
 
 @njit(inline="always")
 def _first_moment(mass, xpos, xmat, h):
-    """Return a body's first moment (3) kg m in the world frame; mass: kg; h: (3) kg m, in the body's frame."""
+    """Convert a body's first moment h (3) kg m from the body's frame to the world frame; mass: kg, of the body."""
     x = mass * xpos[0] + xmat[0] * h[0] + xmat[1] * h[1] + xmat[2] * h[2]
     y = mass * xpos[1] + xmat[3] * h[0] + xmat[4] * h[1] + xmat[5] * h[2]
     z = mass * xpos[2] + xmat[6] * h[0] + xmat[7] * h[1] + xmat[8] * h[2]
@@ -109,7 +109,7 @@ def _first_moment(mass, xpos, xmat, h):
 
 @njit(inline="always")
 def _direction(v, net, z, user):
-    """Return the factor on load-dependent friction, in [-1, 1], and its slope by v, s/rad; z: bristle deflection."""
+    """Return the factor on load-dependent friction, in [-1, 1], and d factor / dv, s/rad; z: bristle deflection."""
     if user[FAMILY] == BRISTLES:  # in the coming step, without bristle damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
@@ -133,9 +133,9 @@ def install() -> Any:
 
 
 def _force_at(at: dict[str, int]) -> Callable:
-    """Return the callback function to compile; `at`: byte offsets of the fields of mjModel and mjData.
+    """Return the callback as a function to compile; at: byte offsets of the fields of mjModel and mjData.
 
-    The offsets are integers in the function's closure, so numba caches the function separately for other offsets.
+    The offsets are integers in the function's closure, so numba caches a separate function for each set of offsets.
     """
     nv_at, nbody_at, nuser_at = (at[k] // 8 for k in ("nv", "nbody", "nuser_jnt"))
     user_at, damping_at = (at[k] // 8 for k in ("jnt_user", "dof_damping"))
@@ -178,8 +178,8 @@ def _friction(sizes, user, q, dq, forces, places):
     """Add friction, offsets and errors of the gravity compensation to the passive force of a step.
 
     Args:
-        sizes: numbers of joints and bodies. user: (n, WIDTH), jnt_user.
-        forces, places: addresses of (damping, applied, passive, bias, M, userdata), (xpos, xmat, xanchor, xaxis).
+        sizes: numbers of joints and of bodies. user: (n, WIDTH), columns of `jnt_user`.
+        forces: addresses of damping, applied, passive, bias, M, userdata. places: of xpos, xmat, xanchor, xaxis.
     """
     n, nbody = sizes
     q, dq = carray(as_doubles(q), (n,)), carray(as_doubles(dq), (n,))  # type: ignore[call-arg]
@@ -243,7 +243,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by those of the control law; a variable n avoids a minute of compilation."""
+    """Replace the applied torques by the control law's torques; a constant n would add a minute of compiling."""
     user = carray(as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(as_doubles(fields[0]), (n,)), carray(as_doubles(fields[1]), (n,))
     applied, kept = carray(as_doubles(fields[2]), (n,)), carray(as_doubles(fields[5]), (KEPT, n))
@@ -257,9 +257,9 @@ def _control(n, user, fields):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _drive(n, user, fields, places):
-    """Change the applied torques by conditioning, safety filter, delay and lag, in this order.
+    """Apply conditioning, safety filter, delay and lag, in this order, to the applied torques.
 
-    numba compiles a constant n into the code: loops unroll, and the filter takes half the time (benchmarks/law.py).
+    If n is a constant, numba unrolls the loops, so that the filter takes half the time (benchmarks/law.py).
 
     Args:
         n: number of joints. user, fields, places: addresses of MuJoCo's arrays.
@@ -297,7 +297,7 @@ def _drive(n, user, fields, places):
 
 @njit(cache=True, error_model="numpy")
 def _push(limit, arm, body, places, last, bounds, sent):
-    """Limit the push of the command `sent` (n,) Nm; places: addresses of xpos, xmat, xanchor, xaxis."""
+    """Apply the push limit to the command `sent` (n,) Nm; places: addresses of xpos, xmat, xanchor, xaxis."""
     n = len(sent)
     xpos, xmat = carray(as_doubles(places[0]), (body + 1, 3)), carray(as_doubles(places[1]), (body + 1, 9))  # type: ignore[call-arg]
     anchor, axis = carray(as_doubles(places[2]), (n, 3)), carray(as_doubles(places[3]), (n, 3))  # type: ignore[call-arg]
@@ -310,9 +310,9 @@ def _hold(forces, dq, user, joint, work, touch, touches):
     """Change the passive force so that the step ends with the velocities that stick_slip.py or contact.py computes.
 
     Args:
-        forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), output of
-            `_friction`. work: (2 n + 6, n), scratch array.
-        touch: arrays `contact` and `jacobian` after `near`. touches: whether the tip may touch, result of `near`.
+        forces: MuJoCo's M, damping, bias, applied, passive. dq: (n,) rad/s, joint velocities. user: (n, WIDTH), from
+            `jnt_user`. joint: (ROWS, n), results of `_friction`. work: (2 n + 6, n), scratch array.
+        touch: arrays `contact` and `jacobian` that `near` wrote. touches: whether the tip may touch, from `near`.
     """
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]

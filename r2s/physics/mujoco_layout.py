@@ -1,4 +1,4 @@
-"""Byte offsets of the mjModel and mjData fields that the compiled callback reads, found in a live model."""
+"""Find, in a live model, the byte offsets of the mjModel and mjData fields that the compiled callback reads."""
 
 import ctypes
 from typing import Any
@@ -16,10 +16,10 @@ DATA_FIELDS = (  # in the order of mujoco_callback.py
 def struct_offsets(width: int, kept: int) -> dict[str, int]:
     """Return the byte offsets of MODEL_FIELDS in mjModel and DATA_FIELDS in mjData, found in a live model.
 
-    The address of a field's NumPy view identifies its pointer; a size has an index in MuJoCo's introspection.
+    The address of an array's NumPy view identifies the array's pointer; MuJoCo's introspection lists the sizes.
 
     Args:
-        width: number of columns of `jnt_user` in the live model. kept: number of rows of its `userdata` (kept, n).
+        width: number of columns of `jnt_user` in the live model. kept: number of rows of `userdata` (kept, n).
     """
     joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
     spec = mujoco.MjSpec.from_string(
@@ -48,7 +48,7 @@ def struct_offsets(width: int, kept: int) -> dict[str, int]:
 
 
 def _size_fields() -> list[Any]:
-    """Return mjModel's leading integer fields, all mjtSize (64 bit), in order."""
+    """Return the integer fields at the beginning of mjModel, in order; all are mjtSize (64 bit)."""
     from mujoco.introspect import structs
 
     fields: list[Any] = []

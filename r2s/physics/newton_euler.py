@@ -1,8 +1,8 @@
 """Equations of motion of a serial arm, compiled: mass matrix and bias torque in about a microsecond.
 
-The bias torque comes from the recursive Newton-Euler algorithm with zero joint accelerations, the mass matrix from
-the composite-rigid-body algorithm (Featherstone 2008, ch. 5 and 6), both with moments about the base's origin.
-This code is independent of MuJoCo and DART, and tests compare its results with theirs.
+The recursive Newton-Euler algorithm with zero joint accelerations computes the bias torque, the composite-rigid-body
+algorithm computes the mass matrix (Featherstone 2008, ch. 5 and 6). Moments are about the base's origin. This module
+is independent of MuJoCo and DART; tests compare the results of all three.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ WORK = 22  # columns of the work array of `equations`
 
 
 def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return `links` (n, LINK) from masses (n,) kg, centers of mass (n, 3) m, tensors about them (n, 3, 3) kg m^2."""
+    """Return `links` (n, LINK) from masses (n,) kg, centers of mass (n, 3) m and central tensors (n, 3, 3) kg m^2."""
     own = replace(Dynamics.of(robot, np.zeros((robot.n, 3))), mass=mass, com=com, inertia=inertia)
     rows = [
         [*link.origin[:3, 3], *link.origin[:3, :3].flat, *link.axis, link.mass, *link.com, *link.inertia.flat]
@@ -36,8 +36,8 @@ def equations(links, gravity, q, dq, mass, bias, work):
 
     Args:
         links: output of `links_of`. gravity: (3,) m/s^2 in the base frame.
-        q, dq: (n,) rad, rad/s.
-        mass, bias: outputs. work: (n, WORK), scratch array.
+        q, dq: (n,) rad, rad/s, joint angles and velocities.
+        mass, bias: arrays for the results. work: (n, WORK), scratch array.
     """
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     px, py, pz = 0.0, 0.0, 0.0
@@ -81,7 +81,7 @@ def equations(links, gravity, q, dq, mass, bias, work):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _project(mass, bias, work):
-    """Sum the forces and inertias of the links that each joint carries, and project them onto the joint axes."""
+    """Sum forces and inertias of the links that each joint carries, and project the sums onto the joint axes."""
     for j in range(len(bias) - 1, -1, -1):
         s = work[j]
         bias[j] = s[16] * s[3] + s[17] * s[4] + s[18] * s[5] + s[19] * s[0] + s[20] * s[1] + s[21] * s[2]
@@ -114,10 +114,10 @@ def joint_frame(R, link, angle):
     """Advance forward kinematics by one joint.
 
     Args:
-        R: axes of the parent link (9 numbers, row by row). link: row of `links_of`. angle: rad.
+        R: rotation of the parent link (9 numbers, row by row). link: row of `links_of`. angle: joint angle, rad.
 
     Returns:
-        The link's offset from its parent link, m, its joint axis and its rotation matrix, all in base axes.
+        Offset of the link from the parent link, m, joint axis, and rotation matrix of the link, all in base axes.
     """
     offset = rotate(R, link[PLACE], link[PLACE + 1], link[PLACE + 2])
     R = product(R, link, FRAME)
@@ -132,13 +132,13 @@ def _cross(ax, ay, az, bx, by, bz):
 
 @njit(cache=True, inline="always")
 def rotate(R, x, y, z):
-    """Return R (9 numbers, row by row) times a vector."""
+    """Return the vector x, y, z multiplied by the matrix R (9 numbers, row by row)."""
     return R[0] * x + R[1] * y + R[2] * z, R[3] * x + R[4] * y + R[5] * z, R[6] * x + R[7] * y + R[8] * z
 
 
 @njit(cache=True, inline="always")
 def product(R, k, at):
-    """Return R times the matrix in k[at : at + 9]."""
+    """Return the product of the matrices R and k[at : at + 9], as 9 numbers, row by row."""
     return (
         R[0] * k[at] + R[1] * k[at + 3] + R[2] * k[at + 6],
         R[0] * k[at + 1] + R[1] * k[at + 4] + R[2] * k[at + 7],
@@ -154,7 +154,7 @@ def product(R, k, at):
 
 @njit(cache=True, inline="always")
 def rotate_about(R, x, y, z, angle):
-    """Return R times the rotation by `angle` about the unit axis (Rodrigues)."""
+    """Return R times the rotation matrix for `angle`, rad, about the unit axis x, y, z (Rodrigues)."""
     c, s = np.cos(angle), np.sin(angle)
     d = 1.0 - c
     k = (
@@ -167,7 +167,7 @@ def rotate_about(R, x, y, z, angle):
 
 @njit(cache=True, inline="always")
 def base_tensor(R, k):
-    """Return xx, xy, xz, yy, yz, zz of a link's tensor in base axes."""
+    """Return the elements xx, xy, xz, yy, yz, zz of a link's inertia tensor in base axes."""
     A = product(R, k, TENSOR)
     return (
         A[0] * R[0] + A[1] * R[1] + A[2] * R[2],

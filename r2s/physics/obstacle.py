@@ -22,7 +22,7 @@ class Box:
     yaw: float = 0.0
 
     def add_to(self, spec: mujoco.MjSpec, number: int) -> None:
-        """Add the box to the world of a model."""
+        """Add the box as obstacle number `number` to the world body of the MuJoCo model `spec`."""
         axes = [np.cos(0.5 * self.yaw), 0.0, 0.0, np.sin(0.5 * self.yaw)]
         half = 0.5 * np.array(self.size)
         kind = mujoco.mjtGeom.mjGEOM_BOX
@@ -33,7 +33,7 @@ def boxes(where: str, given: Sequence[Mapping[str, Any]]) -> list[Box]:
     """Return the boxes that a setting describes, [{center: [x, y, z], size: [x, y, z], yaw: rad}, ...].
 
     Raises:
-        UserError: an unknown or missing key, or values that are no numbers.
+        UserError: a key is unknown or missing, or a value is not a valid number.
     """
     out = []
     for k, one in enumerate(given):

@@ -1,8 +1,8 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A payload changes mass, center of mass and inertia tensor of the last link, which is exact in every simulator. An
+A payload changes mass, center of mass and inertia tensor of the last link; every simulator is exact for it. An
 external force could not represent a payload, because the force would depend on the acceleration that it causes. The
-payload's frame is that of `robot.ee_site`; on a Panda this is the flange, the frame of libfranka's setLoad.
+payload's frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
 """
 
 from collections.abc import Mapping
@@ -28,12 +28,12 @@ WATER = 1000.0  # kg/m^3
 
 @dataclass(frozen=True)
 class Payload:
-    """A payload; mass, center of mass and inertia may have any leading batch shape.
+    """Payload of one arm, or of many arms with any leading batch shape.
 
     Attributes:
-        mass: (...) kg. centre: (..., 3) m, in the end-effector frame.
-        inertia: (..., 3, 3) kg m^2 about `centre`, axes of the end-effector frame.
-        on_s, off_s: (...) s, times of attachment and removal on the clock of a motion.
+        mass: (...) kg. centre: (..., 3) m, center of mass in the end-effector frame.
+        inertia: (..., 3, 3) kg m^2, inertia tensor about `centre`, axes of the end-effector frame.
+        on_s, off_s: (...) s, times of attachment and removal within a motion.
     """
 
     mass: np.ndarray
@@ -43,22 +43,22 @@ class Payload:
     off_s: np.ndarray | float = np.inf
 
     def attached(self, t: np.ndarray | float) -> Any:
-        """Return whether the payload is attached at t s, (...)."""
+        """Return whether the payload is attached at the time t, s."""
         return (self.on_s <= t) & (t < self.off_s)
 
 
 def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload") -> Payload | None:
     """Return the payload that a setting describes as a number of kg, a mapping or a file; None for 0 kg.
 
-    A number describes a point mass at the end effector. A mapping contains `mass`, and optionally `centre` (3,) m,
-    `inertia` (3 principal moments, or xx, yy, zz, xy, xz, yz, kg m^2 about `centre`; default: a sphere of water),
+    A number is the mass, kg, of a point mass at the end effector. A mapping contains `mass` and optionally `centre`
+    (3,) m, `inertia` (xx, yy, zz or xx, yy, zz, xy, xz, yz, kg m^2 about `centre`; default: a sphere of water),
     `on_s` and `off_s`. A string is the path of an identification's payload.yaml or run folder.
 
     Args:
-        value: the setting. name: the setting's name, for error messages. most: kg and m, `Robot.payload_max`.
+        value: the setting. name: its name in error messages. most: largest mass, kg, and distance, m, see `Robot`.
 
     Raises:
-        UserError: mass, centre, tensor or times out of range, or no such file; the message begins with `name`.
+        UserError: mass, centre, tensor or time is out of range, or a file is missing; the message begins with `name`.
     """
     if value is None:
         return None
@@ -104,7 +104,7 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...], default: np.ndarray)
 
 
 def _of_file(name: str, path: Path) -> Any:
-    """Return the mapping in a payload.yaml, given by its path or its run folder."""
+    """Return the mapping in a payload.yaml; path: the file or its run folder."""
     file = run_file(path, "payload.yaml", name)
     try:
         return yaml.safe_load(file.read_text())["payload"]
@@ -114,7 +114,7 @@ def _of_file(name: str, path: Path) -> Any:
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
-    """Return the tensor (3, 3) kg m^2 from 3 moments or 6 elements; None: the tensor of a sphere of water.
+    """Return the inertia tensor (3, 3) kg m^2 from 3 moments or 6 elements; value=None: a sphere of water.
 
     A principal moment may be at most m (2 d)^2, with the largest allowed mass m and distance d in `most`.
     """
@@ -185,14 +185,14 @@ def dynamics_with_payload(
 ) -> Dynamics:
     """Return the dynamics of an arm with a payload attached, regardless of the payload's on_s and off_s.
 
-    declared: the payload declared to the arm's gravity compensation (libfranka's setLoad), right or wrong.
+    declared: payload declared to gravity compensation (libfranka's setLoad), which may differ from `payload`.
     """
     mass, com, inertia = with_payload(robot, payload, (dynamics.mass, dynamics.com, dynamics.inertia))
     return replace(dynamics, mass=mass, com=com, inertia=inertia, declared_payload=mass_and_moment(robot, declared))
 
 
 def mass_and_moment(robot: Robot, payload: Payload | None) -> np.ndarray:
-    """Return the payload's mass, kg, and first moment in the last link's frame, kg m, (..., 4)."""
+    """Return (..., 4): the payload's mass, kg, and first moment, kg m, in the last link's frame."""
     if payload is None:
         return np.zeros(4)
     place, axes = ee_pose(robot)
@@ -211,10 +211,10 @@ class LoadTorque:
         return mujoco.MjData(self._robot.model(gravity=False))
 
     def __call__(self, q: np.ndarray, load: np.ndarray, gravity: np.ndarray | None = None) -> np.ndarray:
-        """Return the joint torque (n,) Nm at q (n,) rad.
+        """Return the joint torque (n,) Nm that holds the body at q (n,) rad.
 
         Args:
-            load: (4,) kg, kg m, from `mass_and_moment`. gravity: (3,) m/s^2 in the base frame; None: the robot's.
+            load: (4,) kg, kg m, from `mass_and_moment`. gravity: (3,) m/s^2, base frame; None: `Robot.gravity`.
         """
         if not load.any():
             return np.zeros(len(q))

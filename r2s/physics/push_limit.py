@@ -1,7 +1,7 @@
-"""Push limit: it bounds the force with which a tool's tip presses on a surface, and the closing speed at contact.
+"""Limit the force with which a tool's tip presses on a surface, and the tip's closing speed at contact.
 
-A push is a force along the surface's inward normal. With the tip's Jacobian J, speed v and effective mass
-m = 1 / (J M^-1 J^T) in this direction (Khatib, IEEE J. Robotics and Automation 3(1), 1987),
+A push is a force along the surface's inward normal. The tip's Jacobian J, speed v and effective mass
+m = 1 / (J M^-1 J^T) along this normal (Khatib, IEEE J. Robotics and Automation 3(1), 1987) satisfy
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
@@ -9,21 +9,21 @@ Here P is the push of the command, F >= 0 the contact force, and P_f the push of
 `hidden` = m |J M^-1| friction. Every millisecond, the push limit enforces two rules:
 
 - Force: P + hidden <= force_max.
-- Speed: dv/dt <= RATE (v_max - v), or P <= R + m RATE (v_max - v) with an estimate R of the force that resists the
-  push. The allowed speed v_max is `speed_near` at the surface and grows with the distance from the surface.
+- Speed: dv/dt <= RATE (v_max - v). With an estimate R of the force against the push, this rule is P <= R + m RATE
+  (v_max - v). The allowed speed v_max is `speed_near` at the surface and grows with the distance from the surface.
 
 The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. In
-the air, R is 0, so the speed rule keeps the tip below v_max. In contact at rest, R is P, so the speed rule lets P
-rise. If the tip is faster than v_max or leaves the surface, nothing resists, and the limit resets R to 0.
+free motion, R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, R is P, so the speed rule
+allows P to rise. If the tip is faster than v_max or leaves the surface, the push limit resets R to 0.
 
-On a frictionless surface of stiffness k, the contact force is at most force_max + speed_near sqrt(k m): when it
+On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m): when F
 exceeds force_max, the tip's speed is at most speed_near, and from then on P + P_f - F < 0 brakes the tip. Surface
 friction mu F pushes a sliding tip inward with up to mu c F, where c = m |T J M^-1 J^T n| with the full Jacobian J and
-the projection T across the normal n. In the bound for a surface with friction, (1 - mu c) F replaces F.
+the projection T across the normal n. Therefore, (1 - mu c) F replaces F in the bound for a surface with friction.
 
-Force and speed rule limit the torque to half-spaces with the same normal J M^-1. Of all torques in both half-spaces,
-the nearest by Gauss' principle is the target minus J^T f with a force f. As the torque must also satisfy the joints'
-acceleration bounds (safety_filter.py), regula falsi finds the f whose bounded torque satisfies the push limit.
+The force rule and the speed rule restrict the torque to two half-spaces with the same normal J M^-1. Of all torques
+in both, the nearest to the target by Gauss' principle is the target minus J^T f with a force f. As the torque must
+also satisfy acceleration bounds (safety_filter.py), regula falsi finds the f whose bounded torque meets the limit.
 """
 
 from dataclasses import dataclass
@@ -60,12 +60,12 @@ NEAR_M = 0.3  # m, distance from the surface beyond which the limit does nothing
 
 @dataclass(frozen=True)
 class PushLimit:
-    """Settings of the push limit (see the module) at a plane that is known approximately.
+    """Settings of the push limit at a plane whose position is known approximately.
 
     Attributes:
-        force_max: N. speed_near: m/s. point, normal: (3,) m and (3,), nominal plane in the base frame.
+        force_max: N, largest push. speed_near: m/s, largest closing speed at the surface.
+        point, normal: (3,) m and (3,), nominal plane in the base frame. stop: a key of STOPS (contact_stop.py).
         place, tilt: m and rad, largest deviations of the true plane from the nominal plane.
-        stop: kind of stop in contact, a key of STOPS (contact_stop.py).
     """
 
     force_max: float
@@ -77,7 +77,7 @@ class PushLimit:
     stop: str = "release"
 
     def columns(self, robot: Robot) -> np.ndarray:
-        """Return the `limit` (COLUMNS,) of `push_bound` for the robot's tool, before the first cycle."""
+        """Return the initial argument `limit` (COLUMNS,) of `push_bound` for the robot's tool."""
         Tip(robot)  # raises without a tool
         site, axes = ee_pose(robot)
         out = np.zeros(COLUMNS)
@@ -97,7 +97,7 @@ class PushLimit:
     def bound(self, robot: Robot, q: np.ndarray, stiffness: float, friction: float = 0.0) -> float:
         """Return the largest contact force, N, at q (n,) rad for `stiffness`, N/m, and `friction` of a surface.
 
-        This force is infinite where surface friction can push a sliding tip inward without limit.
+        The result is infinite if surface friction can push a sliding tip inward without limit.
         """
         jacobian = Tip(robot)(q)[1]
         moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, by a force on the tip
@@ -119,8 +119,8 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max: N. speed_near: m/s; None: the speed that limits the force on 1e5 N/m to 2 force_max.
-        plane: point and normal; None: a table below the tip at home. asked: N, largest force of the task.
+        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None bounds the force on 1e5 N/m by 2 force_max.
+        plane: point and normal; None: a table below the tip at home. asked: N, largest force that the task requests.
         stop: a key of STOPS (contact_stop.py); None: "release".
 
     Raises:
@@ -149,9 +149,9 @@ def push_limit(
 
 @njit(cache=True, error_model="numpy")
 def tip_motion(limit, kinematics, dq, row):
-    """Write the Jacobian J (n,) m/rad into `row`; return the tip's height, m, two speeds, m/s, and dJ/dt dq, m/s^2.
+    """Write the Jacobian J (n,) m/rad into `row`; return height, m, normal and lateral speed, m/s, dJ/dt dq, m/s^2.
 
-    The height is above the highest possible true plane; the speeds are inward and along the nominal plane.
+    The height is above the highest possible true plane. The normal speed is inward; the lateral is along the plane.
     """
     position, R, anchor, axis = kinematics
     a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
@@ -190,14 +190,14 @@ def tip_motion(limit, kinematics, dq, row):
 
 @njit(cache=True, error_model="numpy")
 def push_bound(limit, arm, kinematics, last, friction, work):
-    """Return the upper bound, m/s^2, on J M^-1 tau, the tip's inward acceleration by a torque; inf far away.
+    """Return the upper bound, m/s^2, on the tip's inward acceleration J M^-1 tau; inf far from the surface.
 
     Args:
-        limit: (COLUMNS,) from `PushLimit.columns`; this function updates R and the last speed.
-        arm: `JointDynamics`, finite. kinematics: position (3,) m and rotation (9,) of the last link, and anchors and
-            axes (n, 3) of the joints, in the base frame.
-        last: (n,) Nm, the torque that the arm applied last.
-        friction: (n,) Nm, level of each joint's friction.
+        limit: (COLUMNS,) from `PushLimit.columns`; this function updates the estimate R and the last speed.
+        arm: `JointDynamics` with finite values. kinematics: position (3,) m and rotation (9,) of the last link, and
+            anchors (n, 3) m and axes (n, 3) of the joints, all in the base frame.
+        last: (n,) Nm, command of the previous cycle.
+        friction: (n,) Nm, friction level of each joint.
         work: (n + WORK, n), scratch array; afterward, row n contains J and row n + 1 contains J M^-1.
     """
     n = len(last)
@@ -231,9 +231,9 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit the push of the torques `out` (n,) Nm, and the joint accelerations under the estimated contact force.
+    """Apply the push limit to the torques `out` (n,) Nm, and limit joint accelerations in contact.
 
-    Return whether `out` changed. See `push_bound` for the arguments, and `filter_torque` for share and limits.
+    Return whether `out` changed. `push_bound` explains the arguments, `filter_torque` explains `share` and `limits`.
     """
     n = len(out)
     own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()
@@ -274,7 +274,7 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
 
 @njit(cache=True, error_model="numpy")
 def _excess(lever, bound, tau):
-    """Return the excess, m/s^2, of the inward acceleration J M^-1 tau over `bound`; lever: J M^-1. tau: (n,) Nm."""
+    """Return the excess, m/s^2, of the inward acceleration J M^-1 tau over `bound`; lever: (n,), J M^-1."""
     out = -bound
     for j in range(len(tau)):
         out += lever[j] * tau[j]

@@ -1,8 +1,8 @@
 """Rigid-body functions of the nominal arm: regressor, inverse dynamics, mass matrix and end-effector kinematics.
 
-The regressor form is torque = regressor @ standard inertial parameters. A link's standard parameters are ten numbers
-in the link's own frame, about its origin (Khalil and Dombre 2002, ch. 9): mass m, first moments h = m c, and the
-tensor's xx, yy, zz, xy, xz, yz.
+The regressor is the matrix in torque = regressor @ standard inertial parameters. A link has ten standard parameters,
+in the axes and about the origin of the link's frame (Khalil and Dombre 2002, ch. 9): mass m, first moments h = m c,
+and the tensor elements xx, yy, zz, xy, xz, yz.
 """
 
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class LinkInertia:
-    """Inertial parameters of n links; any leading batch shape.
+    """Inertial parameters of n links, with any leading batch shape.
 
     Attributes:
-        mass: (..., n) kg. com: (..., n, 3) m, link frame.
-        inertia: (..., n, 3, 3) kg m^2 about the center of mass, link axes.
+        mass: (..., n) kg, link masses. com: (..., n, 3) m, centers of mass, link frames.
+        inertia: (..., n, 3, 3) kg m^2, inertia tensor of each link about its center of mass, link axes.
     """
 
     mass: np.ndarray
@@ -30,7 +30,7 @@ class LinkInertia:
     inertia: np.ndarray
 
     def standard(self) -> np.ndarray:
-        """Return each link's standard parameters (..., n, 10): mass, first moments, and tensor about the origin."""
+        """Return each link's standard parameters (..., n, 10): mass, first moments, tensor about its origin."""
         m, c = self.mass[..., None], self.com
         square = (c**2).sum(-1)[..., None, None] * np.eye(3) - c[..., :, None] * c[..., None, :]
         tensor = tensor_elements(self.inertia + m[..., None] * square)
@@ -39,7 +39,7 @@ class LinkInertia:
 
 
 def tensor_elements(tensor: np.ndarray) -> np.ndarray:
-    """Return (..., 6) xx, yy, zz, xy, xz, yz of symmetric tensors (..., 3, 3)."""
+    """Return the elements xx, yy, zz, xy, xz, yz (..., 6) of symmetric tensors (..., 3, 3)."""
     rows, columns = zip(*_PAIRS, strict=True)
     return tensor[..., rows, columns]
 
@@ -50,9 +50,9 @@ def regressor(
     """Return the regressor (T, n, n, 10): the derivative of each joint torque by each link's standard parameters.
 
     Args:
-        robot: the arm's kinematics.
-        q, dq, ddq: (T, n) rad, rad/s, rad/s^2.
-        gravity: (3,) m/s^2, or None for an arm with gravity compensation.
+        robot: the arm, for its kinematics.
+        q, dq, ddq: (T, n) rad, rad/s, rad/s^2, joint motion.
+        gravity: (3,) m/s^2 in the base frame; None: the arm compensates gravity.
     """
     place, frame, anchor, axis = joint_kinematics(robot, q)
     samples, n = q.shape
@@ -62,7 +62,7 @@ def regressor(
     a = np.zeros((samples, 3)) - (0.0 if gravity is None else np.asarray(gravity))  # gravity as a base acceleration
 
     def at(a, omega, alpha, arm):
-        """Return the acceleration, m/s^2, at `arm` from the point whose acceleration is `a`."""
+        """Return the acceleration, m/s^2, of the point at `arm`, m, from a point with the acceleration `a`."""
         return a + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
 
     basis = np.zeros((6, 3, 3))
@@ -92,7 +92,7 @@ def regressor(
 
 
 def joint_kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return link origins (T, n, 3) and frames (T, n, 3, 3), joint anchors and axes (T, n, 3), in the base frame."""
+    """Return link origins (T, n, 3) m and axes (T, n, 3, 3), joint anchors and axes (T, n, 3), in the base frame."""
     model = robot.model(gravity=False)
     data = mujoco.MjData(model)
     bodies = model.jnt_bodyid
@@ -110,9 +110,9 @@ def joint_kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def rigid_body(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (rest (T, n) Nm, regressor (T, n, n, 10)): torque = rest + regressor @ standard parameters.
+    """Return rest (T, n) Nm and regressor (T, n, n, 10) of torque = rest + regressor @ standard parameters.
 
-    The torque `rest` is due to the file's armature and welded bodies. See `regressor` for the arguments.
+    The torque `rest` is due to armature and welded bodies in the robot's file. `regressor` explains the arguments.
     """
     total = nominal_torque(robot, q, dq, ddq, False if gravity is None else gravity)
     y = regressor(robot, q, dq, ddq, gravity)
@@ -124,7 +124,7 @@ def nominal_torque(
 ) -> np.ndarray:
     """Return the torque (T, n) Nm of the nominal links and rotors, without MuJoCo's forces at joint limits.
 
-    q, dq, ddq: (T, n) rad, rad/s, rad/s^2. gravity: True (the robot's), False (none), or (3,) m/s^2.
+    q, dq, ddq: (T, n) rad, rad/s, rad/s^2, joint motion. gravity: True (the robot's), False (none), or (3,) m/s^2.
     """
     model = robot.model(gravity=bool(np.any(gravity)))
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
@@ -134,7 +134,7 @@ def nominal_torque(
 
 
 def mujoco_inverse_dynamics(model: mujoco.MjModel, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return the torque (T, n) Nm of a model at q, dq, ddq (T, n) rad, rad/s, rad/s^2."""
+    """Return the torque (T, n) Nm that a MuJoCo model needs for q, dq, ddq (T, n) rad, rad/s, rad/s^2."""
     data, out = mujoco.MjData(model), np.empty_like(q)
     for t in range(len(q)):
         data.qpos[:], data.qvel[:], data.qacc[:] = q[t], dq[t], ddq[t]
@@ -155,7 +155,7 @@ def mass_matrix(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return principal moments (..., 3) kg m^2 and axes, a quaternion (..., 4) w x y z, of tensors (..., 3, 3)."""
+    """Return principal moments (..., 3) kg m^2 and axes, as quaternions (..., 4) w x y z, of tensors (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     moments, axes = np.linalg.eigh(inertia)
@@ -167,7 +167,7 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def set_links(
     model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
 ) -> None:
-    """Set a model's link masses (n,) kg, centers of mass (n, 3) m, tensors (n, 3, 3) and rotors (n,) kg m^2."""
+    """Set a model's link masses (n,) kg, centers of mass (n, 3) m, tensors (n, 3, 3) and armature (n,) kg m^2."""
     at = model.jnt_bodyid
     model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com
@@ -176,7 +176,7 @@ def set_links(
 
 
 class Kinematics:
-    """End-effector position and Jacobian of the nominal geometry, from measured joint angles."""
+    """Compute end-effector position and Jacobian from measured joint angles, with nominal link geometry."""
 
     def __init__(self, robot: Robot):
         self._model = robot.model(gravity=False)
@@ -192,7 +192,7 @@ class Kinematics:
 
 
 class InverseInertia:
-    """Inverse mass matrix of m nominal arms; 1 / diagonal is a joint's inertia while the other joints are free."""
+    """Inverse mass matrices of m nominal arms; 1 / element (j, j) is joint j's inertia if all joints can move."""
 
     def __init__(self, robot: Robot, m: int = 1):
         model = robot.model(gravity=False)
@@ -202,7 +202,7 @@ class InverseInertia:
         self._rows = np.repeat(np.arange(robot.n), model.M_rownnz)
 
     def __call__(self, q: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
-        """Return M^-1 (m, n, n), 1/(kg m^2), at q (m, n) rad of the arms `ids` (all by default)."""
+        """Return inverse mass matrices (m, n, n), 1/(kg m^2), of the arms `ids` (all by default) at q (m, n) rad."""
         at = slice(None) if ids is None else ids
         self._q[at] = q
         self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)

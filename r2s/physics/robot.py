@@ -1,6 +1,6 @@
 """Load a `Robot`: kinematics, inertia and gravity from an MJCF or URDF file, limits from the file or the config.
 
-r2s commands joint torques, so its model contains the file's joints and links, but no actuators, sensors, keyframes,
+r2s commands joint torques, so `Robot.model` has the file's joints and links, but no actuators, sensors, keyframes,
 free objects, gravity compensation or contacts. The file's damping and frictionloss are nominal values of the friction
 law (dynamics.py), so `Robot.model` sets both to 0, but keeps nonlinear damping. The file's armature is the nominal
 rotor inertia. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
@@ -47,14 +47,14 @@ class Robot:
         q_home: (n,) rad, start of episodes and excitations.
         ee_site: the site of `model` that is the end effector.
         gravity: (3,) m/s^2 in the base frame.
-        mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
+        mass, com: (n,) kg and (n, 3) m, nominal mass and center of mass of each moving link, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its center of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
-        damping: (n,) Nm s/rad and frictionloss: (n,) Nm from the file; 0 where the file has none.
-        velocity_envelope: None, or deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit
-            sqrt(2 deceleration distance + offset^2) - offset at a distance from the position limit.
+        damping, frictionloss: (n,) Nm s/rad and (n,) Nm, viscous and Coulomb friction in the file, 0 by default.
+        velocity_envelope: None, or deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3, whose velocity limit is
+            sqrt(2 deceleration distance + offset^2) - offset at a distance, rad, from a position limit.
         tool: the spherical tip that touches surfaces; None: no tool.
-        lock: {joint: rad or m}, welded joints and their positions.
+        lock: {joint: rad or m}, positions of the welded joints.
         payload_max: (2,) largest payload mass, kg, and largest distance, m, from end effector to payload center.
     """
 
@@ -92,7 +92,7 @@ class Robot:
 
     @property
     def q_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """(low, high), (n,) rad: the position limits; a range above 2 pi is cut to pi on either side of home."""
+        """(low, high), (n,) rad: position limits; a range above 2 pi is cut to at most pi on either side of home."""
         more = self.q_max - self.q_min > 2 * np.pi
         low = np.where(more, np.maximum(self.q_min, self.q_home - np.pi), self.q_min)
         return low, np.where(more, np.minimum(self.q_max, self.q_home + np.pi), self.q_max)
@@ -103,11 +103,11 @@ class Robot:
         """Compile the MuJoCo model.
 
         Args:
-            gravity: False is libfranka's convention (the arm compensates gravity); True is for link-side torque.
-            user: columns of `jnt_user`, the parameters of the callback (r2s/physics/mujoco_callback.py).
-            memory: number of doubles in the callback's state.
+            gravity: whether gravity acts; False: the arm compensates gravity (libfranka). True: link-side torque.
+            user: number of columns of `jnt_user`, which stores parameters of the callback (mujoco_callback.py).
+            memory: number of doubles in `userdata`, the state of the callback.
             dt: time step, s.
-            obstacles: boxes around the arm, for distance computations.
+            obstacles: boxes around the arm, used only to compute distances.
         """
         spec, _ = read_spec(self.mjcf, self.lock)
         spec.compile()  # assigns the joints' ids; the changes below invalidate them
@@ -134,10 +134,10 @@ class Robot:
 
 
 def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
-    """Return (n,) floats from one value per joint or one for all; joints: their description in error messages.
+    """Return (n,) floats from one value per joint or one for all; joints: text for the joints in error messages.
 
     Raises:
-        UserError: a wrong number of values, or values that are no numbers.
+        UserError: the number of values is wrong, or a value is not a number.
     """
     try:
         array = np.array(value, dtype=float)
@@ -169,24 +169,24 @@ def load_robot(
     payload_max: float | None = None,
     payload_far: float | None = None,
 ) -> Robot:
-    """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
+    """Read an arm from an MJCF or URDF file; arguments except `mjcf` override values of the file.
 
     The file has position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
     its motor) and q_home, as a keyframe named home; a URDF also has velocity limits. MJCF and URDF have no limits of
-    acceleration or torque rate. `gravcomp`, disabled gravity and objects on free joints are ignored.
+    acceleration or torque rate. r2s ignores `gravcomp`, disabled gravity and objects on free joints in the file.
 
     Args:
         mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; None: the Panda.
         ee: site, body or link of the end effector; None: the only site, or the last link of a URDF.
         q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; None: from the file or a default.
-        gravity: (3,) m/s^2 in the base frame; None: the file's gravity; for a URDF, gravity of an upright base.
-        armature: kg m^2, rotor inertia at the joints; None: the file's.
+        gravity: (3,) m/s^2 in the base frame; None: the file's gravity or, for a URDF, gravity of an upright base.
+        armature: kg m^2, rotor inertia at the joints; None: the file's armature.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
-        lock: {joint: rad or m}, joints to weld at these positions, such as a gripper's; None: none.
-        payload_max, payload_far: kg, m, values of `Robot.payload_max`; None: estimates from torque limits and reach.
+        lock: {joint: rad or m}, positions at which to weld joints, such as a gripper's; None: weld no joint.
+        payload_max, payload_far: kg and m, for `Robot.payload_max`; None: estimates from torque limits and reach.
 
     Raises:
-        UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
+        UserError: the file is missing or invalid, is no serial arm of hinges, or lacks limits or the end effector.
     """
     path = located(mjcf or PANDA)
     spec, model, fastest = _read(path, lock)
@@ -224,7 +224,7 @@ def load_robot(
 
 
 def _read(path: Path, lock: Mapping[str, float] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel, np.ndarray]:
-    """Return the file's MjSpec, its checked model, and its velocity limits, rad/s, nan where the file has none."""
+    """Return the MjSpec, the checked model and the velocity limits, rad/s, of a file; nan: no velocity limit."""
     if not path.is_file():
         raise UserError(f"robot.mjcf: no such file: {path}{nearest_file(path, '*.*')}")
     spec, fastest = read_spec(path, lock)
@@ -246,7 +246,7 @@ def _limits(
     q_home: list[float] | None,
     tau_max: list[float] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return checked q_min, q_max, q_home (n,) rad and tau_max (n,) Nm; the file's values replace None."""
+    """Return checked q_min, q_max, q_home (n,) rad and tau_max (n,) Nm; an argument None becomes the file's value."""
     limited = model.jnt_limited.astype(bool)
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
     high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
@@ -262,7 +262,7 @@ def _limits(
 def _payload_max(
     model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
 ) -> tuple[float, float]:
-    """Return `Robot.payload_max`; estimates from torque limits and the reach beyond joint 2 replace None."""
+    """Return `Robot.payload_max`; an argument None is estimated from torque limits and the reach beyond joint 2."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     sites = [model.site(i).name for i in range(model.nsite)]
@@ -304,7 +304,7 @@ def _end_effector(model: mujoco.MjModel, name: str | None, path: Path) -> str:
 
 
 def _ends(model: mujoco.MjModel) -> list[str]:
-    """Return the names of the bodies that move with the last joint and have no child."""
+    """Return the names of the bodies that move with the last joint and have no child body."""
     last = model.jnt_bodyid[-1]
     parents = set(model.body_parentid.tolist())
     return [model.body(i).name for i in np.flatnonzero(model.body_weldid == last) if i not in parents]

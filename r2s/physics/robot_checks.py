@@ -1,4 +1,4 @@
-"""Checks of an arm's file: a serial chain without couplings, complete limits, plausible masses."""
+"""Check that an arm's file has a serial chain without couplings, complete limits and plausible masses."""
 
 from pathlib import Path
 
@@ -103,7 +103,7 @@ def check_limits(
     """Raise UserError unless position and torque limits are complete and q_home lies within them.
 
     Args:
-        model, path: the arm and its file. low, high, home: (n,) rad, limits and home. torque: (n,) Nm, limits.
+        model, path: arm and file. low, high, home: (n,) rad, limits and q_home. torque: (n,) Nm, torque limits.
         unset: names of joints with a range of 0 to 0 in the file.
     """
     if unset:
@@ -195,7 +195,7 @@ def _weight(model: mujoco.MjModel, gravity: np.ndarray, home: np.ndarray) -> np.
 
 
 def torque_limits(model: mujoco.MjModel) -> np.ndarray:
-    """Return the torque limits (n,) Nm from the joints' actuatorfrcrange or their motors; nan: the file has none."""
+    """Return the torque limits (n,) Nm from the joints' actuatorfrcrange or their motors; nan: no limit."""
     limit = np.where(model.jnt_actfrclimited.astype(bool), np.abs(model.jnt_actfrcrange).min(1), np.nan)
     for i in range(model.nu):
         joint = model.actuator_trnid[i, 0]

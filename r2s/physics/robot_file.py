@@ -1,7 +1,7 @@
-"""Reader for the arm in an MJCF or URDF file: it drops elements of the simulation and welds locked joints.
+"""Read the arm in an MJCF or URDF file, without elements of the simulation and with locked joints welded.
 
-The reader drops objects on free joints, which scene files contain. A gripper's fingers are welded at the positions in
-`robot.lock` and become part of the link that carries them.
+The reader removes objects on free joints, as in scene files. The reader welds a gripper's fingers at the positions in
+`robot.lock`, so the fingers become part of the link that carries the gripper.
 """
 
 from collections.abc import Mapping
@@ -20,11 +20,11 @@ FREE_OR_BALL = (JOINT.mjJNT_FREE, JOINT.mjJNT_BALL)
 
 
 def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
-    """Return an MJCF or URDF file's MjSpec, and its velocity limits, rad/s, (n,) or a scalar; nan: no limit.
+    """Return the MjSpec of an MJCF or URDF file, and the velocity limits, rad/s, (n,) or a scalar; nan: no limit.
 
     Args:
         path: the file.
-        lock: {joint: rad or m}: joints that are welded at a position, such as a gripper's or a rail's.
+        lock: {joint: rad or m}, positions at which to weld joints, such as a gripper's or a rail's.
 
     Raises:
         UserError: the file is not valid, or does not contain a joint of `lock`.
@@ -50,7 +50,7 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
 def strip(spec: mujoco.MjSpec) -> None:
     """Remove elements that describe the simulation, not the arm: motors, sensors, keyframes, physics switches.
 
-    Each joint receives its motor's damping; `rotors` returns the rotor inertia. `check_arm` comes first.
+    Each joint receives the damping of its motor; `rotors` returns the rotor inertia. Call `check_arm` before `strip`.
     """
     for actuator in spec.actuators:
         joint = spec.joint(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
@@ -65,7 +65,7 @@ def strip(spec: mujoco.MjSpec) -> None:
 
 
 def rotors(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotor inertia (n,) kg m^2 and viscous damping (n,) Nm s/rad of joints and motors, at the joints."""
+    """Return each joint's rotor inertia (n,) kg m^2 and viscous damping (n,) Nm s/rad, including the motor's."""
     armature, damping = model.dof_armature[model.jnt_dofadr].copy(), model.dof_damping[model.jnt_dofadr].copy()
     for i in np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT):
         joint, square = model.actuator_trnid[i, 0], model.actuator_gear[i, 0] ** 2
@@ -75,13 +75,13 @@ def rotors(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_loose(body: mujoco.MjsBody) -> bool:
-    """Return whether a body is loose: its subtree has free or ball joints only."""
+    """Return whether a body is loose, that is, whether all joints of its subtree are free or ball joints."""
     joints = [joint.type for below in (body, *body.find_all("body")) for joint in below.joints]
     return bool(joints) and all(kind in FREE_OR_BALL for kind in joints)
 
 
 def _remove(spec: mujoco.MjSpec, loose: list[mujoco.MjsBody]) -> None:
-    """Delete loose bodies, and every element that refers to them."""
+    """Delete the bodies `loose` and every element that refers to one of these bodies."""
     spec.compile()  # so that keyframes lose the bodies' part of qpos, too
     bodies = [below for body in loose for below in (body, *body.find_all("body"))]
     gone = {x.name for body in bodies for x in (body, *body.joints, *body.sites, *body.geoms) if x.name}
@@ -107,7 +107,7 @@ def _forget(spec: mujoco.MjSpec, names: set[str]) -> None:
 
 
 def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
-    """Weld the bodies of locked joints, and lump them with the links that carry them."""
+    """Weld the bodies of locked joints, and lump each welded body with the link that carries it."""
     model, joints = spec.compile(), {joint.name: joint for joint in spec.joints}
     at = {str(name): float(value) for name, value in lock.items()}
     for name in at:
@@ -116,7 +116,7 @@ def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
                 f"robot.lock: no hinge or slide '{name}' in {path.name}; joints: {choices(joints)}"
                 f"{nearest(name, joints)}"
             )
-    for equality in spec.equalities:  # a finger that mirrors a locked one
+    for equality in spec.equalities:  # a finger that mirrors a locked finger
         first, second, c = equality.name1, equality.name2, equality.data
         if equality.type == EQ.mjEQ_JOINT and equality.active and second in at and first not in at:
             x = at[second] - model.joint(second).qpos0[0]
@@ -143,7 +143,7 @@ def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
 
 
 def _lump(spec: mujoco.MjSpec, welded: set[str | int]) -> None:
-    """Add the inertia of welded bodies, and of bodies fixed to them, to the moving links that carry them."""
+    """Add the inertia of each welded body, and of bodies fixed to it, to the moving link that carries the body."""
     model = spec.compile()
     bodies, of = Bodies(model), {body.id: body for body in spec.bodies}
     carriers = {int(model.body_weldid[body.id]) for body in of.values() if (body.name or body.id) in welded}

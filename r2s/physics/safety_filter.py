@@ -1,19 +1,19 @@
-"""Safety filter: it limits joint accelerations near the speed and position limits, as the last stage before the arm.
+"""Limit joint accelerations near speed and position limits, as the last stage before the arm: the safety filter.
 
-The same compiled filter runs in training and on every arm. The filter's input is the effort, the target torque after
+Training and every arm run the same compiled safety filter. The filter's input is the effort, the target torque after
 the low-pass (r2s/physics/actuation.py). The safety filter consists of three limits:
 
 - Fading: the policy's torque fades out as a joint approaches its velocity limit or a position limit.
 - Acceleration limit: each joint's acceleration a = M^-1 (tau - Coriolis torque) satisfies -RATE (v + dq) <= a <= RATE
   (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within this limit, the filter selects
-  the nearest to the effort by Gauss' principle of least constraint: it adds the torques that mechanical stops would
-  exert. Joint friction only widens the limit, so an overestimated friction never accelerates a joint.
-- Rate limit: the torque is clipped to its range, and one common factor for all joints limits its rate. The command
-  thus moves on the straight line from the last command to the new torque, within the convex set of the acceleration
-  limit. With one rate limit per joint, the command could leave this set if two joint axes are almost parallel.
+  the torque nearest to the effort by Gauss' principle of least constraint, by adding torques of fictitious mechanical
+  stops. Joint friction only widens the limit, so an overestimated friction never accelerates a joint.
+- Rate limit: the filter clips the torque, and limits the torque rate by one factor for all joints. The command
+  therefore moves straight from the last command to the new torque, within the convex set of the acceleration limit.
+  With a separate factor for each joint, the command could leave this set if two joint axes are almost parallel.
 
-The acceleration limit is a control barrier function (Ames et al., European Control Conference 2019). The filter is
-continuous in state and target, so it causes no chattering, and RATE tolerates the latency of an arm.
+The acceleration limit is a control barrier function (Ames et al., European Control Conference 2019). The command is
+continuous in state and effort, so the filter causes no chattering. RATE is low enough for the latency of an arm.
 """
 
 import math
@@ -66,13 +66,13 @@ class JointDynamics(NamedTuple):
 
 
 def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
-    """Return the limits (n, COLUMNS) of `filter_torque`.
+    """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
-    In the filter, light joints have added inertia (column ADDED), just enough that the largest target torque of this
-    or a coupled joint passes at rest. Added inertia makes a joint's loop faster than RATE; DELAY_PHASE bounds it.
+    The filter adds inertia (column ADDED) to light joints, just enough that the largest target torque of the joint or
+    of a coupled joint passes at rest. DELAY_PHASE bounds the added inertia, which makes a loop faster than RATE.
 
     Args:
-        robot: position, velocity, torque and rate limits, and the mass matrix at home.
+        robot: the arm, for its position, velocity, torque and rate limits and its mass matrix at home.
         torque: (n,) Nm, largest target torque.
     """
     out = np.empty((robot.n, COLUMNS))
@@ -97,7 +97,7 @@ class SafetyFilter:
         changed: number of cycles in which fading or acceleration limit changed the effort.
 
     Args:
-        model: one arm without gravity. robot, torque: see `filter_limits`. friction: (n,) Nm, see `filter_torque`.
+        model: one arm without gravity. robot, torque: see `filter_limits`. friction: (n,) Nm, estimated friction.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, torque: np.ndarray, friction: np.ndarray):
@@ -107,7 +107,7 @@ class SafetyFilter:
         self.changed = 0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, effort: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Return the command (n,) Nm for the effort (n,) Nm at q, dq (n,), after the command `last` (n,) Nm."""
+        """Return the command (n,) Nm for `effort` (n,) Nm at q, dq (n,), after the previous command `last`, Nm."""
         data, out = self._data, np.empty_like(effort)
         data.qpos[:], data.qvel[:] = q, dq
         mujoco.mj_fwdPosition(self._model, data)
@@ -122,9 +122,9 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
     """Write a cycle's command (n,) Nm into `out`; return whether fading or acceleration limit changed the effort.
 
     Args:
-        arm: `JointDynamics`, finite.
-        effort: (n,) Nm, input. last: (n,) Nm, the command that the arm applied last.
-        share: factor on the allowed joint speeds, 1 or, while the arm brakes, less.
+        arm: `JointDynamics` with finite values.
+        effort: (n,) Nm, requested torque. last: (n,) Nm, command of the previous cycle.
+        share: factor on the allowed joint speeds: 1, or less while the arm brakes.
         friction: (n,) Nm, estimated friction, at least 0.
         limits: (n, COLUMNS) of `filter_limits`. work: (2 n + WORK, n), scratch array.
     """
@@ -136,7 +136,7 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def fade(q, dq, effort, limits, out):
-    """Write the effort (n,) Nm, faded out near velocity and position limits, into `out`; return whether it fades."""
+    """Write the effort (n,) Nm, faded near velocity and position limits, to `out`; return whether fading acted."""
     kept = _torque_share(q, dq, limits)
     for j in range(len(q)):
         out[j] = kept * effort[j]
@@ -168,7 +168,7 @@ def joint_bounds(arm, share, limits, work):
 def bounded(arm, friction, limits, work, desk, out):
     """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether `out` exceeded a bound.
 
-    desk: (n, n), overwritten. With desk = `work[:n]`, the function destroys the Cholesky root in `work`.
+    desk: (n, n), scratch array; if `desk` is `work[:n]`, this function overwrites the Cholesky root in `work`.
     """
     n, dq = len(out), arm.dq
     ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]
@@ -223,7 +223,7 @@ def _speed_limit(distance, share, limits):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _widen(dq, out, friction, limits, work):
-    """Write M^-1 and the acceleration bounds, widened by what joint friction can cancel, into `work`."""
+    """Write M^-1 and the acceleration bounds, widened by accelerations that friction can cancel, into `work`."""
     n = len(out)
     root, mobility, slack = work[:n], work[n : 2 * n], work[2 * n + _SLACK]
     for j in range(n):
@@ -248,9 +248,9 @@ def _widen(dq, out, friction, limits, work):
 def _stop_torque(ddq, low, high, work, root):
     """Write the torque (n,) Nm of fictitious joint stops into row _STOP of `work`, which contains M^-1.
 
-    The torque `stop` solves the linear complementarity problem low <= ddq + M^-1 stop <= high: a stop pushes inward,
-    and only at a bound. The solver is block principal pivoting (Judice and Pires, Computers & Operations Research
-    21(5), 1994). root: (n, n), overwritten.
+    The torque `stop` solves the linear complementarity problem low <= ddq + M^-1 stop <= high: a stop acts only at a
+    bound and pushes inward. The solver is block principal pivoting (Judice and Pires, Computers & Operations Research
+    21(5), 1994). root: (n, n), scratch array.
     """
     n = len(ddq)
     mobility = work[n : 2 * n]

@@ -1,8 +1,8 @@
 """Simulator of many arms at once: `mujoco.batch.Batch` with friction, control law and safety filter in each step.
 
 The simulation has no gravity, and commanded torques exclude gravity (libfranka's convention), because the arm adds
-its own gravity compensation. The compensation uses the nominal masses and centers of mass; the torque of its error
-acts in addition (r2s/physics/mujoco_callback.py).
+its own gravity compensation. The arm computes gravity compensation from nominal masses and centers of mass. The
+simulation adds the torque error of gravity compensation (r2s/physics/mujoco_callback.py).
 """
 
 from collections.abc import Mapping
@@ -36,13 +36,13 @@ from r2s.physics.robot import SIM_DT, Robot
 class Simulator:
     """Batch of `nsim` simulated arms, each with its own `Dynamics`, on `nthread` threads (0: all).
 
-    The motion is bit-identical for any number of threads.
+    The simulated motion is bit-identical for any number of threads.
 
     Args:
-        robot: the arm; with `robot.tool`, each simulated arm may have a surface (`Dynamics.surface`).
-        dynamics: one for all arms, or a batch of `nsim`. nsim, nthread: numbers of arms and threads.
-        dt: s, duration of a physics step.
-        control: law that maps commands to torques; None: the caller passes torques to `rollout`.
+        robot: robot to simulate; a robot with a tool may touch a surface (`Dynamics.surface`).
+        dynamics: one `Dynamics` for all arms, or a batch of `nsim`. nsim, nthread: numbers of arms and threads.
+        dt: duration of a physics step, s.
+        control: control law that maps commands to torques; None: the caller passes torques to `rollout`.
     """
 
     def __init__(
@@ -89,9 +89,9 @@ class Simulator:
         self.set_dynamics(dynamics)
 
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray | None = None, repeat: int = 1) -> None:
-        """Set the dynamics of the arms `ids` (all by default); a field without a batch shape applies to all of them.
+        """Set the dynamics of the arms `ids`, by default of all arms.
 
-        With repeat > 1, each of the given dynamics applies to that many consecutive arms.
+        A field without a batch axis applies to all `ids`; a batched value applies to `repeat` consecutive arms.
         """
         arms = np.arange(self.nsim) if ids is None else np.asarray(ids)
         moments, axes = principal_axes(dynamics.inertia)
@@ -122,14 +122,14 @@ class Simulator:
         soft_start_s: float = 0.0,
         push_limit: PushLimit | None = None,
     ) -> None:
-        """Enable control law, low-pass and limits, safety filter, delay and lag in all following steps.
+        """Enable control law, torque low-pass, limits, safety filter, delay and lag in all later steps.
 
-        Without a control law, the torques passed to `rollout` are efforts, the input of the safety filter.
+        Without a control law, the torques passed to `rollout` are the efforts that enter the safety filter.
 
         Args:
-            limits: (n, COLUMNS), see `r2s.physics.safety_filter.filter_limits`.
-            torque_limit: (n,) Nm, largest target. cutoff_hz: Hz, low-pass. soft_start_s: s, fade-in of an episode.
-            push_limit: limit for a robot with a tool; None: pushes are not limited.
+            limits: (n, COLUMNS), limits of the safety filter, see `r2s.physics.safety_filter.filter_limits`.
+            torque_limit: (n,) Nm, largest target torque. cutoff_hz: Hz, cutoff of the torque low-pass.
+            soft_start_s: s, fade-in of the torque in an episode. push_limit: push limit of a tool; None: no limit.
         """
         u = native
         self._user[:, :, u.LIMITS : u.LIMITS + limits.shape[1]] = limits
@@ -143,7 +143,7 @@ class Simulator:
             self._push[:] = self._push_limit = push_limit.columns(self.robot)
 
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
-        """Set the control law's commands (nsim, c), which apply until the next call of `command`.
+        """Set the c commands (nsim, c) of each arm's control law until the next call of `command`.
 
         speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: no noise.
         """
@@ -153,15 +153,15 @@ class Simulator:
             self._memory[:, native.NOISE * n : (native.NOISE + 1) * n] = speed_noise
 
     def push(self, tau: np.ndarray) -> None:
-        """Apply external joint torques tau (nsim, n) Nm until the next `push`, in addition to the arms' offsets."""
+        """Apply external joint torques tau (nsim, n) Nm, besides the arms' offsets, until the next call of `push`."""
         self._user[:, :, native.OFFSET] = self._offset + tau
 
     def reset(
         self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, bristle: np.ndarray | float = 0.0
     ) -> None:
-        """Set q, dq (m, n) rad, rad/s of the arms `ids` (all by default), and update their kinematics.
+        """Set q (m, n) rad and dq (m, n) rad/s of the arms `ids` (by default all), and update their kinematics.
 
-        bristle: (m, n) in [-1, 1], bristle deflection of friction with a memory.
+        bristle: (m, n), bristle deflection from -1 to 1, for friction laws with memory.
         """
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         at = slice(None) if ids is None else ids
@@ -200,43 +200,43 @@ class Simulator:
         return self.batch.rollout(tau.shape[1], tau, control_spec=spec, record=record, ids=ids)
 
     def kinematics(self) -> None:
-        """Update `ee` and `jacobian` after a rollout."""
+        """Update the properties `ee` and `jacobian` after a rollout."""
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
 
     @property
     def tau(self) -> np.ndarray:
-        """(nsim, n) Nm, the last command of the safety filter."""
+        """Last torque (nsim, n) Nm that the safety filter commanded."""
         n = self.robot.n
         return self._memory[:, native.SENT * n : (native.SENT + 1) * n]
 
     @property
     def effort(self) -> np.ndarray:
-        """(nsim, n) Nm, the target torque after low-pass, clip and rate limit."""
+        """Target torque (nsim, n) Nm after low-pass, clip and rate limit."""
         n = self.robot.n
         return self._memory[:, native.EFFORT * n : (native.EFFORT + 1) * n]
 
     @property
     def limited(self) -> np.ndarray:
-        """(nsim,), number of cycles since `reset` in which the safety filter changed the effort."""
+        """Number of cycles (nsim,) since `reset` in which the safety filter changed the effort."""
         return self._memory[:, native.LIMITED * self.robot.n]
 
     @property
     def contact_force(self) -> np.ndarray:
-        """(nsim, 3) N, force on the tool in the base frame, mean over the last step; requires a tool."""
+        """Mean force (nsim, 3) N on the tool over the last step, in the base frame; requires a tool."""
         return self._contact[:, FORCE : FORCE + 3]
 
     @property
     def box(self) -> np.ndarray:
-        """(nsim, 6), pose of the box that the tool pushes: center, m, and first axis; requires a tool."""
+        """Pose (nsim, 6) of the box that the tool pushes: center, m, and first axis; requires a tool."""
         return box_pose(self._contact)
 
     @property
     def depth(self) -> np.ndarray:
-        """(nsim,) m, penetration of the tool at the start of the last step, negative outside the surface."""
+        """Penetration (nsim,) m of the tool at the start of the last step, negative outside the surface."""
         return self._contact[:, DEPTH]
 
     def contact_torque(self) -> np.ndarray:
-        """Return (nsim, n) Nm, the joint torques of `contact_force`; requires a tool."""
+        """Return the joint torques (nsim, n) Nm that `contact_force` causes; requires a tool."""
         c, last = self._contact, self._bodies[-1]
         axes = self._xmat[:, last].reshape(-1, 3, 3)
         point = self._xpos[:, last] + (axes @ c[:, TIP : TIP + 3, None])[..., 0]
@@ -245,12 +245,12 @@ class Simulator:
 
     @property
     def ee(self) -> np.ndarray:
-        """(nsim, 3) m, the end effector in the base frame."""
+        """Position (nsim, 3) m of the end effector in the base frame."""
         return self._site_xpos[:, self._site]
 
     @property
     def jacobian(self) -> np.ndarray:
-        """(nsim, 3, n) m/rad, translational Jacobian of the end effector: axis x (ee - anchor) for hinges."""
+        """Translational Jacobian (nsim, 3, n) m/rad of the end effector; a hinge's column is axis x (ee - anchor)."""
         return _jacobian(self._xaxis, self._xanchor, self.ee)
 
 
@@ -276,7 +276,7 @@ def single_arm(robot: Robot, dynamics: Dynamics) -> mujoco.MjModel:
 
 
 def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray:
-    """Return the columns of `jnt_user` that describe the arm, (..., n, LIMITS)."""
+    """Return the columns (..., n, LIMITS) of `jnt_user` that describe the arm."""
     f = native
     moment, nominal = d.mass[..., None] * d.com, robot.mass[:, None] * robot.com
     # error of gravity compensation, which uses the nominal links and the declared payload

@@ -1,20 +1,20 @@
-"""Dynamics of a box that a tip pushes on a table: three more velocities in the implicit contact of contact.py.
+"""Simulate a box that a tool's tip pushes on a table, within the implicit contact step of contact.py.
 
 The limit surface of table friction is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
-Tanie, IROS 1992). Table friction is -mu N u / |u| for the normal force N and the generalized velocity u = (v, r w) of
-a box with center velocity v and spin w. The ratio r of friction moment to force is the mean distance of the base's
-points from its center (uniform pressure). At rest, table friction is the elastic force -mu N z / `RIGID`: the
-deflection z follows dz/dt = u - |u| z / RIGID, in backward Euler. In sliding, z / RIGID equals u / |u|.
+Tanie, IROS 1992). A box with center velocity v and spin w has the generalized velocity u = (v, r w), and the table
+friction -mu N u / |u| under the normal force N. Pressure on the base is uniform, so the ratio r of friction moment to
+force is the mean distance between the base's points and the base's center. At rest, table friction is the elastic
+force -mu N z / `RIGID`. The deflection z follows dz/dt = u - |u| z / RIGID, in backward Euler; while the box slides,
+z / RIGID equals u / |u|.
 
-The box is not a body of the MuJoCo model. Training, twins and engines can therefore share one compiled law, which
-solves joint friction and the box together, and the box changes no simulation without a box. The box neither tilts nor
-lifts (`check_size` in box.py). The tip's vertical force only changes the load on the base; the tip does not touch the
-table.
+The box is not a body of the MuJoCo model, so training, twins and engines can share one compiled law, which solves
+joint friction and box motion together, and simulations without a box do not change. The box neither tilts nor lifts
+off (`check_size` in box.py). The tip does not touch the table; the tip's vertical force only changes the box's load.
 
-In a step, the contact force F on the tip is F = F0 - K d, where d is the change of the tip's velocity relative to the
-box. The box's velocity after the step is linear in the force F, with the mobility h W at the contact. Elimination of
-the box's velocity yields F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is the change of the tip's velocity,
-and d_0 the change of the box's velocity for F = 0. The joint equations contain this softer contact force.
+In a step, the contact force on the tip is F = F0 - K d, where d is the change of the tip's velocity relative to the
+box. The box's velocity after the step is linear in F, with the mobility h W at the contact. Elimination of the box's
+velocity yields the contact force in the joint equations, F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is
+the change of the tip's velocity, and d_0 is the change of the box's velocity if F is 0.
 """
 
 import numpy as np
@@ -60,7 +60,7 @@ def _cross(a, b, out):
 
 @njit(cache=True, error_model="numpy")
 def load_box(contact, x, y, z):
-    """Write the lever arm of a contact at x, y, z, m, and the largest table friction for the last contact force."""
+    """Write the lever arm of a contact at (x, y, z) m, and the table friction limit under the last contact force."""
     a, b, c = contact[POINT], contact[POINT + 1], contact[POINT + 2]
     contact[ARM], contact[ARM + 1], contact[ARM + 2] = x - a, y - b, z - c
     down = 0.0
@@ -71,7 +71,7 @@ def load_box(contact, x, y, z):
 
 @njit(cache=True, error_model="numpy")
 def contact_point_velocity(contact, motion, out):
-    """Write the velocity (3,) m/s of the box at the contact; motion: velocity of the center (3,) and spin."""
+    """Write the box's velocity (3,) m/s at the contact to `out`; `motion` (4,) is the center's velocity and spin."""
     _cross(contact[UP : UP + 3], contact[ARM : ARM + 3], out)
     for k in range(3):
         out[k] = motion[k] + motion[3] * out[k]
@@ -79,14 +79,14 @@ def contact_point_velocity(contact, motion, out):
 
 @njit(cache=True, error_model="numpy")
 def _grip(contact, speed, h):
-    """Return spring, N/m, and damper, N s/m, of table friction -(spring z + damper u) with u after the step."""
+    """Return spring k, N/m, and damper c, N s/m: table friction is -(k z + c u), with z before and u after a step."""
     stiff = contact[LOAD] / RIGID / (1.0 + h * speed / RIGID)
     return stiff, h * stiff
 
 
 @njit(cache=True, error_model="numpy")
 def _free_change(contact, speed, h, out):
-    """Write the box's velocity change (4,) without tip force; return h times its mobilities, s/kg, s/(kg m^2)."""
+    """Write a box's velocity change (4,) without tip force; return h * mobility: linear s/kg, angular s/(kg m^2)."""
     spring, damper = _grip(contact, speed, h)
     reach, strain = contact[REACH], contact[STRAIN : STRAIN + 4]
     along = h / (contact[MASS] + h * damper)
@@ -119,7 +119,7 @@ def _speed(contact, motion):
 
 @njit(cache=True, error_model="numpy")
 def _next_speed(contact, old, found, h):
-    """Return the next guess of the box's speed after the guess `old` resulted in the speed `found`, m/s."""
+    """Return the next guess of the box's speed, m/s, if the guess `old` results in the speed `found`, m/s."""
     if old <= 0.0:
         return found
     slowing = h * contact[LOAD] / contact[MASS]  # straight motion: found = frictionless speed * old / (old + slowing)
@@ -128,15 +128,15 @@ def _next_speed(contact, old, found, h):
 
 @njit(cache=True, error_model="numpy")
 def start_box(contact, guess):
-    """Write the first guess of the box's speed after the step: its present speed."""
+    """Write the box's present speed as the first guess of its speed after the step."""
     guess[BOX_SPEED] = _speed(contact, contact[VELOCITY : VELOCITY + 4])
 
 
 @njit(cache=True, error_model="numpy")
 def yielding(contact, force, h, guess):
-    """Write the columns FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m for the contact with a box that can move.
+    """Write the contact with a movable box into `guess`: columns FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m.
 
-    force: (3,) N, force on the tip for an unchanged velocity of the tip relative to the box.
+    force: (3,) N, force on the tip if the tip's velocity relative to the box does not change.
     """
     change, lever, point = np.empty(4), np.empty(3), np.empty(3)
     along, about = _free_change(contact, guess[BOX_SPEED], h, change)
@@ -162,7 +162,7 @@ def yielding(contact, force, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _divide(a, vector, matrix):
-    """Multiply a vector (3,) and a matrix (3, 3) by a^-1 from the left, in place (Cramer's rule)."""
+    """Replace `vector` (3,) with a^-1 vector and `matrix` (3, 3) with a^-1 matrix, by Cramer's rule."""
     inverse = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -181,9 +181,9 @@ def _divide(a, vector, matrix):
 
 @njit(cache=True, error_model="numpy")
 def yielded(contact, tip, h, guess, point):
-    """Write the box's velocity at the contact to `point`; return the relative error of table friction.
+    """Write the box's velocity at the contact to `point`; return the relative friction error due to the speed guess.
 
-    Both velocities, `point` and `tip` (3,) m/s, are those after the step. The guessed box speed causes the error.
+    `point` and `tip`, (3,) m/s, are velocities after the step.
     """
     force, change = np.empty(3), np.empty(4)
     for i in range(3):
@@ -201,7 +201,7 @@ def yielded(contact, tip, h, guess, point):
 
 @njit(cache=True, error_model="numpy")
 def move_box(contact, motion, h):
-    """Move the box for h s with its velocity and spin `motion` (4,); store both and the elastic deflection."""
+    """Move the box for h s with velocity and spin `motion` (4,); store `motion` and the elastic deflection."""
     share, length = 1.0 / (1.0 + h * _speed(contact, motion) / RIGID), 0.0
     for k in range(4):
         rate = motion[k] if k < 3 else contact[REACH] * motion[3]

@@ -1,13 +1,13 @@
-"""Stick and slip of coupled joints within one step: which joints stick, break away, stop or reverse, and when.
+"""Find which coupled joints stick, break away, stop or reverse within one step, and when.
 
-A joint at rest sticks while the net torque on it lies within its breakaway edges; the net torque includes the
-coupling to other joints, but not the joint's own friction. If the net torque exceeds a breakaway edge, the joint
-slides against the friction of that direction. Torques are constant during a step, so accelerations are constant
-between events, and each event is located exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynamics
-with Unilateral Contacts, 1996). Time stepping would apply the friction at the end of a step to the whole step, so the
-impulse of each reversal would have an error of up to h times the friction.
+A joint at rest sticks while its net torque lies between its edges, the breakaway torques in the negative and positive
+direction. The net torque includes the coupling to other joints, but not the joint's own friction. If the net torque
+exceeds an edge, the joint slides in the torque's direction. Torques are constant in a step, and accelerations are
+constant between events, so each event is located exactly (event-driven integration: Pfeiffer and Glocker, Multibody
+Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at the end of a step to the whole
+step, so that at each reversal the impulse would have an error of up to the friction times the step h.
 
-MuJoCo adds the force of the joints' position limits to the stick-slip forces.
+MuJoCo itself adds the forces of the joints' position limits.
 """
 
 from typing import NamedTuple
@@ -24,9 +24,9 @@ HELD, FREE = 0.0, 2.0  # `side` of a sticking joint and of a joint without stict
 class JointForces(NamedTuple):
     """Velocities and torques of n joints at the beginning of a step.
 
-    dq: (n,) rad/s. drive: (n,) Nm, all torques but friction. friction: (n,) Nm at dq. rest: (2, n) Nm, kinetic
-    friction at zero speed in the negative and the positive direction. edges: (2, n) Nm, breakaway, at or
-    beyond `rest`; 0: no stiction.
+    dq: (n,) rad/s, joint velocities. drive: (n,) Nm, sum of torques without friction. friction: (n,) Nm, friction at
+    dq. rest: (2, n) Nm, kinetic friction at zero speed in negative and positive direction. edges: (2, n) Nm,
+    breakaway torques in both directions, at least as large as `rest`; 0: no stiction.
     """
 
     dq: np.ndarray
@@ -38,9 +38,9 @@ class JointForces(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def any_reversal(mass, damping, h, dq, net, work):
-    """Return whether a joint would reverse if all joints kept sliding under `net` (n,) Nm, friction included.
+    """Return whether any joint reverses if all joints slide under `net` (n,) Nm, the torques with friction.
 
-    See `coming_velocity` for all arguments except `net`.
+    `coming_velocity` explains all arguments except `net`.
     """
     n = len(dq)
     root, change = work[:n], work[n]
@@ -59,13 +59,13 @@ def any_reversal(mass, damping, h, dq, net, work):
 def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
     """Write the velocities (n,) at the end of a step into `coming`; return whether stiction had an effect.
 
-    Without stiction, the velocities solve (mass + h damping) (coming - dq) = h (drive - friction).
+    Without stiction, `coming` is the solution of (mass + h damping) (coming - dq) = h (drive - friction).
 
     Args:
-        mass: packed mass matrix, kg m^2. damping: (n,) Nm s/rad, implicit. h: s, duration of the step.
-        forces: `JointForces`.
-        dq_min: rad/s, speed below which a joint stops if the net torque on it lies within its breakaway edges.
-        work: (n + 4, n), scratch array. coming: (n,) rad/s.
+        mass: packed mass matrix, kg m^2. damping: (n,) Nm s/rad, implicit damping. h: s, duration of the step.
+        forces: velocities and torques at the beginning of the step.
+        dq_min: rad/s, speed below which a joint stops if its net torque lies between its breakaway torques.
+        work: (n + 4, n), scratch array. coming: (n,) rad/s, array for the resulting velocities.
     """
     n = len(forces.dq)
     root, side, friction, acceleration, impulse = work[:n], work[n], work[n + 1], work[n + 2], work[n + 3]
@@ -87,7 +87,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
             on = side[j] * forces.dq[j] > 0.0  # the joint keeps its direction
             friction[j] = forces.friction[j] if on else forces.rest[int(side[j] > 0.0), j]
             took_part |= not on
-        if slow:  # an impulse stops the slow sticking joints; the coupling transmits it to the others
+        if slow:  # an impulse stops the slow sticking joints; the coupling transmits the impulse to other joints
             slow = False
             for j in range(n):
                 impulse[j] = 0.0
@@ -113,7 +113,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
 
 @njit(cache=True, error_model="numpy")
 def _initial_sides(forces, dq_min, side, friction, coming):
-    """Write each joint's side, friction and velocity; return whether a sticking joint moves, and whether all rest."""
+    """Write each joint's side, friction and velocity; return if a HELD joint has speed, and if all joints rest."""
     dq, drive, edges, n = forces.dq, forces.drive, forces.edges, len(forces.dq)
     slow, held, inside = False, 0, True
     for j in range(n):
@@ -132,7 +132,7 @@ def _initial_sides(forces, dq_min, side, friction, coming):
 
 @njit(cache=True, error_model="numpy")
 def _first_stop(coming, acceleration, side, left):
-    """Return the time of the first stop or reversal within `left` s, and its joint, -1 for none."""
+    """Return the time of the first stop or reversal within `left` s, and the joint's index (-1: no joint stops)."""
     span, first = left, -1
     for j in range(len(side)):
         if abs(side[j]) == 1.0:
@@ -147,7 +147,7 @@ def _first_stop(coming, acceleration, side, left):
 
 @njit(cache=True, error_model="numpy")
 def _farthest_beyond(mass, acceleration, forces, side):
-    """Return the sticking joint whose net torque is farthest beyond its edges, -1 for none, and the torque's sign."""
+    """Return the index of the sticking joint farthest beyond its edges (-1: none), and the sign of its net torque."""
     worst, at, direction = 0.0, -1, 1.0
     for j in range(len(side)):
         if side[j] == HELD:

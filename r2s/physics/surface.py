@@ -1,8 +1,8 @@
-"""A tool's tip and the surface that it touches: contact parameters, for simulation and identification.
+"""Define a tool's tip and the surface that the tip touches, with contact parameters.
 
 The normal force at the tip's penetration depth d is F = K d^e (1 + c d') >= 0 (Hunt and Crossley, ASME Journal of
-Applied Mechanics 1975). With K = k / (1 mm)^(e - 1), k d is the undamped force at d = 1 mm for every exponent e. The
-tangential force in sliding is mu F, against the velocity.
+Applied Mechanics 1975). The stiffness k is the undamped force per depth at d = 1 mm, so K = k / (1 mm)^(e - 1). While
+the tip slides, the tangential force is mu F, opposite to the sliding velocity.
 """
 
 import json
@@ -25,8 +25,8 @@ class Tool:
     """A spherical tip at the end effector.
 
     Attributes:
-        tip: (3,) m, center of the sphere in the frame of the end effector's site.
-        radius: m. mass: kg, at the center; r2s simulates it only if it is also a payload (r2s/physics/payload.py).
+        tip: (3,) m, center of the sphere in the frame of the end effector's site. radius: m, radius of the sphere.
+        mass: kg, at the sphere's center; r2s simulates this mass only as a payload (r2s/physics/payload.py).
     """
 
     tip: np.ndarray
@@ -40,11 +40,11 @@ class Surface:
 
     Attributes:
         point: (3,) m, on the plane, or the center of the box.
-        normal: (3,) unit vector, out of the material; for a box, its third axis.
-        stiffness: N/m, k, force per depth at 1 mm. exponent: e, 1 (linear) to 1.5 (Hertz).
-        damping: s/m, c. friction: mu. bristle: m, tangential deflection at which friction is mu F; 0: no deflection.
-        half: (3,) m, half edges of a box; None: a plane. axes: (3, 3), its axes in columns.
-        mass: kg, mass of a box that slides on a table if pushed (sliding.py); None: the surface is fixed.
+        normal: (3,), unit vector out of the material; for a box, the box's third axis.
+        stiffness: k, N/m, force per depth at a depth of 1 mm. exponent: e, from 1 (linear) to 1.5 (Hertz).
+        damping: c, s/m. friction: mu. bristle: m, tangential deflection at which friction is mu F (0: no deflection).
+        half: (3,) m, half edges of a box; None: the surface is a plane. axes: (3, 3), the box's axes as columns.
+        mass: kg, mass of a box that slides on a table when pushed (sliding.py); None: the surface is fixed.
         table: friction coefficient between a sliding box and its table.
     """
 
@@ -68,7 +68,7 @@ class Surface:
 
     @property
     def coefficient(self) -> np.ndarray | float:
-        """K, N/m^e, factor of the normal force."""
+        """Factor K, N/m^e, in the normal force K d^e (1 + c d')."""
         return self.stiffness / UNIT_DEPTH ** (self.exponent - 1.0)
 
     def depth(self, centre: np.ndarray, radius: float) -> np.ndarray:
@@ -79,7 +79,7 @@ class Surface:
         return radius - np.linalg.norm(beyond.clip(0.0), axis=-1) - np.minimum(beyond.max(-1), 0.0)
 
     def one(self, k: int) -> "Surface":
-        """Return the k-th surface of a batch (m, ...); fields without a batch shape stay unchanged."""
+        """Return the k-th surface of a batch (m, ...); all surfaces share the fields without a batch axis."""
         values = {f.name: np.asarray(v) for f in fields(self) if (v := getattr(self, f.name)) is not None}
         one = {"point": 1, "normal": 1, "half": 1, "axes": 2}  # number of axes for one arm
         return replace(self, **{name: v[k] for name, v in values.items() if v.ndim > one.get(name, 0)})
@@ -114,7 +114,7 @@ class Surface:
 
 @njit(cache=True, error_model="numpy")
 def normal_force(K, exponent, damping, depth, rate):
-    """Return the normal force, N, of Hunt and Crossley's law at a penetration `depth`, m, and its `rate`, m/s."""
+    """Return Hunt and Crossley's normal force, N, for penetration `depth`, m, and penetration `rate`, m/s."""
     if depth <= 0.0:
         return 0.0
     return max(K * depth**exponent * (1.0 + damping * rate), 0.0)
@@ -124,7 +124,7 @@ def load_tool(path: str | Path) -> Tool:
     """Read a tool file, JSON: `tip_in_flange_m` (3 numbers), `radius_m`, optional `mass_kg`.
 
     Raises:
-        UserError: no such file, no valid JSON, an unknown or missing key, a value out of range.
+        UserError: the file is missing or no valid JSON, a key is unknown or missing, or a value is out of range.
     """
     if not isinstance(path, str | Path):
         raise UserError(f"robot.tool: expected a JSON file, got {path!r}")

@@ -6,8 +6,8 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.robot import Robot
 
-BELOW = 0.15  # gap between tip and nominal surface at home, over the end effector's distance from the base
-POSTURE = 1e-3  # m^2, damping of the steps of inverse kinematics
+BELOW = 0.15  # gap between tip and nominal surface at home, relative to the end effector's distance from the base
+POSTURE = 1e-3  # m^2, damping in the least-squares steps of inverse kinematics
 MARGIN = 0.1  # rad, distance of inverse kinematics from the position limits
 CLOSE = 1e-4  # m, position error at which inverse kinematics ends
 ROUNDS = 60
@@ -29,7 +29,7 @@ class Tip:
         self._site = self._model.site(robot.ee_site).id
 
     def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip's place (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
+        """Return the tip's position (3,) m and Jacobian (3, n) m/rad at q (n,) rad."""
         d = self._data
         d.qpos = q
         mujoco.mj_kinematics(self._model, d)
@@ -37,7 +37,7 @@ class Tip:
         return place, np.cross(d.xaxis, place - d.xanchor).T
 
     def posture(self, place: np.ndarray) -> np.ndarray | None:
-        """Return q (n,) rad near home with the tip at `place` (3,) m, by damped least squares; None: out of reach."""
+        """Return q (n,) rad near home for the tip position `place` (3,) m, or None if `place` is out of reach."""
         r = self._robot
         low, high = r.q_range[0] + MARGIN, r.q_range[1] - MARGIN
         q = r.q_home.copy()
@@ -68,7 +68,7 @@ def default_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nominal_plane(robot: Robot, point: object = None, normal: object = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return point (3,) m and unit normal (3,) of a plane; those of `default_plane` replace None."""
+    """Return point (3,) m and unit normal (3,) of a plane; `default_plane` replaces an argument that is None."""
     default = default_plane(robot)
     values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), default, strict=True)]
     for name, value in zip(("point", "normal"), values, strict=True):

@@ -1,7 +1,7 @@
 """URDF reader: links, joints, limits, rotor inertia and primitive shapes.
 
-The reader ignores meshes, materials, elements for simulators, and the inertia of the base and of links fixed to the
-base, which do not move. A link that is fixed to a moving link becomes part of the moving link.
+The reader ignores meshes, materials, simulator elements, and the inertia of links that do not move: the base and
+links fixed to the base. A link that is fixed to a moving link becomes part of the moving link.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,7 +20,7 @@ DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements; URDF 
 ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
 ET.register_namespace("drake", DRAKE)
 NO_RANGE = "limits 0 to 0"  # value of `info` that marks a joint with these limits
-COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers in an attribute; 1 in all others
+COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # attribute -> how many numbers it contains; other attributes contain one
 
 
 def is_urdf(path: Path) -> bool:
@@ -37,11 +37,11 @@ def is_urdf(path: Path) -> bool:
 def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
-    Names of bodies and joints, damping and friction are those of the file. The joints in `lock` ({name: rad or m})
-    become fixed at these positions, and so do joints that mimic them.
+    The spec has the file's body and joint names, joint damping and friction. Joints in `lock` ({name: rad or m}), and
+    joints that mimic a locked joint, become fixed at these positions.
 
     Raises:
-        UserError: no XML, no URDF, or not an arm of revolute joints.
+        UserError: the file is no XML or no URDF, or the arm has a joint that is neither revolute nor fixed.
     """
     return _Reader(path, lock or {}).spec()
 
@@ -145,7 +145,7 @@ class _Reader:
         return along / np.linalg.norm(along)
 
     def _attach(self, joint: ET.Element) -> None:
-        """Check a joint and register it with its parent and child links."""
+        """Check a joint's type, and register the joint with its parent link and its child link."""
         kind, child = joint.get("type"), self._end(joint, "child")
         lock = f"; robot.lock={{{joint.get('name')}: 0}} welds it there"
         if kind not in (*MOVING, FIXED):
@@ -169,7 +169,7 @@ class _Reader:
         return "" if joint is None else joint.get("name", ""), inertia
 
     def _end(self, joint: ET.Element, which: str) -> str:
-        """Return the name of a joint's parent or child link."""
+        """Return the name of the joint's link that `which` selects: "parent" or "child"."""
         element = joint.find(which)
         name = element.get("link", "") if element is not None else ""
         if name not in self.links:
@@ -177,7 +177,7 @@ class _Reader:
         return name
 
     def _tree(self, link: str, *, fixed: bool = False) -> Iterator[tuple[ET.Element, str]]:
-        """Yield each joint beyond `link` with its child link, parents first; fixed: only through fixed joints."""
+        """Yield the joints beyond `link` with their child links, parents first; `fixed`: follow only fixed joints."""
         for joint in self.children[link]:
             if not fixed or joint.get("type") == FIXED:
                 child = self._end(joint, "child")
@@ -185,7 +185,7 @@ class _Reader:
                 yield from self._tree(child, fixed=fixed)
 
     def _numbers(self, element: ET.Element, key: str, default: str, owner: str) -> np.ndarray:
-        """Return the numbers of an attribute, (k,)."""
+        """Return the numbers in the attribute `key` of an XML element as an array (k,)."""
         text = element.get(key, default)
         try:
             out = np.array([float(word) for word in text.split()])

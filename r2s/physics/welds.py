@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; center (3,), m; tensor (3, 3) about it, kg m^2
+Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; center (3,), m; tensor (3, 3) about the center, kg m^2
 
 
 def combined(parts: list[Inertia]) -> Inertia:
@@ -29,7 +29,7 @@ class Bodies:
         self.local = [make_pose(position, rotation(quat)) for position, quat in poses]
 
     def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
-        """Return the nearest body with a joint at or above `body` (0: the world), and the pose of `body` in it."""
+        """Return `body` or its nearest ancestor with a joint (0: the world), and the pose of `body` in its frame."""
         pose = np.eye(4)
         while body and self.model.body_dofnum[body] == 0:
             pose = self.local[body] @ pose
@@ -37,7 +37,7 @@ class Bodies:
         return body, pose
 
     def lumped(self, body: int) -> Inertia:
-        """Return mass, center of mass and tensor about it for `body` together with all bodies welded to `body`."""
+        """Return mass, center of mass and central tensor of `body` together with all bodies welded to `body`."""
         parts = [(self.mass[body], self.com[body], self.inertia[body])]
         for other in range(1, self.model.nbody):
             anchor, pose = self.moving_parent(other)
@@ -62,7 +62,7 @@ def about(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
-    """Return the pose (4, 4) with this position and rotation; None is zero or the identity."""
+    """Return the pose (4, 4) of a position, None for zero, and a rotation, None for the identity."""
     pose = np.eye(4)
     if position is not None:
         pose[:3, 3] = position

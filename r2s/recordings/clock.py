@@ -14,7 +14,7 @@ ALIKE = 0.05  # if the joints' speed factors spread less than this (relative), t
 def speed_factors(recording: Recording) -> np.ndarray:
     """Return each joint's speed factor (n,), the change of q over the integral of dq; nan without enough motion.
 
-    A linear trend is removed from q and from the integral in each trajectory, so that a bias of dq has no effect.
+    In each trajectory, linear trends of q and of the integral of dq are removed, so that a bias of dq has no effect.
     """
     square, cross, own = np.zeros((3, recording.n_joints))
     for s in recording.stretches:
@@ -34,10 +34,10 @@ def speed_factors(recording: Recording) -> np.ndarray:
 
 
 def check_clock(recording: Recording) -> np.ndarray:
-    """Check that each joint's speed factor is near 1 or nan, and return the speed factors (n,).
+    """Return the joints' speed factors (n,) after checking that every factor is near 1 or nan.
 
     Raises:
-        UserError: t runs too fast or too slowly for the velocities, or the scales of a joint's q and dq differ.
+        UserError: the scale of t does not fit the velocities, or a joint's q and dq have different scales.
     """
     factor = speed_factors(recording)
     seen = np.flatnonzero(np.isfinite(factor))

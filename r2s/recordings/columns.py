@@ -1,4 +1,4 @@
-"""Find the columns of t, q, dq, tau and trajectory in a file, by default names, numbered names or joint names."""
+"""Find the columns of t, q, dq, tau and trajectory in a file by default names, numbered names or joint names."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,7 +29,7 @@ WORDS = {  # field -> words for it in a column name that also contains the name 
 
 
 def specs_of(columns: Mapping[str, Spec]) -> dict[str, Spec]:
-    """Return {field: the user's column names without units, or None} for each field in `DEFAULT_COLUMNS`."""
+    """Return {field: the user's column names without units}, with None for fields that the user did not name."""
     for key in columns:
         if key not in DEFAULT_COLUMNS:
             raise UserError(f"unknown key '{key}' in data.columns; {instead_of(key, DEFAULT_COLUMNS)}")
@@ -37,7 +37,7 @@ def specs_of(columns: Mapping[str, Spec]) -> dict[str, Spec]:
 
 
 def _bare(spec: Spec) -> Spec:
-    """Return the user's column names without units, because the names in the table have none."""
+    """Remove units from the user's column names, because the table's column names contain no units."""
     if spec is None or isinstance(spec, str):
         return None if spec is None else bare_name(spec)[0]
     return [bare_name(str(name))[0] for name in spec]
@@ -59,7 +59,7 @@ def find_columns(
 ) -> list[str]:
     """Return the names of a field's columns; [] for an optional field without columns in the file.
 
-    Columns that are named after joints are returned in the order of `robot_joints`, the names of the robot's joints.
+    Column names that contain joint names are returned in the order of `robot_joints`, the robot's joint names.
     """
     candidates = DEFAULT_COLUMNS[field]
     if field == "tau":
@@ -89,7 +89,7 @@ def find_columns(
 
 
 def _match(table: Table, field: str, name: str) -> list[str]:
-    """Return the columns that `name` denotes: the column with this name, or its numbered columns."""
+    """Return the columns for a name such as "q": the column q itself, or the numbered columns q1, q2, ..."""
     if field in ("t", "trajectory"):
         return [name] if name in table else []
     if name in table and table[name].ndim > 1:
@@ -104,7 +104,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
-    """Return the index of the joint in a column's name (-1: none) and the rest of the name in lower case."""
+    """Return the index of the joint in a column name (-1: no joint), and the rest of the name in lower case."""
     lower = column.lower()
     cores = [re.sub(r"^joint_|_joint$", "", joint.lower()) for joint in robot_joints]
     for k in sorted(range(len(cores)), key=lambda k: -len(cores[k])):
@@ -115,7 +115,7 @@ def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
 
 
 def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -> list[str]:
-    """Return one column per joint, named by the joint and one word of `words`; [] if a joint has no such column."""
+    """Return a column for each joint, named by the joint and a word of `words`, or [] if a joint has no column."""
     found: dict[str, dict[int, str]] = {}
     for column in table:
         joint, rest = _joint_of(column, robot_joints)
@@ -129,7 +129,7 @@ def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -
 
 
 def _check_order(names: list[str], field: str, robot_joints: Sequence[str]) -> None:
-    """Raise UserError if the user's columns are named after all joints of the robot, but in another order."""
+    """Raise UserError if the user's columns name all the robot's joints, but not in the robot's order."""
     joints = [_joint_of(name, robot_joints)[0] for name in names]
     every = list(range(len(robot_joints)))
     if every and joints != every and sorted(joints) == every:
@@ -144,7 +144,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
     """Return the table with each (T, m) array reduced to the robot's joints, in the robot's order, found by name.
 
     Args:
-        table: columns of the file. The first text array with a name in NAMES contains the file's joint names (m,).
+        table: {column name: array}. The first text array with a name in NAMES contains the file's joint names (m,).
         user: the user's joint names, data.joints. robot_joints, n: names and number of the robot's joints.
 
     Raises:
@@ -167,7 +167,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return the columns named `pattern` with {} = first, first + 1, ...; first=None: from 0 if it exists, else 1."""
+    """Return columns such as q1, q2, ... (pattern "q{}", first=1); first=None: start at q0 or, without q0, at q1."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)
@@ -181,7 +181,7 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Return the error for a missing column, with a hint: a similar name, or another kind of torque in the file."""
+    """Return the error for a missing column; a hint names a similar column or a kind of torque that the file has."""
     if field == "tau" and _match(table, "q", "ddq"):
         return UserError(
             "no torque, but ddq: this is a planned motion; let the arm follow it, and give the arm's own log"

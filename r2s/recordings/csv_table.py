@@ -26,7 +26,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     The header is the line above the first numeric line; it may begin with `#` or `%`. Earlier lines are skipped.
 
     Raises:
-        UserError: no header, or rows of another length than the header.
+        UserError: the file has no header, or header and rows differ in length.
     """
     head = path.read_bytes()[:HEAD]
     encoding = _encoding(head)
@@ -84,7 +84,7 @@ def without_units(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def bare_name(name: str) -> tuple[str, float]:
-    """Return a column's name without the bracketed unit at its end, and the factor from this unit to SI units."""
+    """Split a column name such as `q1 [deg]` into the name without unit, and the factor from the unit to SI units."""
     found = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name)
     unit = found[2].strip().lower() if found else ""
     if not found or unit not in UNITS or (unit in ("a", "ma") and not found[1].lower().startswith(("i", "current"))):
@@ -103,8 +103,8 @@ def _encoding(head: bytes) -> str:
 
 
 def _separator(line: str) -> str:
-    """Return a line's separator, "" for spaces; if a line has semicolons or tabs, its commas are decimal commas."""
-    return next((mark for mark in ";\t," if mark in line), "")
+    """Return a line's separator: the first of semicolon, tab and comma that the line contains, or "" for spaces."""
+    return next((mark for mark in ";\t," if mark in line), "")  # beside semicolons or tabs, commas are decimal
 
 
 def _split(line: str, separator: str) -> list[str]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from r2s.errors import UserError
 
-LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; a pause exceeds both; in a shorter gap, frames are lost
+LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; a pause exceeds both limits; lost frames cause shorter gaps
 SLOWEST_S = 0.2  # s; a longer median step means that t is not in seconds; below 5 Hz unit_checks.py checks nothing
 SLACK = 1e-6  # relative tolerance for round-off: steps of a 20 Hz clock are not exactly 0.05 s
 
@@ -13,10 +13,10 @@ def longest_step(steps: np.ndarray, max_gap_s: float | None = None) -> float:
     """Return the longest time step that is not a pause, s, increased by the relative tolerance SLACK.
 
     Args:
-        steps: (T,) s, time steps of a log. max_gap_s: the user's limit; None: five median steps, at least 0.05 s.
+        steps: (T,) s, time steps. max_gap_s: s, the user's limit; None: five median steps, at least 0.05 s.
 
     Raises:
-        UserError: the median step exceeds `max_gap_s` (None: 0.2 s), so t is probably not in seconds.
+        UserError: the median step exceeds `max_gap_s` (0.2 s if None), so t is probably not in seconds.
     """
     median = float(np.median(steps)) if len(steps) else 0.0
     allowed = SLOWEST_S if max_gap_s is None else max_gap_s

@@ -13,9 +13,9 @@ DT = 1e-3  # s, common grid of recordings with different rates; r2s filters ever
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
-    """Join all rows in one recording. If rates or command periods differ, resample each recording to 1 kHz first.
+    """Join recordings into one; if their rates or command periods differ, resample all of them to 1 kHz first.
 
-    Signals that some recordings lack are dropped. `period` becomes None; `Recording.in_phase` finds a common period.
+    Signals that a recording lacks are dropped. `period` becomes None; `Recording.in_phase` finds a common period.
 
     Raises:
         UserError: the recordings differ in kind of torque or number of joints.

@@ -21,7 +21,7 @@ class Lateness:
 
     Attributes:
         s: (n,) s, lateness; nan if dq is not the derivative of q or the joint does not move. sigma: (n,) s, standard
-            deviation of `s`. filtered: whether `s` is the time constant of a first-order filter; if not, a delay.
+            deviation of `s`. filtered: if True, `s` is the time constant of a first-order filter, otherwise a delay.
     """
 
     s: np.ndarray
@@ -30,22 +30,22 @@ class Lateness:
 
     @property
     def sure(self) -> np.ndarray:
-        """Lateness (n,) s for the correction: `s`, with 0 in place of values that are too small or too uncertain."""
+        """Lateness (n,) s to correct: `s`, but 0 for joints whose lateness is too small or too uncertain."""
         seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
         return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
 
     @property
     def as_logged(self) -> "Lateness":
-        """Lateness without correction: finite values of `s` become 0, and nan remains."""
+        """Copy of this lateness with 0 for finite values of `s`, so that dq stays as logged; nan remains nan."""
         return replace(self, s=0.0 * self.s)
 
     def corrected(self, smooth: Recording) -> np.ndarray:
-        """Return the corrected velocity (T, n) rad/s: from dq or, where the lateness is nan, from q."""
+        """Return the corrected dq (T, n) rad/s; if a joint's lateness is nan, return the derivative of its q."""
         return _corrected(smooth, self.sure, self.filtered)
 
 
 def from_q(joints: int) -> Lateness:
-    """Return a lateness of nan for all joints: the derivative of q then replaces the logged dq."""
+    """Return a lateness of nan for all joints, so that the derivative of q replaces the logged dq."""
     return Lateness(np.full(joints, np.nan), np.zeros(joints))
 
 
@@ -53,7 +53,7 @@ def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
     """Estimate the lateness of dq by least squares on motion below `cutoff_hz`, where a filter acts like a delay.
 
     Correcting dq is better than differentiating q, because the logged dq is often smoother. The correction inverts a
-    first-order filter or a delay, depending on which of these models fits the data better.
+    first-order filter or a delay, whichever model fits the data better.
     """
     smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
     slope, ddq, n = smooth.derivative(smooth.q), smooth.derivative(smooth.dq), recording.n_joints

@@ -1,7 +1,7 @@
 """Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet files and meta/info.json.
 
-`write_dataset` stores commanded torque as `action`, other torque as `observation.effort`. In other datasets,
-`lerobot_table` finds angles, velocities and torques by words in the names of features and of their elements.
+`write_dataset` stores commanded torque as `action`, measured and motor torque as `observation.effort`.
+`lerobot_table` finds angles, velocities and torques by words in the names of features and of feature elements.
 """
 
 import json
@@ -51,12 +51,12 @@ def dataset_files(folder: Path) -> list[Path]:
 def lerobot_table(folder: Path) -> Table:
     """Return t (T,) s, trajectory (T,), joint_names (m,) and, if stored, q, dq, tau, tau_J_d, current (T, m).
 
-    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. Torque in `action`
-    becomes tau_J_d. Features of a gripper, hand or pose are ignored. `reader_note` states which clock and features
-    were used.
+    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. A torque in
+    `action` is returned as tau_J_d. Features of a gripper, hand or pose are ignored. The entry `reader_note` names
+    the clock and features that were used.
 
     Raises:
-        UserError: no torque in the dataset, another version, or a damaged file.
+        UserError: the dataset has no torque or is not version 3, or a file is damaged.
     """
     info = _info(folder)
     features = info["features"]
@@ -112,7 +112,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, int, float]]]:
-    """Return (field, joint, (feature, element index, factor to SI units)) per feature element of an arm joint."""
+    """Return (field, joint, (feature, element index, factor to SI units)) for each feature element of a joint."""
     out = []
     for feature, spec in features.items():
         shape = spec["shape"]
@@ -181,14 +181,14 @@ def write_dataset(
 ) -> list[str]:
     """Write a recording as a new folder for `lerobot`: one episode per trajectory, in float32, with statistics.
 
-    A recording with a clock other than frame_index / fps is resampled, and the returned list reports the resampling.
+    A recording whose clock is not frame_index / fps is resampled, and a returned note reports the resampling.
 
     Args:
-        joints: names of the n joints. robot: name of the arm. task: text that describes the task of all episodes.
-        more: {feature: (T, k)}, further features, which are never resampled.
+        joints: n joint names. robot: name of the arm. task: task description, the same for all episodes.
+        more: {feature: (T, k)}, values of further features, which cannot be resampled.
 
     Raises:
-        UserError: the folder exists, or `more` is given and the recording must be resampled.
+        UserError: the folder exists, or the recording needs resampling although `more` has features.
     """
     if folder.exists():
         raise UserError(f"to: {folder} exists; a LeRobotDataset needs a new folder")

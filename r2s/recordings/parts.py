@@ -21,7 +21,7 @@ def give_back(recording: Recording) -> None:
 
 
 def _trim() -> None:
-    """Release freed memory to the operating system, and from now on every block above MAPPED when it is freed."""
+    """Release freed memory to the operating system, and later blocks above MAPPED bytes as soon as they are freed."""
     libc: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
     if hasattr(libc, "malloc_trim"):  # musl has no malloc_trim
         libc.mallopt(M_MMAP_THRESHOLD, MAPPED)
@@ -29,7 +29,7 @@ def _trim() -> None:
 
 
 def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return {name: that array of all parts, joined}; delete the arrays of the parts to save memory."""
+    """Return {name: array joined from all parts}; the parts' own arrays are deleted to save memory."""
     out = {}
     for name in names:
         out[name] = np.concatenate([vars(part).pop(name) for part in parts])
@@ -41,7 +41,7 @@ def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:
     """Yield pieces of about `seconds` s in the order of the log; in a trajectory, pieces overlap by `overlap_s` s.
 
-    The last piece includes the remainder of the log, which alone may be too short for a filter.
+    The last piece includes the rest of the log, because this rest alone may be too short to filter.
     """
     if recording.duration <= 1.5 * seconds:
         yield recording

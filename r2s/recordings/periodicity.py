@@ -1,7 +1,7 @@
 """Find repeated motion in recordings, so that training and validation share no motion.
 
-A correlation by FFT compares two pieces of motion, a and b, at all lags at once. Their squared distance, |a|^2 +
-|b|^2 - 2 a b, is summed over the rows that both contain.
+A correlation by FFT compares two motions a and b at all lags at once. The squared distance |a|^2 + |b|^2 - 2 a b
+between a and b is summed over the rows that both motions contain.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class Track:
     """Motion between two restarts of the clock, resampled to time steps of STEP; q is NaN in gaps of the log."""
 
     def __init__(self, t: np.ndarray, q: np.ndarray, stretches: Sequence[slice]):
-        """Resample q (T, n) rad, logged at t (T,) s, over `stretches` of rows with increasing t."""
+        """Resample q (T, n) rad, logged at t (T,) s, within `stretches`: slices of rows with increasing t."""
         self.stretches = list(stretches)
         self.start = float(t[stretches[0].start])
         grid = np.arange(self.start, t[stretches[-1].stop - 1] + 1e-9, STEP)
@@ -42,7 +42,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return a track for each stretch if `each`, else for each part of t (T,) s between clock restarts."""
+    """Return one track per stretch if `each` is True, else one track per part of t (T,) s between clock restarts."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -55,10 +55,10 @@ def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
 
 
 def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
-    """Return the period of the motion, s, and the time shifts (K,) s that align the clocks of K tracks.
+    """Return the period of the motion, s, and time shifts (K,) s that align repeated motion in K tracks.
 
-    After the shifts, equal motion has the same phase in all tracks. The period is None if no motion repeats. If a
-    motion repeats only in another track, the period is the time from the first to the last row of all aligned tracks.
+    The shifts align the phase of a motion that occurs in several tracks. The period is None if no motion repeats. If
+    no track repeats itself, but tracks repeat each other, the period is the time span of all aligned tracks.
     """
     shift, found, period = np.zeros(len(tracks)), False, None
     for k, b in enumerate(tracks):
@@ -79,7 +79,7 @@ def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that occurs in `training`, in all joints at the same time.
 
     A piece of motion occurs in `training` if each joint's RMS distance is below the joint's tolerance. A joint's
-    tolerance is TRACKING, limited to the range SIMILAR in units of the joint's standard deviation in `other`.
+    tolerance is TRACKING, clipped to the range SIMILAR times the joint's standard deviation in `other`.
     """
     deviation = np.nanstd(np.concatenate([track.q for track in other]), axis=0) if other else np.zeros(1)
     tolerance = np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -114,8 +114,8 @@ def _pieces(q: np.ndarray, motion: float) -> list[np.ndarray]:
 def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare angles a (A, n) and b (B, n) rad, NaN in gaps, at all L lags from -(B - 1) to A - 1.
 
-    Returns for each lag the mean square of a[k + lag] - b[k] (L, n), the variance of b[k] over the rows that a and b
-    have in common (L, n), and the number of these rows (L,).
+    At each lag, the common rows are the k for which a[k + lag] and b[k] exist. Return the mean square of
+    a[k + lag] - b[k] (L, n), the variance of b[k] (L, n) over the common rows, and the number of common rows (L,).
     """
     size = 1 << int(len(a) + len(b) - 1).bit_length()
     middle = np.nanmean(a, axis=0)  # centring reduces the round-off of the differences
@@ -138,9 +138,9 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each of L lags, the RMS distance over rows and joints (L,) rad and the number of common rows (L,).
+    """Return the RMS distance (L,) rad between a and b, and the number of their common rows (L,), at L lags.
 
-    The distance is inf at lags where the common rows last less than OVERLAP_S or no joint moves by MIN_MOTION.
+    The distance is inf at a lag if the common rows last less than OVERLAP_S, or if no joint moves by MIN_MOTION.
     """
     square, variance, count = _distances(a, b)
     counts = (count >= OVERLAP_S / STEP) & (variance.max(1) > (MIN_MOTION * TOLERANCE) ** 2)
@@ -148,7 +148,7 @@ def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _own_lag(track: Track) -> int | None:
-    """Return the first lag, in rows, at which a track repeats itself, or None."""
+    """Return the first lag, in rows, at which a track repeats itself, or None if the track does not repeat."""
     q, least = track.q, round(OVERLAP_S / STEP)
     error = _errors(q, q)[0][len(q) - 1 :]  # from lag 0
     error[:least] = np.inf
@@ -160,7 +160,7 @@ def _own_lag(track: Track) -> int | None:
 
 
 def _lag(a: Track, b: Track) -> int | None:
-    """Return the lag, in rows, at which track b repeats track a, or None; prefer the lag with most common rows."""
+    """Return the lag, in rows, at which b repeats a, or None; of several lags, choose one with most common rows."""
     error, count = _errors(a.q, b.q)
     runs = _runs(error < TOLERANCE)
     if not runs:

@@ -22,14 +22,14 @@ BREAKAWAY = 2e-3  # rad; a joint that has moved this far has broken away or is a
 
 @dataclass(frozen=True, eq=False)
 class Ramps:
-    """K recorded ramps, one per trajectory of the recording.
+    """Recorded torque ramps, one in each of the recording's K trajectories.
 
     Attributes:
-        recording: recording with commanded torque; identification uses t, and q and tau of the ramped joint.
-        joint, sign, pose: ramped joint (from 0), direction (1 or -1), posture (from 0); (K,) or one value for all.
+        recording: motion with commanded torque; identification uses t, and the ramped joint's q and tau.
+        joint, sign, pose: ramped joint (from 0), direction (1 or -1), posture (from 0), each (K,) or a single value.
 
     Raises:
-        UserError: the torque is not commanded, or joint, sign or pose does not fit the recording.
+        UserError: the torque is not commanded, or `joint`, `sign` or `pose` has a wrong shape or value.
     """
 
     recording: Recording
@@ -69,9 +69,9 @@ def read_ramps(
 ) -> Ramps:
     """Read ramps from a file of `Ramps.save`, or from a log in any format of `readers.read`.
 
-    A log needs columns of commanded torque and motion (t s, q rad, tau_J_d or tau Nm, optionally dq rad/s), and
-    columns `joint` (from 1) and `sign` (1 or -1) with a value per row or per ramp. A new ramp begins where `joint`,
-    `sign`, `trajectory` or `segment` changes from one row to the next, where t restarts, and after a gap.
+    A log needs columns t (s), q (rad), tau_J_d or tau (commanded torque, Nm), optionally dq (rad/s), and columns
+    `joint` (from 1) and `sign` (1 or -1) with a value per row or per ramp. A new ramp begins where the value of
+    `joint`, `sign`, `trajectory` or `segment` changes, where t restarts, and after a gap in t.
 
     Args:
         path: the file.
@@ -80,7 +80,7 @@ def read_ramps(
         max_gap_s: s; a longer time step separates ramps; None: see `longest_step`.
 
     Raises:
-        UserError: no such file, a file without ramps, or a joint or sign that contradicts the command.
+        UserError: the file is missing or contains no ramps, or a joint or sign contradicts the command.
     """
     path = Path(path).expanduser()
     table = readers.load_table(path)
@@ -142,7 +142,7 @@ def _from_columns(
 
 
 def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
-    """Convert `values`, given per ramp or per row, to one per row (T,); `ramp` (T,) is the ramp index of each row."""
+    """Expand `values`, one per ramp or per row, to one value per row (T,); `ramp` (T,) is each row's ramp index."""
     count = ramp[-1] + 1 if len(ramp) else 0
     if values.dtype.kind not in "iuf":
         raise UserError(f"column '{field}': expected numbers, got type {values.dtype}")
@@ -152,7 +152,7 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError if commands change, but that of the ramped joint does not rise or fall as `sign` requires."""
+    """Raise UserError if commands change, but the ramped joint's command does not change in direction `sign`."""
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY

@@ -63,24 +63,24 @@ def read(
     Args:
         path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
             LeRobotDataset.
-        torque: kind of torque, see `Recording`: "measured", "commanded" or "motor"; None if the file declares it.
-        columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
-            DEFAULT_COLUMNS; for tau, the name in TAU has priority. For q, dq and tau, a name stands for one array
-            (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... In a name, `{j}`
-            (from 1) or `{i}` (from 0) stands for the joint number. A list contains one column name per joint. In
-            HDF5 a column name is a path such as robot/q.
+        torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); None: the file declares it.
+        columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. Default names
+            are in DEFAULT_COLUMNS; for tau, the name in TAU has priority. For q, dq and tau, a name stands for one
+            array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... In a name,
+            `{j}` (from 1) or `{i}` (from 0) stands for the joint number. Instead of a name, a list may contain one
+            column name per joint. In HDF5 a column name is the path of a dataset, such as robot/q.
         n_joints: expected number of joints.
-        max_gap_s: s; a longer time step begins a new trajectory; None: see `longest_step`; inf: no splitting.
-        period: s, see `Recording`.
+        max_gap_s: s, longest time step within a trajectory; None: see `longest_step`; inf: gaps do not split.
+        period: period of the motion, s, see `Recording`.
         name: name of the recording; None: the file name without its suffix.
-        topic: topic of a bag, see `bag_table`.
+        topic: ROS topic to read from a bag, see `bag_table`.
         joints, model_joints: the robot's joint names in the file, and in the robot description. `by_names` and
-            `choose_joints` use these names to select and sort the file's joints.
-        torque_constant: Nm/A at the joint, gear ratio included, (n,) or one for all; tau is then a motor current.
-        limits: lowest and highest q of the robot, (n,) rad each; angles outside are shifted inside by revolutions.
+            `choose_joints` select and sort the file's joints by these names.
+        torque_constant: (n,) or one value, Nm/A at the joint, with gear ratio; if set, `tau` is a motor current.
+        limits: (lowest, highest) q of the robot, (n,) rad each; angles outside are shifted inside by revolutions.
 
-    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. If a file
-    other than a bag has no column `trajectory`, a clock restart also begins a new trajectory. Faults with only one
+    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. Clock
+    restarts also separate trajectories, except in bags and in files with a column `trajectory`. Faults with only one
     remedy are repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file that
     `Recording.save` wrote is restored unchanged.
 
@@ -150,7 +150,7 @@ def from_table(table: Table, how: Options) -> Recording:
 
 
 def _without_holds(recording: Recording) -> Recording:
-    """Drop the rows that repeat earlier values, if the log's rate exceeds that of the values (see `held`)."""
+    """Drop rows that repeat earlier values, if the log has more rows per second than new values (see `held`)."""
     rows = held(recording.t, recording.q, recording.dq, recording.stretches)
     if rows is None:
         return recording
@@ -160,9 +160,9 @@ def _without_holds(recording: Recording) -> Recording:
 
 
 def restart_index(t: np.ndarray) -> np.ndarray | None:
-    """Return each row's trajectory index (T,) if the clock t (T,) s restarts, else None.
+    """Return the trajectory index (T,) of each row, or None if the clock t (T,) s does not restart.
 
-    At a restart, the clock jumps back to about its first value. `Recording` rejects all other jumps back in time.
+    At a restart, the clock jumps back to about its first value; `Recording` rejects any other backward jump.
     """
     if t.ndim != 1 or not len(back := np.flatnonzero(np.diff(t) < 0) + 1):
         return None
@@ -183,7 +183,7 @@ def _agreed_torque(declared: str | None, stored) -> str:
 
 
 def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
-    """Return torque constants in Nm/A, () or (n,), or None if none are given."""
+    """Return the torque constants in Nm/A, () or (n,), or None if `value` is None."""
     if value is None:
         return None
     where = "data.torque_constant"
@@ -214,7 +214,7 @@ def _vector(table: Table, names: list[str], n_joints: int | None, field: str) ->
 
 
 def scalar(table: Table, names: list[str]) -> np.ndarray:
-    """Return a single column as (T,)."""
+    """Return the values (T,) of the single column in `names`."""
     if len(names) != 1:
         raise UserError(f"expected one column for t and for trajectory, got {len(names)}: {listed(names)}")
     value = _numbers(table, names[0])
@@ -243,7 +243,7 @@ def files_of(path: str | os.PathLike) -> list[Path]:
 
 
 def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
-    """Return all columns of the file `path`; errors name the file. `bag`: the keyword arguments of `bag_table`."""
+    """Return all columns of the file `path`; errors name the file; `bag` contains the arguments of `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")

@@ -26,19 +26,19 @@ SIGNALS = (  # further values that an arm may measure or estimate, with libfrank
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Joint motion and torque: T rows of n joints. The constructor checks the arrays and makes them read-only.
+    """Motion and torque of n joints in T rows; the constructor checks the arrays and makes them read-only.
 
     Methods return new recordings. A difference, filter or window never includes rows of two trajectories.
 
     Attributes:
-        t: (T,) s, logged time. Within a trajectory, t increases, perhaps in uneven steps. A trajectory may restart t.
+        t: (T,) s, logged time; t increases within a trajectory, evenly or not, and may restart in the next one.
         q, dq, tau: (T, n) joint angles in rad, velocities in rad/s and torques in Nm.
         torque: kind of `tau`: "measured" (by a link-side sensor, with gravity), "commanded" (without gravity) or
             "motor" (motor torque times gear ratio; it contains gravity, all friction and rotor inertia).
         signals: {name from `SIGNALS`: (T,) or (T, k)}, further values that the arm reported; None becomes {}.
         trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses; None: all 0.
-        period: s, time on the clock `t` after which the motion repeats (see `split`); None: no known repetition.
-        notes: one line per repair or other remark of the file reader.
+        period: s, period of the motion on the clock `t` (see `split`); None: no known period.
+        notes: remarks of the file reader, such as one line per repair.
         command_period: s, time for which the arm applies each command; None: until the next row.
     """
 
@@ -152,7 +152,7 @@ class Recording:
         return self.rows(rows, np.concatenate([[0], np.cumsum(cut)])[: len(rows)])
 
     def split_at_gaps(self, max_gap_s: float | None = None) -> "Recording":
-        """Begin a new trajectory after each pause, defined by `longest_step`; drop single rows between two pauses."""
+        """Begin a new trajectory after each pause (see `longest_step`), and drop trajectories of a single row."""
         if max_gap_s is not None:
             _positive("max_gap_s", max_gap_s, "s")
         steps = self._steps()
@@ -166,9 +166,9 @@ class Recording:
     def resample(self, dt: float) -> "Recording":
         """Interpolate each trajectory linearly onto a uniform grid of `dt` s from its first logged time.
 
-        Commanded torque is averaged over each step of `dt`, because a command acts until the next one. There is no
-        anti-aliasing filter: to lower the rate, resample at the logged rate, `smooth`, then resample again. Each
-        of the `signals` has its last logged value, because flags and poses cannot be interpolated. Trajectories
+        A command acts until the next command, so commanded torque is averaged over each step of `dt`. There is no
+        anti-aliasing filter: to lower the rate, resample at the logged rate, call `smooth`, then resample again. A
+        new row contains the last logged `signals`, because flags and poses cannot be interpolated. Trajectories
         shorter than `dt` are dropped.
         """
         _positive("dt", dt, "s")
@@ -193,9 +193,9 @@ class Recording:
         return replace(self, signals=signals, **{f: np.concatenate(parts) for f, parts in columns.items()})  # type: ignore[arg-type]
 
     def _held(self, s: slice, grid: np.ndarray, dt: float) -> np.ndarray:
-        """Return the commands (G, n) Nm of the rows `s`, averaged over the intervals from `grid` to `grid + dt`.
+        """Return the mean commands (G, n) Nm of the rows `s` in the G intervals from `grid` to `grid + dt`.
 
-        Each command acts until the next one. Commands that the log does not contain are interpolated.
+        A command acts until the next command. Commands that were sent between two logged rows are interpolated.
         """
         t, tau, period = self.t[s], self.tau[s], self.command_period or 1.0 / self.rate_hz
         if len(grid) == len(t) and np.abs(grid - t).max() < 1e-6 * dt and period > 0.9 * dt:
@@ -213,9 +213,9 @@ class Recording:
         return out
 
     def smooth(self, cutoff_hz: float) -> "Recording":
-        """Low-pass q, dq and tau with a zero-phase filter: a Butterworth of order 4, run forwards and backwards.
+        """Low-pass q, dq and tau without delay, by a Butterworth filter of order 4 forwards and then backwards.
 
-        The two passes together have a gain of -6 dB at the cutoff. The time steps must be uniform; see `resample`.
+        Both passes together have a gain of -6 dB at the cutoff. Time steps must be uniform (see `resample`).
         """
         _positive("cutoff_hz", cutoff_hz, "Hz")
         steps, rate = self._steps(), self.rate_hz
@@ -247,13 +247,13 @@ class Recording:
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        A repetition lasts at least 0.5 s, its RMS difference over the joints is below 0.01 rad, and a joint moves by
-        at least about 0.1 rad. `in_phase` also aligns repetitions after a clock restart.
+        A repetition lasts at least 0.5 s, moves a joint by about 0.1 rad or more, and differs by less than 0.01 rad
+        RMS over the joints. `in_phase` also aligns repetitions after a clock restart.
         """
         return self._period_and_clock()[0]
 
     def in_phase(self) -> "Recording":
-        """Return the recording with `period` set and `t` shifted so that repetitions of a motion have equal phase.
+        """Return the recording with its period, and with t shifted so that all repetitions have the same phase.
 
         If the motion does not repeat, the recording is returned unchanged.
         """
@@ -276,23 +276,23 @@ class Recording:
         return best, clock
 
     def overlap(self, training: "Recording") -> float:
-        """Return the share (0 to 1) of this motion that also occurs in `training`; see `periodicity.overlap`.
+        """Return the share (0 to 1) of this recording's motion that occurs in `training` (see `periodicity.overlap`).
 
-        Pieces with too little motion are ignored. The same motion may occur at different times in the recordings.
+        Pieces with too little motion are ignored. A motion may occur at different times in the two recordings.
         """
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
-        """Split into (train, validation) without common motion; `validation_fraction` is validation's share of rows.
+        """Return (training, validation) without common motion; `validation_fraction` of the rows are for validation.
 
-        1. If the motion has a period (argument or attribute), validation is the end of each repetition: the rows with
-           the largest phase, `t` modulo period. A chronological split would put the same motion in both parts: the
-           recording gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
-        2. If there are several trajectories, validation consists of the last trajectories.
-        3. In all other cases, validation is the end of the recording.
+        1. If the motion has a period (argument or attribute), validation is the end of each period: the rows with the
+           largest phase, `t` modulo period. A chronological split could put the same motion in both parts; for
+           example, the recording gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
+        2. Without a period, but with several trajectories, validation consists of the last trajectories.
+        3. Without a period and with one trajectory, validation is the end of the recording.
 
-        In cases 1 and 3, training has no rows within 0.1 s of a validation row. Trajectories of a single row are
-        dropped from training and validation.
+        If validation does not consist of whole trajectories, training has no rows within 0.1 s of a validation row.
+        Trajectories of a single row are dropped from training and validation.
         """
         if not 0 < validation_fraction < 1:
             raise UserError(f"validation_fraction: expected a number in (0, 1), got {validation_fraction}")
@@ -322,7 +322,7 @@ class Recording:
         return self.select(train)._without_lone_rows(), self.select(validation)._without_lone_rows()
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the recording to `path` (.npz); `readers.read` restores it."""
+        """Write the recording to `path` (.npz), from which `readers.read` restores the recording."""
         save_npz(path, self.arrays())
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -332,9 +332,9 @@ class Recording:
         return {**own, **period, **self.signals}
 
     def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
-        """Return a recording of the rows with indices `rows` (K,) and the new trajectory indices `trajectory` (K,).
+        """Return the rows with indices `rows` (K,) as a recording with the trajectory indices `trajectory` (K,).
 
-        drop_lone: whether to drop trajectories of a single row. If all rows are consecutive, the arrays are views.
+        drop_lone: whether to drop trajectories of a single row. Arrays of consecutive rows are views, not copies.
         """
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1

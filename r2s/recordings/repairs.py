@@ -1,7 +1,7 @@
-"""Repair log faults with only one remedy: swapped or repeated rows, zero stamps, wrapped angles, repeated values.
+"""Repair log faults that have only one remedy: swapped or repeated rows, zero stamps, wrapped or misread angles.
 
-Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired;
-`Recording` or the checks of an identification report it.
+Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired, but
+reported by `Recording` or by the checks of an identification.
 """
 
 from itertools import pairwise
@@ -11,13 +11,13 @@ import numpy as np
 Arrays = dict[str, np.ndarray]  # t (T,), trajectory (T,), q, dq, tau (T, n)
 
 MOST_SWAPPED = 10  # rows; a row that is farther out of place indicates two interleaved logs
-JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: q is misread if it steps by more than all, and back
+JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: q is misread if it jumps beyond all three, and back
 AWAY, MOST_FAILED = 10, 0.01  # largest number of successive rows, and share of all rows, with misread q
 FIRST_STEP = 100  # median steps; the first valid stamp is farther than this from 0
 REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad: at a wrap, q jumps by a revolution give or take its motion, below NEAR
 SLACK = 0.05  # rad by which a logged angle may exceed a joint limit
 LEAST_HELD = 2.0  # rows, least median length of a hold: a run of rows with equal values
-REGULAR = 0.8  # least share of equal holds (give or take a row); with a coarse encoder they vary with speed
+REGULAR = 0.8  # least share of equal holds (give or take a row); holds of a coarse encoder vary with speed
 MOVES = 0.2  # rad, least motion of a log in which holds are removed
 
 
@@ -52,7 +52,7 @@ def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
 
 
 def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of the rows with misread q: a joint's angle jumps away, and back within AWAY rows."""
+    """Return a mask (T,) of the rows with misread q: a joint's angle jumps, and jumps back within AWAY rows."""
     out, fast = np.zeros(len(q), dtype=bool), FASTEST * np.maximum(np.diff(t), 0.0)
     for x in q.T:  # one joint at a time: an hour of a log is large
         step = np.abs(np.diff(x))
@@ -65,7 +65,7 @@ def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _order(arrays: Arrays) -> np.ndarray | None:
-    """Return row indices (T,) that sort each trajectory by time; None if sorted or if a row is far out of place."""
+    """Return row indices (T,) that sort trajectories by time; None if rows are in order or too far out of order."""
     t, index = arrays["t"], arrays.get("trajectory", np.zeros(len(arrays["t"])))
     run = np.concatenate([[0], np.cumsum(np.diff(index) != 0)])
     if not np.any((np.diff(t) < 0) & (np.diff(run) == 0)):
@@ -75,9 +75,9 @@ def _order(arrays: Arrays) -> np.ndarray | None:
 
 
 def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Arrays, list[str]]:
-    """Remove jumps of q by a revolution within a trajectory; return the arrays and a line per repair.
+    """Remove jumps of q by a full revolution within a trajectory; return the arrays and a note on each repair.
 
-    limits: (low, high), (n,) rad each; angles outside are shifted by revolutions, if the shifted angles are inside.
+    limits: (low, high) joint limits, (n,) rad each; shift angles outside by revolutions if this moves them inside.
     """
     q, index = arrays["q"], arrays.get("trajectory")
     if q.ndim != 2 or q.dtype.kind not in "iuf" or len(q) != len(arrays["t"]):
@@ -123,7 +123,7 @@ def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -
 def held(t: np.ndarray, q: np.ndarray, dq: np.ndarray, stretches: list[slice]) -> np.ndarray | None:
     """Return a mask (T,) of the rows with new values, or None if the log does not repeat each value in several rows.
 
-    A log at 1 kHz may repeat values that arrive at 30 Hz. While the arm moves, each value fills equally many rows.
+    For example, a log at 1 kHz may contain each value of a 30 Hz sensor in about 33 rows while the arm moves.
     """
     new = np.ones(len(t), dtype=bool)
     lengths, moved = [], 0.0

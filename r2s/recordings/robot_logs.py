@@ -24,10 +24,10 @@ def is_bag(path: Path) -> bool:
 
 
 def libfranka_table(table: Table) -> Table:
-    """Add t (T,) s and q, dq, tau_J, tau_J_d (T, 7) to a log of `franka::logToCSV`; return other tables unchanged.
+    """Add t (T,) s and q, dq, tau_J, tau_J_d (T, 7) to a log of `franka::logToCSV`; return any other table unchanged.
 
-    In such a log (libfranka, src/log.cpp), `time` is in whole ms, and `state.tau_J` is measured torque. A row has the
-    state of cycle k + 1 and the command `cmd.tau_J_d` of cycle k; `shift_command` corrects this offset of one cycle.
+    libfranka (src/log.cpp) logs `time` in whole ms, and measured torque as `state.tau_J`. A row has the state of
+    cycle k + 1, but the command `cmd.tau_J_d` of cycle k; `shift_command` corrects this offset of one cycle.
     """
     if not {"time", "success_rate", "state.q[0]"} <= table.keys():
         return table
@@ -45,9 +45,9 @@ def libfranka_table(table: Table) -> Table:
 
 
 def rostopic_table(table: Table) -> Table:
-    """Add t, q, dq, tau and joint_names to a JointState log of `rostopic echo -p`; return other tables unchanged.
+    """Add t, q, dq, tau and joint_names to a JointState log of `rostopic echo -p`; return any other table unchanged.
 
-    The log's stamps are in ns. The columns `field.name0` ... contain the joint names, in an order set by the driver.
+    `rostopic echo -p` writes stamps in ns, and joint names as columns `field.name0` ..., in the driver's order.
     """
     fields = {"q": "field.position", "dq": "field.velocity", "tau": "field.effort"}
     stamp = table.get("field.header.stamp")
@@ -69,17 +69,17 @@ def _last_number(name: str) -> int:
 
 
 def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-    """Shift the logged tau_J_d (T, n) Nm by one cycle, so that each state has the command that answered it.
+    """Shift the logged tau_J_d (T, n) Nm by one cycle, so that each state is paired with the command that followed.
 
-    A Franka state at t (T,) s contains the command of the previous cycle. A `Recording` (`r2s.arm.recorder`) pairs a
-    state with the command that follows it. If the log's rate is below the arm's, the shifted command is interpolated.
-    The command of the last row is not shifted, because no later command is known.
+    A Franka state at t (T,) s contains the command of the previous cycle, but a `Recording` (`r2s.arm.recorder`)
+    pairs a state with the next command. If the log is slower than the control cycle, shifted commands are
+    interpolated. The last command is not shifted, because the log contains no later command.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
 
 
 class Sample(NamedTuple):
-    """A message: header stamp and bag time, ns; joint names (() if its type has none); {field: values (n,)}."""
+    """A message: header stamp, ns; bag time, ns; joint names (() if the type has no names); {field: values (n,)}."""
 
     stamp: int
     received: int
@@ -97,13 +97,13 @@ def bag_table(
 ) -> Table:
     """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) from one topic of a bag.
 
-    t is 0 at the first message; its source is the header stamps, or bag time if all stamps are 0. Messages without
-    all joints of the robot, such as a gripper's, are ignored. Messages are sorted by time, and repetitions dropped.
-    `reader_note` states how many messages are left out, because the stamp is 0 or the first values are missing.
+    t starts at 0 and comes from the header stamps, or from bag time if all stamps are 0. Messages that lack joints of
+    the robot, such as a gripper's, are ignored. Messages are sorted by time, and repeated messages are dropped. The
+    entry `reader_note` counts omitted messages: messages with stamp 0, and first messages without values.
 
     Args:
-        path: .bag (ROS 1), .db3 or .mcap, or the folder of a ROS 2 bag.
-        topic: topic with sensor_msgs/JointState or franka_msgs/FrankaState, FrankaRobotState; None: the only one.
+        path: .bag (ROS 1), .db3 or .mcap file, or the folder of a ROS 2 bag.
+        topic: topic of type JointState, FrankaState or FrankaRobotState; None: the only topic of these types.
         joints, model_joints, n_joints: see `choose_joints`.
 
     Raises:
@@ -140,9 +140,9 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    A log's order may differ from the robot's, because some ROS 2 drivers sort joints by name. These names have
-    priority, in this order: (1) `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix such as in
-    panda_joint1; (3) n names that differ only in a number; (4) if n is 1 or `model_joints` is empty, the first n.
+    A log's order may differ from the robot's, because some ROS 2 drivers sort joints by name. The joints are found,
+    in order of priority, by (1) `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix as in
+    panda_joint1; (3) n names that differ only in a number; (4) the first n names, if n is 1 or `model_joints` empty.
 
     Args:
         logged: joint names in the log.
@@ -185,7 +185,7 @@ def choose_joints(
 
 
 def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
-    """Return the topic that was read, and its messages."""
+    """Read a topic (None: the only readable topic); return the topic's name and messages."""
     rosbag1, rosbag2 = (optional_import(f"rosbags.rosbag{k}", "reading this file", "recordings") for k in (1, 2))
     try:
         # only this topic is decoded: others may have unknown message types
@@ -257,7 +257,7 @@ def _joint_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
-    """Return the joint names and {field: values} of a Franka message (franka_ros or franka_ros2)."""
+    """Return the joint names and {field: values} of a Franka state message (franka_ros or franka_ros2)."""
     if hasattr(message, "measured_joint_state"):
         names, values = _joint_state(message.measured_joint_state)
         desired = message.desired_joint_state
@@ -291,7 +291,7 @@ def _pick_joints(topic: str, samples: list[Sample], joints, model_joints, n_join
 
 
 def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.ndarray:
-    """Return the values of a field as (T, n), or an empty array if no message has them."""
+    """Return the values (T, n) of a field, or an empty array if no message has values of this field."""
     if not any(s.values[field].size for s in samples):
         return np.empty(0)
     rows = []

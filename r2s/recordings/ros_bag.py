@@ -48,14 +48,14 @@ def write_mcap(
     dynamics: Dynamics,
     reference: Mapping[str, np.ndarray] | None = None,
 ) -> list[str]:
-    """Write `path` (.mcap) and its Foxglove layout, and return a line for each part that was left out.
+    """Write a bag `path` (.mcap) and a Foxglove layout; return a line for each topic that was left out.
 
-    Topics: /joint_states, where effort is tau; /external_wrench, if the recording has O_F_ext_hat_K; /reference, if
-    given; /tf, the link poses at 50 Hz or less; /robot_description, the URDF, latched.
+    The topics are /joint_states (effort is tau), /external_wrench (if the recording has O_F_ext_hat_K), /reference
+    (if given), /tf (link poses at 50 Hz or less) and /robot_description (the URDF, latched).
 
     Args:
-        robot, dynamics: model that the URDF describes. recording: motion of this robot.
-        reference: planned motion, which starts at the recording's start: t (T,) s and q, dq, ddq (T, n).
+        robot, dynamics: arm and parameters for the URDF. recording: motion of this arm.
+        reference: planned motion {"t": (T,) s, "q", "dq", "ddq": (T, n)}, which starts with the recording.
 
     Raises:
         UserError: rosbags is not installed, or robot and recording differ in their number of joints.
@@ -100,7 +100,7 @@ def write_mcap(
 
 
 class _Messages:
-    """Builder of stamped ROS 2 messages; `types` are the message classes of a rosbags typestore."""
+    """Build stamped ROS 2 messages from `types`, the message classes of a rosbags typestore."""
 
     def __init__(self, types: Mapping[str, Any]):
         self._types = types

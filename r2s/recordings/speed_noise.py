@@ -22,9 +22,9 @@ UNEVEN = 0.25  # share of the median step; a step that differs by more, as after
 def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
     """Return the standard deviation (n,) rad/s of the velocity noise; 0 if no recording has a rate of at least 80 Hz.
 
-    The reference velocity is the slope of a cubic through the positions (Savitzky and Golay, Analytical Chemistry
-    36(8), 1964). At low acceleration, the slope is accurate, and a delay of dq has no effect. The result is therefore
-    the median over the 50 ms pieces with the least acceleration, 10 % of all. The acceleration is computed from q.
+    The noise is dq minus a reference velocity, the slope of a cubic fit to q (Savitzky and Golay, Analytical
+    Chemistry 36(8), 1964). At low acceleration, this slope is accurate, and a delay of dq has no effect. Therefore,
+    the result is the median over the 10 % of all 50 ms pieces that have the least acceleration, computed from q.
 
     Raises:
         UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.

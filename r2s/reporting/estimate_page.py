@@ -20,7 +20,7 @@ LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and limits 
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
-    """Draw payload and friction over time from `rows` (`offline_estimation.table`); mark the times `changes`, s."""
+    """Draw payload and friction over time from `rows` (`offline_estimation.table`), with lines at `changes`, s."""
     t, colour = rows["t"].to_numpy(), colours(["estimate"])["estimate"]
 
     def band(axis, name: str, title: str, label: str, scale: float = 1.0) -> None:
@@ -52,7 +52,7 @@ def write_estimate_recording(
     """Write a rerun recording: the arm, the force on the arm, and each estimate with its 95 % interval.
 
     Args:
-        rows: table of the estimates of stage=estimate. wrench: table of the external force, by `observe_recording`.
+        rows: estimates of stage=estimate over time. wrench: table of the external force from `observe_recording`.
     """
     stream = rr.RecordingStream(f"r2s {path.absolute().parent.name.replace('.', '-')}")
     shown = [n for n in rows.columns if n not in wrench.columns and not n.endswith("_half")]
@@ -81,7 +81,7 @@ def _log_columns(stream: rr.RecordingStream, table: pd.DataFrame, names: Sequenc
 
 
 def _layout(names: Sequence[str]) -> rrb.Blueprint:
-    """Return the layout: a tab with the arm and plots of the force on the arm, and a tab with a plot per column."""
+    """Return a layout of two tabs: the arm with plots of the external force, and one plot per estimate in `names`."""
     eye = rrb.EyeControls3D(position=[1.5, -1.1, 0.9], look_target=[0.35, 0.0, 0.4])
     legend = rrb.PlotLegend(visible=False)
     force = [rrb.TimeSeriesView(origin=f, name=f"force along {f[6]}, N", plot_legend=legend) for f in FORCES]

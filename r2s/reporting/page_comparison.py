@@ -1,6 +1,6 @@
 """Compare the table cells of two versions of a page of benchmarks/results, including the intervals in the cells.
 
-Cells are matched by section, row and column, so that added rows and changed paragraphs do not matter.
+Cells are matched by section, row and column, so added rows and changed paragraphs do not affect the comparison.
 """
 
 import re
@@ -40,9 +40,9 @@ def without_rows(page: str) -> str:
 def compare_pages(before: str, now: str) -> pd.DataFrame:
     """Compare all cells of two pages; return a row per cell: section, row, column, committed, now, verdict, change.
 
-    `verdict` is one of VERDICTS. "last digit": numbers differ by at most one unit of their last digits. "beyond
-    intervals": at least one interval in the cell does not overlap with its new version.
-    `change` is the largest relative change of a number in the cell; NaN if a number has no counterpart.
+    `verdict` is one of VERDICTS: with "last digit", numbers differ by at most one unit of their last digits; with
+    "beyond intervals", an interval in the cell does not overlap with the interval that replaces it. `change` is the
+    largest relative change of a number in the cell; NaN if old and new cell differ in how many numbers they contain.
     """
     old, new = table_cells(before), table_cells(now)
     rows = []
@@ -54,7 +54,7 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
 
 
 def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
-    """Apply `compare_pages` to all {page: text}; return one table, which states the page if there are several."""
+    """Apply `compare_pages` to all {page: text}; return one table, which names the pages if there are several."""
     parts = []
     for page, text in before.items():
         cells = compare_pages(text, now[page])
@@ -63,7 +63,7 @@ def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
 
 
 def _tables(page: str) -> Iterator[tuple[str, list[str], list[list[str]]]]:
-    """Yield (section, head, rows) for each table of a page."""
+    """Yield (section heading, column names, rows of cells) for each table of a page."""
     section, block = "", []
     for line in [*page.splitlines(), ""]:
         if line.startswith("|"):
@@ -91,7 +91,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _last_digits(text: str) -> list[float]:
-    """Return the resolution of each number in a text: one unit of its last digit."""
+    """Return the resolution of each number in a text: one unit of the number's last digit."""
     parts = [x.lower().partition("e") for x in re.findall(NUMBER, text)]
     return [10.0 ** (int(power or 0) - len(number.partition(".")[2])) for number, _, power in parts]
 

@@ -48,8 +48,8 @@ def transfer(
 
     Args:
         run, robot: the run and its arm. episodes: {simulator or arm: episodes}. rows: {simulator or arm: measures}.
-        torque: (n,) Nm, the policy's torque limits. timing: latencies of the arm's cycles; None without an arm.
-        stops: stops of the arm, with their reasons. halted: why the arm did not run all episodes, or None.
+        torque: (n,) Nm, the policy's torque limits. timing: latencies of the arm's control cycles; None: no arm.
+        stops: stops of the arm, with their reasons. halted: reason why episodes were not run; None: all were run.
     """
     measures = measures_of(run.folder)
     shown = {label: first(e) for label, e in episodes.items()}
@@ -100,11 +100,11 @@ def pipeline(
     transferred: Mapping[str, Path],
     rows: Mapping,
 ) -> MeasureTable:
-    """Write one recording.rrd and one report of the whole pipeline; return the measure table of its task.
+    """Write one recording.rrd and one report of the whole pipeline; return the task's measure table.
 
     Args:
         run, robot: run and arm of the pipeline. identified: run folder of the identification.
-        trained, transferred: {label: run folder} of trainings and transfers. rows: {label: measures} of transfers.
+        trained, transferred: {label: run folder} of trainings and transfers. rows: {label: measures of a transfer}.
     """
     measures = measures_of(next(iter(transferred.values())))
     write_measures(run.folder, measures)

@@ -18,10 +18,10 @@ NOTE = "without interval: the figure has changed, and the page states no interva
 
 
 def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.DataFrame) -> dict[str, Any]:
-    """Print the cells that differ; write differences.csv, report.md and the report of all pages; return the summary.
+    """Print the differing cells; write differences.csv, report.md and a report of all pages; return a summary.
 
     Args:
-        run: run folder to write to. page: page name. commit: commit of the new page. cells: from `compare_pages`.
+        run: run folder to write to. page: page name. commit: commit of the new page. cells: table of `compare_pages`.
     """
     counts = {verdict: int((cells["verdict"] == verdict).sum()) for verdict in VERDICTS}
     cells.to_csv(run.folder / "differences.csv", index=False)
@@ -53,7 +53,7 @@ def all_pages(folder: Path, last: dict[str, Any]) -> None:
 
 
 def _shown(cells: pd.DataFrame) -> pd.DataFrame:
-    """Sort cells by verdict (beyond intervals, without interval, others), then by change; return them as strings."""
+    """Return cells as strings, sorted by verdict (beyond intervals, without interval, any other), then by change."""
     order = cells.assign(rank=cells["verdict"].map({"beyond intervals": 0, "without interval": 1}).fillna(2))
     order = order.sort_values(["rank", "change"], ascending=[True, False])
     change = order["change"].map(lambda x: "" if pd.isna(x) else f"{100 * x:.0f} %")

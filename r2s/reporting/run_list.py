@@ -1,4 +1,4 @@
-"""List run folders with their status, key figures and age, for `r2s list`."""
+"""List run folders with their status, age and main results, for `r2s list`."""
 
 import csv
 import json
@@ -21,7 +21,7 @@ LEAST = 20  # letters; a result is not cut to fewer than this
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
-    """Return a row of strings per run folder below `root`, the newest last.
+    """Return a table with a row of strings per run folder below `root`, sorted by start time.
 
     Args:
         root: folder of all runs. stage: list only runs of this stage. failed: list only failed and killed runs.
@@ -43,7 +43,7 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
 
 
 def print_runs(console: Console, runs: pd.DataFrame, title: str) -> None:
-    """Print `run_rows` with a line per run, cut to the width of a terminal, but complete in a file or pipe."""
+    """Print `run_rows` with a line per run; lines are cut to the width of a terminal, but not in a file or pipe."""
     rows = [("run", *runs.columns), *((str(name), *map(str, row)) for name, row in runs.iterrows())]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     if console.is_terminal:
@@ -59,7 +59,7 @@ def print_runs(console: Console, runs: pd.DataFrame, title: str) -> None:
 
 
 def ago(seconds: float) -> str:
-    """Return an age in its largest unit: 40 s, 12 min, 5 h, 3 d."""
+    """Return an age as text in seconds, minutes, hours or days: "40 s", "12 min", "5 h", "3 d"."""
     for size, unit in ((86400, "d"), (3600, "h"), (60, "min")):
         if seconds >= size:
             return f"{seconds / size:.0f} {unit}"
@@ -67,7 +67,7 @@ def ago(seconds: float) -> str:
 
 
 def _result(folder: Path, meta: Mapping[str, Any]) -> str:
-    """Return the key figures of a finished run, or the error or the progress of an unfinished one."""
+    """Return the main results of a finished run, the error of a failed run, or the progress of any other run."""
     summary = folder / "summary.json"
     try:
         if summary.is_file():

@@ -19,7 +19,7 @@ def number(value: float | None, form: str = "{:.3g}") -> str:
 
 
 def measure_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return `rows` {label: row of evaluations.csv} as a table of strings, one line per simulator or arm."""
+    """Return `rows`, {simulator or arm: row of evaluations.csv}, as a table of strings with a line per label."""
     return _table([measures[key] for key in measures.rows], rows, measures.corner, decimals=1)
 
 
@@ -39,7 +39,7 @@ def _table(columns: Sequence[Measure], rows: Mapping[str, Mapping], corner: str,
 
 
 def _counted(label: str, row: Mapping) -> str:
-    """Return the row's label; if the arm stopped early, append the number of completed goals."""
+    """Return the label of a row; if the arm stopped early, append the number of completed goals."""
     done, asked = row.get("episodes"), row.get("asked")
     return label if done == asked else f"{label}, {done} of {asked} goals done"
 
@@ -63,7 +63,7 @@ def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, 
 def print_table(
     console: Console, frame: pd.DataFrame, title: str, caption: str | None = None, sentences: bool = False
 ) -> None:
-    """Print a table of strings; dim poorly identifiable numbers, unless the strings are `sentences`."""
+    """Print a table of strings; dim cells with poorly identifiable values, unless the cells contain `sentences`."""
     how = {"title_justify": "left", "caption_justify": "left", "padding": (0, 1, 0, 0)}
     table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **how)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))

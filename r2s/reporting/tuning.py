@@ -1,4 +1,4 @@
-"""Report stage=tune: its trials, and a comparison of its best value with a grid search at equal compute."""
+"""Report stage=tune: the trials, and a comparison of their best value with a grid search at equal compute."""
 
 from collections.abc import Sequence
 from glob import glob
@@ -15,7 +15,7 @@ from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
 ORDERS = 2000  # random orders of a grid: the standard error of their mean is then 1 / 45 of their spread
-SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # of the search's compute
+SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of the search's compute
 
 
 def trials_table(study: Any, folder: Path) -> pd.DataFrame:
@@ -32,9 +32,9 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) of all trials that end within `at` (K,) s of compute, run one after another.
+    """Return the best value (K,) of the trials that end within `at` (K,) s, if trials run one after another.
 
-    A pruned or failed trial (nan) uses compute, but has no value. sign: 1 if larger is better, else -1.
+    Pruned and failed trials use compute, but their value is nan. sign: 1 if a larger value is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))
@@ -58,9 +58,9 @@ def read_grid(against: str, measure: str) -> list[Trained]:
 
 
 def against_table(trials: pd.DataFrame, measure: str, against: str | None, larger: bool) -> pd.DataFrame | None:
-    """Return the best values of search and grid at the `SHARES` of the search's compute; None without a grid.
+    """Return the best values of search and grid after the `SHARES` of the search's compute; None without a grid.
 
-    Since the order of a grid's jobs is arbitrary, the grid's value is a mean over `ORDERS` random orders.
+    The order of a grid's jobs is arbitrary, so the grid's best value is averaged over `ORDERS` random orders.
 
     Args:
         trials: output of `trials_table`. measure: column in evaluations.csv. against: glob of the grid's run folders.
@@ -72,7 +72,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     sign = 1.0 if larger else -1.0
     at = np.array(SHARES) * trials["wall_clock_s"].sum()
     searched = best_so_far(trials["wall_clock_s"].tolist(), trials["value"].tolist(), at, sign)
-    # a job's value is its last evaluation, as for a trial; summary.json evaluates other goals
+    # the value of a job is its last evaluation, as for a trial; summary.json contains evaluations on other goals
     spent, values = (np.array([r.curve[k].iloc[-1] for r in grid]) for k in ("wall_clock_s", measure))
     rng = np.random.default_rng(0)
     orders = [rng.permutation(len(grid)) for _ in range(ORDERS)]

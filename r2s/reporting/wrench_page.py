@@ -24,7 +24,7 @@ TOUCH, NONE = "#cc0018", "#7f8790"
 
 
 def force_of(wrench: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return force and half widths of the 95 % intervals, (T, 3) N each, from a table of `observe_recording`."""
+    """Return the force and half the width of its 95 % interval, each (T, 3) N; wrench: table of observe_recording."""
     return wrench[FORCES].to_numpy(), wrench[[f"{name}_half" for name in FORCES]].to_numpy()
 
 
@@ -38,7 +38,7 @@ def franka_force(recording: Recording) -> np.ndarray | None:
 
 
 def draw_wrench(path: Path, wrench: pd.DataFrame, recording: Recording, contacts: Sequence[dict]) -> Path:
-    """Draw the force with its 95 % band over time, and the contacts."""
+    """Draw the force over time with its 95 % band, and mark the contacts."""
     t, rows = wrench["t"].to_numpy(), at_rate(wrench["t"].to_numpy(), DRAWN_HZ)
     (force, half), own = force_of(wrench), franka_force(recording)
     palette = colours(["estimate", FRANKA])
@@ -84,7 +84,7 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 
 
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
-    """Return lines of the 95 % cone of the force's direction: the cone's edge, and four lines from the tip to it.
+    """Return the 95 % cone of the force's direction as lines: the cone's edge, and four lines from tip to edge.
 
     The edge is the ellipsoid with half axes `half`, projected onto the plane normal to the force.
     """

@@ -1,4 +1,4 @@
-"""Make the adapter that conf/adapt describes, with the identified model of the arm."""
+"""Make the adapter of conf/adapt from the identified model of an arm."""
 
 import filecmp
 from dataclasses import replace
@@ -11,11 +11,11 @@ from r2s.stages.run_config import checked, loaded, modules
 RECORDINGS = ("train.npz", "validation.npz")  # files that stage=identify writes when it records an arm
 PARAMETERS = "parameters.yaml"
 TORQUE = "commanded"  # adapters compare the commanded torque with the motion
-BESIDE = ("calibration",)  # keys of conf/adapt that the adapter's class does not take
+BESIDE = ("calibration",)  # keys of conf/adapt that are no arguments of the adapter's class
 
 
 def calibrated(calibration, robot, trust=()):
-    """Return identified dynamics, (space, posterior draws) and unloaded recordings; the last two may be None."""
+    """Return identified dynamics, (space, posterior draws) or None, and recordings of the unloaded arm or None."""
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
 
@@ -87,7 +87,7 @@ def with_declared_payload(cfg, robot, dynamics):
 def make_adapter(cfg, robot, source):
     """Return the adapter of conf/adapt for the policy of the run folder `source`, or None for adapt=none.
 
-    The adapter uses the identified model in adapt.calibration=, or else in the calibration of the policy's training.
+    The adapter uses the identified model of adapt.calibration=, by default the model of the policy's training.
 
     Raises:
         UserError: there is no arm or no identified model, or the model was not identified from commanded torque.
@@ -113,7 +113,7 @@ def make_adapter(cfg, robot, source):
 def calibration_of(cfg, source):
     """Return the run folder with the adapter's model: adapt.calibration, or the calibration of the policy's training.
 
-    If a training has copied the model, use the folder of the identification if possible, because it has recordings.
+    Prefer the identification's folder to the training's copy, because only an identification has recordings.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)

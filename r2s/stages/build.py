@@ -14,7 +14,7 @@ from r2s.errors import FAILED, Stopped, UserError, check_number, choices, instea
 from r2s.stages.parts import called, check_types, part, plain, target
 from r2s.stages.run_config import CONF, modules
 
-DRIVE_KEYS = ("soft_start_s", "live")  # keys of conf/arm for the policy runner; the arm's class does not take them
+DRIVE_KEYS = ("soft_start_s", "live")  # keys of conf/arm for the policy runner, not for the arm's class
 STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "estimate", "excite", "results")
 COMMON = (
     *("stage", "root", "name", "skip_completed", "resume", "experiment", "grid", "seed", "threads", "tracker"),
@@ -55,18 +55,18 @@ def make_robot(cfg):
 
 
 def make_dynamics(cfg, robot):
-    """Return the dynamics of `base_dynamics` for the task of conf/task.
+    """Return the dynamics of `base_dynamics`, prepared for contact if the task of conf/task touches a surface.
 
-    If the task touches a surface, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`.
+    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`.
     """
     dynamics = base_dynamics(cfg, robot)
     return dynamics.holding_contact() if getattr(target(cfg.task, "task"), "touches", False) else dynamics
 
 
 def base_dynamics(cfg, robot):
-    """Return the dynamics of conf/friction and conf/inertia, or the identified ones of `calibration=`, for any task.
+    """Return the identified dynamics of `calibration=`, or by default the dynamics of conf/friction and conf/inertia.
 
-    Unlike `make_dynamics`, it does not import the task, which imports torch (190 MB).
+    Unlike `make_dynamics`, this function does not import the task, which imports torch (190 MB).
     """
     from r2s.identification.parameter_file import load_parameters
 
@@ -93,13 +93,13 @@ def dynamics_of(robot, friction, inertia):
 def make_task(cfg, robot, dynamics, safety=None):
     """Return the task of conf/task with the arm's model, the controller of conf/control and the safety limits.
 
-    safety: safety settings of a transfer, which replace the settings in the training's config `cfg`; None: no change.
+    safety: safety settings of a transfer, which replace those in the training's config `cfg`; None: replace none.
     """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items() if k != "_target_"}
     task = called(target(cfg.task, "task"), "task", settings).with_model(robot, dynamics)
-    if "_target_" in cfg.control:  # control=default keeps the task's own controller
+    if "_target_" in cfg.control:  # control=default means the task's own controller
         task = task.controlled_by(part(cfg.control, "control", robot, task, dynamics))
     given = {k: v for k, v in (plain(safety) or {}).items() if v is not None}
     safety = {**(plain(cfg.get("safety")) or {}), **given}
@@ -126,7 +126,7 @@ def _arm_target(cfg) -> Callable[..., Any]:
 
 
 def _arm_settings(cfg, robot, task=None):
-    """Return the settings of conf/arm, with unset reflex thresholds set to what the task's contact forces require."""
+    """Return the settings of conf/arm; compute unset reflex thresholds from the task's allowed contact forces."""
     settings = plain(cfg.arm)
     if "collision_force" in settings and None in (settings["collision_torque"], settings["collision_force"]):
         from r2s.arm.clients.collision_thresholds import thresholds_of
@@ -141,17 +141,17 @@ def _arm_settings(cfg, robot, task=None):
 def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
     """Yield the arm of conf/arm; close it afterwards if it is a context manager.
 
-    A signal such as Ctrl-C stops the motion of an arm that is not a twin.
+    Ctrl-C and similar signals stop the motion of the arm, unless the arm is a twin.
 
     Args:
-        noise: number of a twin's sensor-noise stream. task, adapter: the policy's; None for a recording.
-        more: additional arguments for the arm's class.
+        noise: index of the random stream for a twin's sensor noise. task, adapter: task and adapter of the policy, or
+            None if no policy runs. more: further arguments of the arm's class.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.stop_request import handled_signals, pipeline
     from r2s.arm.warm_up import warm_up
 
-    if not is_twin(cfg):  # a twin's clock waits while code compiles
+    if not is_twin(cfg):  # a twin needs no warm-up: its clock waits while code compiles
         warm_up(robot, task, adapter)
     stream = {"noise": noise} if "noise" in inspect.signature(_arm_target(cfg)).parameters else {}
     with ExitStack() as stack:
@@ -187,7 +187,7 @@ def is_simulated(cfg):
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is a twin in this process, without an operator; such twins can run in parallel."""
+    """Return whether conf/arm is a twin in this process and without operator; such twins can run in parallel."""
     return is_simulated(cfg) and "operator" not in cfg.arm
 
 
@@ -196,7 +196,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
     """Yield a `PolicyRunner` for the arm of conf/arm, or a `RealtimeRunner` if arm.live; stop the arm afterwards.
 
     Args:
-        dynamics: center of the training's randomization. noise: see `opened_arm`. adapter: an adapter, or None.
+        dynamics: center of the training's domain randomization. noise: index of the stream of a twin's sensor noise.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.policy_runner import PolicyRunner
@@ -226,9 +226,9 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
 
 @contextmanager
 def opened_source(cfg, robot, noise):
-    """Yield the arm to record: the arm of conf/arm, or with data=simulated a simulated arm with known parameters.
+    """Yield the arm to record: with data=simulated a simulated arm with known parameters, else the arm of conf/arm.
 
-    noise: number of the random stream of the sensor noise: 0, 1, 2, ... for successive recordings of one run.
+    noise: index of the random stream for sensor noise; successive recordings of a run use 0, 1, 2, ...
     """
     if cfg.data.kind != "simulated":
         with opened_arm(cfg, robot, noise) as arm:
@@ -242,7 +242,7 @@ def opened_source(cfg, robot, noise):
 
 
 def within_speed_share(cfg, robot):
-    """Return the robot with speed limits multiplied by arm.speed_share, to plan a motion for a recording."""
+    """Return the robot for planning a recorded motion, with the speed limits scaled by arm.speed_share."""
     share = cfg.arm.get("speed_share", 1.0) if cfg.data.kind == "arm" else 1.0
     check_number("arm.speed_share", share, "(0, 1]")
     return replace(robot, dq_max=share * robot.dq_max)
@@ -259,7 +259,7 @@ def make_truth(cfg, robot):
     """Return the true dynamics of a simulated arm from the files <data.truth>.yaml in conf/friction and conf/inertia.
 
     Raises:
-        UserError: conf/friction or conf/inertia has no such file.
+        UserError: conf/friction or conf/inertia has no file <data.truth>.yaml.
     """
     from omegaconf import OmegaConf
 
@@ -273,7 +273,7 @@ def make_truth(cfg, robot):
 
 
 def is_learner(cfg):
-    """Return whether conf/algo describes a learner; if not, it describes a controller that needs no training."""
+    """Return whether conf/algo describes a learner, rather than a controller that needs no training."""
     from r2s.learning.learner import Learner
 
     kind = target(cfg.algo, "algo")
@@ -281,7 +281,7 @@ def is_learner(cfg):
 
 
 def training_keys():
-    """Return the keys of conf/algo that only trainings use; a controller ignores them if an experiment sets them."""
+    """Return the keys of conf/algo that trainings use, and that controllers without training ignore."""
     from r2s.learning.train import Loop
 
     return ("n_envs", "demonstrations", "hidden", *(f.name for f in fields(Loop)))
@@ -293,9 +293,9 @@ def make_controller(cfg, robot, task, dynamics):
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):
-    """Return the open run folder of this job, with its trackers started; a resumed run keeps its tracker group.
+    """Return the open run folder of this job and start the trackers; a resumed run stays in its tracker group.
 
-    inputs, parents: files that the job reads, and run folders that it uses, in addition to those in the config.
+    inputs: files that the job reads, beyond those in the config. parents: run folders, beyond those in the config.
     """
     from omegaconf import OmegaConf
 
@@ -324,7 +324,7 @@ def open_run(cfg, overrides, inputs=(), parents=()):
 
 
 def console():
-    """Return the console that prints tables."""
+    """Return a console for printing tables."""
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else 100)
@@ -336,7 +336,7 @@ def all_threads(cfg):
 
 
 def set_threads(cfg, threads=None):
-    """Set torch's seed and number of threads (default: all); the physics uses other threads."""
+    """Set torch's seed and torch's number of threads (default: all); the physics has its own threads."""
     import torch
 
     torch.set_num_threads(threads or all_threads(cfg))

@@ -1,4 +1,4 @@
-"""`r2s check data=...`: judge recordings before an identification. stage=identify makes the same checks first."""
+"""`r2s check data=...` judges recordings before an identification; stage=identify begins with the same checks."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from r2s.stages.recordings import labels_of, of_one_reader, recording_files
 def check_data(cfg, to):
     """Print the verdict on each recording of `cfg`, and write the verdict to a JSON file.
 
-    to: JSON file for a single recording; None: ROOT/check/NAME.json for each recording.
+    to: path of the JSON file, only for a single recording; None: one file ROOT/check/NAME.json per recording.
 
     Raises:
         UserError: a file cannot be read, or a recording has the verdict fail.
@@ -35,7 +35,7 @@ def check_data(cfg, to):
 
 
 def judged(cfg, robot, file, validation):
-    """Return the verdict on the recording that a `FileData` describes, and the recording itself."""
+    """Return the verdict on the recording that `file` (`FileData`) describes, and this recording."""
     from r2s.identification.checks import check_recording
     from r2s.identification.verdict import judge, with_validation
 

@@ -7,12 +7,12 @@ HINT = "stage=compare compares adapters if runs= has transfers only: runs='runs/
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads."""
+    """Return the config keys that stage=compare reads."""
     return {"runs", "robot"}
 
 
 def compare(cfg, overrides):
-    """Compare the trainings in the folders of `runs=`; without trainings, compare the adapters of the transfers."""
+    """Compare the trainings that `runs=` matches; if it matches only transfers, compare their adapters."""
     from glob import glob
 
     from r2s.errors import UserError

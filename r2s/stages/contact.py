@@ -1,4 +1,4 @@
-"""stage=identify data.contact=FILE or data.presses=N: identify a surface from presses; write contact.yaml."""
+"""stage=identify data.contact=FILE or data.presses=N: identify a surface from contact; write contact.yaml."""
 
 import shutil
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ ARM = ("parameters.yaml", "posterior.npz")
 
 @dataclass(frozen=True)
 class ContactData:
-    """Recordings with contact: `recording` for the fit, `held_out` for validation or None, and their `files`."""
+    """Two recordings with contact and their files: `recording` for the fit, `held_out` (or None) for validation."""
 
     recording: Any
     held_out: Any
@@ -25,7 +25,7 @@ class ContactData:
 def contact_data(cfg, robot, file):
     """Return the `ContactData` from data.contact and data.contact_validation; None without data.contact.
 
-    file: `FileData` of the config, with the column names.
+    file: `FileData` of the config, which names the columns of the files.
 
     Raises:
         UserError: the robot has no tool, data.torque is not commanded, data.contact is missing, or a file is invalid.
@@ -103,7 +103,7 @@ def pressed_surface(cfg, run, arm, plan):
 
 
 def calibrated_arm(cfg, robot):
-    """Return the identified arm that `calibration=` names, with its posterior, as an `Arm`."""
+    """Return the identified arm of `calibration=` and its posterior as an `Arm`."""
     from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.stages.run_config import modules

@@ -10,7 +10,7 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
-SLOW_MS = 1.5  # ms; if rows of commands are farther apart, r2s prints its assumption on the hold of a command
+SLOW_MS = 1.5  # ms; if recorded commands are farther apart, r2s prints the hold of a command that it assumes
 LEAST_PRESSES = 4
 MAX_OVERLAP = 0.2  # largest share of a validation motion that may repeat training motion, for example in the approach
 
@@ -25,8 +25,8 @@ class ArmData:
         excitation_seed: seed of the training motion; the validation motion has the next seed.
         excitation: file of the training motion; None: r2s optimizes this motion.
         ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
-        presses: number of paths on a surface that replace these motions, or 0. press_point, press_normal: (3,) m and
-            (3,), approximate plane of the surface; None: a table below the tip in the home posture.
+        presses: how often the tool presses on a surface and slides, in place of the motions above; 0: never.
+        press_point, press_normal: (3,) m and (3,), rough plane of that surface; None: a table below the tip at home.
 
     Raises:
         UserError: a value is outside its range.
@@ -63,7 +63,7 @@ class SimulatedData(ArmData):
     """Settings of data=simulated: the motion to record on a simulated arm with known dynamics.
 
     Attributes:
-        truth: name of the dynamics, see `make_truth`. delay, lag: delay and lag of the actuation, s.
+        truth: name of the true dynamics, see `make_truth`. delay, lag: delay and lag of the actuation, s.
         position_noise, velocity_noise: standard deviations of the sensor noise, rad and rad/s.
     """
 
@@ -114,7 +114,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with its command period; without data.command_hz, print the assumed command hold."""
+        """Return the recording with the period of data.command_hz; if unset, print the assumed hold of a command."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -123,7 +123,7 @@ class FileData:
 
     @property
     def files(self) -> list[Path | str]:
-        """All files of training motion, validation motion and ramps."""
+        """Files that contain the training motion, the validation motion and the ramps."""
         from r2s.recordings.readers import files_of
 
         motion = [f for path in (self.path, self.validation) if path for f in files_of(path)]
@@ -133,7 +133,7 @@ class FileData:
 def file_data(cfg, path=None):
     """Return the `FileData` of a config; ignore keys of data=arm and data=simulated.
 
-    path: file that replaces data.path, which may then be missing.
+    path: file to read instead of data.path; data.path may then be missing.
     """
     from omegaconf import OmegaConf
 
@@ -152,7 +152,7 @@ def file_data(cfg, path=None):
 def read_file(robot, file, path, torque=None):
     """Return the recording in `path`, read with the settings of a `FileData`; `torque` replaces data.torque.
 
-    Print the reader's repairs. If data.path is a bag and `path` is not, ignore the bag's settings topic and joints.
+    Print what the reader repaired. If data.path is a bag but `path` is not, ignore data.topic and data.joints.
     """
     from r2s.recordings.readers import is_bag, read
 
@@ -170,7 +170,7 @@ def read_file(robot, file, path, torque=None):
 
 
 def read_episodes(path):
-    """Return the episodes of a transfer as a recording of commands, and {LeRobot name: rows} of the other signals.
+    """Return a transfer's episodes as a recording of commanded torque, and further signals as {LeRobot name: rows}.
 
     Raises:
         UserError: the file has no episodes of a transfer.
@@ -240,7 +240,7 @@ def check_cutoff(cutoff_hz, recordings):
 
 
 def read_user_ramps(robot, file):
-    """Return the ramps that a `FileData` names, or None; recording and ramps have the same column names."""
+    """Return the ramps in `file.ramps`, or None if unset; their columns have the same names as in the recording."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
 
@@ -248,7 +248,7 @@ def read_user_ramps(robot, file):
         return None
     columns = dict(file.columns)
     if file.torque != "commanded":
-        columns["tau"] = None  # the column of the recording has another kind of torque; ramps need commanded torque
+        columns["tau"] = None  # ramps need commanded torque, which this column of the recording does not contain
     ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
     check_ramps(robot, ramps)
     return replace(ramps, recording=file.held(ramps.recording))
@@ -270,9 +270,9 @@ def ramp_poses(cfg, robot):
 
 
 def record_motion(cfg, robot, motion, k, label, timing):
-    """Record motion number k on the arm; return the motion and the recording. If `motion` is None, optimize one.
+    """Record a motion on the arm; return the motion and the recording. If `motion` is None, optimize a motion.
 
-    timing: object that stores the durations of the control cycles.
+    k: index of the recording in the run. timing: object that stores the durations of the control cycles.
     """
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
@@ -290,7 +290,7 @@ def record_motion(cfg, robot, motion, k, label, timing):
 
 
 def record_ramps(cfg, robot, timing):
-    """Record breakaway ramps in postures about home; return the ramps, or None without ramp postures.
+    """Record breakaway ramps in postures about home; return the ramps, or None if the settings require none.
 
     timing: object that stores the durations of the control cycles.
     """
@@ -313,7 +313,7 @@ def record_arm(cfg, robot, run, motion):
     A resumed run reads its existing recordings. timing.csv lists the cycle durations, even if the arm stopped.
 
     Args:
-        run: open run folder for the files. motion: the training motion; None: r2s optimizes one.
+        run: open run folder for the files. motion: the training motion; None: r2s optimizes a motion.
 
     Raises:
         Stopped: the arm stopped; <name>_until_stop.npz contains the motion up to the stop.

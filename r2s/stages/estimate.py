@@ -24,7 +24,7 @@ LIMIT_SHARE = 0.6  # share of the speed and acceleration limits that a motion wi
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads."""
+    """Return the config keys that stage=estimate reads."""
     keys = {"robot", "calibration", "data", "estimate"} | (set() if cfg.calibration else {"friction", "inertia"})
     return keys | ({"arm"} if cfg.data.kind == "arm" else set())
 
@@ -98,7 +98,7 @@ def estimate(cfg, overrides):
 
 
 def identified_surface(cfg, robot):
-    """Return the `IdentifiedSurface` of estimate.surface=, or None; raise UserError if the robot has no tool."""
+    """Return the identified surface of estimate.surface=, or None; raise UserError if the robot has no tool."""
     if not cfg.estimate.surface:
         return None
     from r2s.identification.contact.contact_file import load_contact
@@ -109,7 +109,7 @@ def identified_surface(cfg, robot):
 
 
 def wrench_observer(cfg, robot, dynamics, surface):
-    """Return the wrench observer, and the source of its contact threshold: "recordings" or "noise"."""
+    """Return the wrench observer, and what determines its contact threshold: "recordings" or "noise"."""
     from r2s.adaptation.wrench import WrenchObserver, contact_threshold
     from r2s.adaptation.wrench_fusion import FusedWrench
 
@@ -151,7 +151,7 @@ def given_recording(cfg, robot):
 
 
 def record_arm(cfg, robot):
-    """Record data.excitation, or a motion of data.seconds; return the recording and the reason of a stop, or None.
+    """Record data.excitation, or a motion of data.seconds; return the recording, and the reason of a stop or None.
 
     Raises:
         Stopped: a signal stopped the arm, or the arm stopped before the recording began.

@@ -15,7 +15,7 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads."""
+    """Return the config keys that stage=excite reads."""
     return {"robot", "calibration", "identify", "excite"} | (
         {"friction.family"} if cfg.calibration else {"friction", "inertia"}
     )

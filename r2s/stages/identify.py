@@ -29,7 +29,7 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads."""
+    """Return the config keys that stage=identify reads."""
     keys = {"robot", "calibration", "identify", "search", "data"}
     keys |= {"friction.family"} if cfg.calibration else {"friction", "inertia"}
     return keys | ({"arm"} if cfg.data.kind == "arm" else set())
@@ -39,7 +39,7 @@ def reads(cfg):
 class Parts:
     """Inputs of an identification, checked before a run folder is made.
 
-    With data=arm, r2s records `groups` and `ramps` later. `motion`: data.excitation. `earlier`: identify.from.
+    `groups` and `ramps` are empty until an arm is recorded. `motion`: data.excitation. `earlier`: identify.from.
     """
 
     robot: Any
@@ -117,7 +117,7 @@ def with_known_arm(cfg):
 
 
 def identify_with_known_arm(cfg, overrides, key):
-    """Identify a surface (contact.yaml) or a payload (payload.yaml) with the arm that `calibration=` names."""
+    """Identify a surface or a payload with the model of `calibration=`; write contact.yaml or payload.yaml."""
     robot = make_robot(cfg)
     if key == "presses":
         arm = calibrated_arm(cfg, robot)
@@ -168,7 +168,7 @@ def identify(cfg, overrides):
             run.track("metrics", row)
         run.summary(summary)
         how = {"window_s": cfg.identify.window_s, "cutoff_hz": cfg.identify.cutoff_hz}
-        # after the fits, whose memory peaks: matplotlib and rerun take 70 MB
+        # import only now, after the memory peak of the fits: matplotlib and rerun need 70 MB
         from r2s.reporting.identification.page import identification_page
         from r2s.reporting.identification.tables import identification_table
 
@@ -264,9 +264,9 @@ def fit_group(cfg, run, made, group, earlier, folder):
 
 
 def compared(made, group, found, settings, known_from):
-    """Return tables and summary.json entries on the contribution of each recording and the drift since identify.from.
+    """Return tables and summary.json entries: contribution of each recording, and drift since the run identify.from.
 
-    known_from: text that names the earlier identifications, whose results are `settings.known`.
+    known_from: names of the earlier identifications that provide `settings.known`, for messages.
     """
     from r2s.identification.contributions import contradictions, contributions, validated
     from r2s.identification.known import FAR, block_of, disagreement, drift_table

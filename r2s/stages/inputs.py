@@ -1,4 +1,4 @@
-"""Find the files that a job reads and the run folders that it uses; meta.json records the files' SHA-256."""
+"""Find the files and run folders that a job reads; meta.json records the SHA-256 of the files."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,7 +13,7 @@ PARENTS = (
     "estimate.surface",
     "dr.surface",
 )  # config keys that name a run folder
-FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; files of the package are fixed by the commit
+FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; the commit determines files of the package
 # files of a run folder that another job may read
 READ = (
     *("config.yaml", "overrides.yaml", "policy.yaml", "summary.json", "measures.json", "evaluations.csv"),
@@ -23,10 +23,10 @@ READ = (
 
 
 def parents_of(cfg) -> list[str]:
-    """Return the run folders, or parameter files, that a config names."""
+    """Return the run folders and parameter files that a config names."""
     from omegaconf import OmegaConf
 
-    copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # a resumed run reads these
+    copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # a resumed run reads these copies
     keys = [k for k in PARENTS if not (cfg.resume and k in copies and (Path(cfg.resume) / copies[k]).is_file())]
     return [str(Path(str(value))) for key in keys if (value := OmegaConf.select(cfg, key))]
 

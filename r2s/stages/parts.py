@@ -1,4 +1,4 @@
-"""Make the objects that config nodes describe by `_target_`; errors name settings as the user types them."""
+"""Make the objects that config nodes describe by `_target_`; error messages name settings as the user types them."""
 
 import inspect
 import logging
@@ -9,13 +9,13 @@ from r2s.errors import UserError, nearest
 
 
 def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
-    """Call the class or function that a config node's `_target_` names, and return the result, a part.
+    """Make a part: call the class or function that a config node's `_target_` names, and return the result.
 
     Args:
-        node: config node; its keys are arguments of the target.
+        node: config node whose keys are arguments of the target.
         group: path of the node in the config, for error messages.
-        given: positional arguments of the target, in addition to those in the config.
-        beside: keys of the node that the target does not receive.
+        given: positional arguments of the target; the config contains only keyword arguments.
+        beside: keys of the node that are not passed to the target.
 
     Raises:
         UserError: the target does not exist or refuses these arguments.
@@ -32,7 +32,7 @@ def target(node: Any, group: str) -> Callable[..., Any]:
     path = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(path, str) or not path:
         raise UserError(f"{group}: expected a yaml with _target_ (dotted path of a class or function), got none")
-    logging.getLogger("hydra.utils").disabled = True  # it would print the error a second time
+    logging.getLogger("hydra.utils").disabled = True  # Hydra would print the error a second time
     try:
         return get_object(path)
     except Exception as error:  # the import of a user's module may raise anything
@@ -44,7 +44,7 @@ def target(node: Any, group: str) -> Callable[..., Any]:
 
 
 def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *given: Any) -> Any:
-    """Return the result of make(*given, **settings); errors name settings as the user types them.
+    """Return the result of make(*given, **settings); error messages name settings as the user types them.
 
     Raises:
         UserError: an argument is unknown, missing or of a wrong type, or `make` raises UserError.

@@ -12,7 +12,7 @@ from r2s.stages.data import check_cutoff, read_file
 
 @dataclass(frozen=True)
 class LoadedData:
-    """Recording of the loaded arm, payload declared to the arm's gravity compensation (or None), and files read."""
+    """Recording of the loaded arm, its files, and the payload (or None) that the gravity compensation includes."""
 
     recording: Any
     declared: Any
@@ -23,7 +23,7 @@ def loaded_data(cfg, robot, file, torque=None):
     """Return the `LoadedData` of data.loaded, or None without data.loaded.
 
     Args:
-        file: `FileData` of the config, with the column names. torque: replaces data.torque unless None.
+        file: `FileData` of the config. torque: kind of torque to use instead of data.torque; None: data.torque.
 
     Raises:
         UserError: data.declared_payload or data.contact contradicts data.loaded, or the file is invalid.
@@ -53,10 +53,10 @@ def loaded_data(cfg, robot, file, torque=None):
 def torque_of_calibration(cfg, given):
     """Return the kind of torque from which `calibration=` was identified; loaded recordings need the same kind.
 
-    given: value of data.torque; None: not set.
+    given: value of data.torque, or None if unset.
 
     Raises:
-        UserError: data.torque is another kind of torque.
+        UserError: data.torque differs from the kind of torque of the calibration.
     """
     from r2s.stages.adapter_factory import PARAMETERS, TORQUE
     from r2s.stages.run_config import loaded
@@ -73,7 +73,7 @@ def torque_of_calibration(cfg, given):
 def identify_load(cfg, run, arm, data, label=""):
     """Identify a payload; write payload.yaml and figure, print the tables, return the entry for summary.json.
 
-    label: label of one of several recordings; payload.yaml is then in the folder payload_LABEL.
+    label: label of the recording if there are several; payload.yaml is then in the folder payload_LABEL.
     """
     from r2s.identification.payload.estimate import identify_payload
     from r2s.identification.payload.payload_file import save_payload

@@ -1,4 +1,4 @@
-"""stage=pipeline: identify, train and transfer on one computer; each command of a step has its own run folder.
+"""stage=pipeline: identify, train and transfer on one computer; every command writes its own run folder.
 
 For a task on a surface, the arm presses on the surface before the trainings, and r2s identifies the surface.
 """
@@ -35,8 +35,8 @@ ROWS = {
     ADAPTED: "identified model + adapter",
     REFERENCE: "hybrid control, identified model",
 }
-PATHS = 6  # number of paths on the surface, 8 s each; the last one is for validation
-CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # in transfers only
+PATHS = 6  # number of contact motions on the surface, 8 s each; the last is for validation
+CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # only for transfers
 WHY = {
     "calibration": "it identifies the arm itself",
     "policy": "it trains its policies itself",
@@ -46,13 +46,13 @@ WHY = {
 
 
 def reads(cfg):
-    """Return the config keys that the steps read, except the keys that the pipeline itself sets."""
+    """Return the config keys that the steps of stage=pipeline read, except keys that stage=pipeline sets."""
     keys = {"pipeline", *identify.reads(cfg), *train.reads(cfg), *transfer.reads(cfg)} - {"calibration", "policy"}
     return keys if cfg.pipeline.train_minutes is None else keys - {"budget"}
 
 
 def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
-    """Return the user's overrides that a step reads. step: config of the step."""
+    """Return those of the user's overrides that the command with the config `step` reads."""
     own = ("stage=", "name=", "root=", "threads=", "pipeline.")
     return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
 
@@ -62,7 +62,7 @@ def run_step(words: dict[str, list[str]]) -> None:
 
     Raises:
         UserError: a command failed; the remaining commands are terminated.
-        Stopped: a command's arm stopped; the remaining commands are terminated.
+        Stopped: the arm stopped during a command; the remaining commands are terminated.
     """
     running: dict[str, subprocess.Popen] = {}
     last: dict[str, str] = {}
@@ -107,12 +107,12 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Return groups of commands that run in parallel: the whole step, or single commands if an arm `moves`."""
+    """Return a step's commands in groups to run in parallel: one group, or one per command if an arm `moves`."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
 def command_prefix() -> list[str]:
-    """Return the command line that starts r2s as in this process: from checkout or package, with its --config-dir."""
+    """Return the command that starts r2s again, from the same checkout or package with the same --config-dir."""
     from hydra.core.hydra_config import HydraConfig
 
     program = [str(PACKAGE.parent / "run.py")] if CONF.parent != PACKAGE else ["-m", "r2s"]
@@ -121,17 +121,17 @@ def command_prefix() -> list[str]:
 
 
 def compose_step(words: Sequence[str], option: str) -> Any:
-    """Return the config of a command with the overrides `words`; errors begin with `option`.
+    """Return the config of a command with the overrides `words`; error messages begin with `option`.
 
     Raises:
-        UserError: Hydra refuses the overrides.
+        UserError: Hydra rejects the overrides.
     """
     from hydra import compose
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     try:
-        return replayed(compose("config", list(words)))  # Hydra of this job knows --config-dir
+        return replayed(compose("config", list(words)))  # Hydra already has the --config-dir of this job
     except (HydraException, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split()).removeprefix("In 'config': ")
         reason = reason.split(" Config search path")[0].split(" To append")[0]
@@ -166,10 +166,10 @@ def check_free(root: Path, name: str, cfg: Any) -> None:
 
 
 def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
-    """Return {label: words of a command} for each step: identify, press on a surface of the task, train, transfer.
+    """Return the commands {label: words} of each step: identify the arm, identify a surface, train, transfer.
 
     The trainings on the identified and the nominal model have the same settings, time and computer. With an adapter,
-    the arm's payload, friction and delay change (CHANGES) after the identification, for the transfers only.
+    only the transfers run with changed payload, friction and delay of the arm (CHANGES).
 
     Args:
         cfg: config of the pipeline. name: name of the pipeline's run folder; all other folder names begin with it.
@@ -237,14 +237,14 @@ def surface_words(cfg: Any) -> list[str]:
 
 
 def tool_words(cfg: Any) -> list[str]:
-    """Return overrides that set the task's tool and plane for the presses."""
+    """Return overrides that set the task's tool and plane for the identification of the surface."""
     tool = [f"robot.tool={cfg.task.tool}"] if cfg.robot.get("tool") is None else []
     given = {k: cfg.task[k] for k in ("point", "normal") if cfg.task[k] is not None}
     return tool + [f"data.press_{k}={list(v)}" for k, v in given.items()]
 
 
 def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrides: Sequence[str]) -> None:
-    """Set task.friction to the identified friction in trainings on the identified model, if the task has that key."""
+    """In trainings on the identified model, set task.friction, if the task has this key, to the identified value."""
     from r2s.identification.contact.contact_file import load_contact
 
     if "friction" not in cfg.task or any(o.startswith("task.friction=") for o in overrides):
@@ -254,7 +254,7 @@ def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrid
 
 
 def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
-    """Raise UserError, before the arm moves, if identification or training would refuse an override."""
+    """Raise UserError if identification or training would refuse an override, before the arm moves."""
     first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
     identify.make_parts(compose_step(first["identify"], "stage=identify"))
     train.make_parts(compose_step(trained["nominal"], "stage=train"))  # other trainings need the identified model

@@ -14,7 +14,7 @@ from r2s.stages.run_config import loaded
 class Earlier:
     """An earlier identification: folder, kind of torque, parameter space, values x (P,) and posterior draws (S, P).
 
-    drift: value of identify.drift. given: True for the run that identify.from= names, False for a fit of this run.
+    drift: value of identify.drift. given: True for the run that identify.from= names, False for a fit in this job.
     """
 
     run: str
@@ -26,12 +26,12 @@ class Earlier:
     given: bool = False
 
     def __str__(self):
-        """Return a text that names the source in messages."""
+        """Return the name of this identification for messages."""
         return self.run if self.given else f"{self.torque} torque"
 
     @property
     def arm(self):
-        """The identified dynamics; an estimated payload is removed, because r2s will estimate it again."""
+        """The identified dynamics without an estimated payload, because r2s estimates the payload again."""
         x = self.x.copy()
         if "payload_mass" in self.space.blocks:
             x[self.space.where("payload_mass")] = 0.0
@@ -39,7 +39,7 @@ class Earlier:
 
 
 def earlier_run(cfg, robot):
-    """Return the `Earlier` of identify.from=, or None.
+    """Return the identification of identify.from= as an `Earlier`, or None if unset.
 
     Raises:
         UserError: the run has no identification of this robot, or calibration= is also set.
@@ -59,12 +59,12 @@ def earlier_run(cfg, robot):
 
 
 def make_settings(cfg, torque, earlier=(), last=True):
-    """Return the `Settings` of an identification from this kind of torque.
+    """Return the `Settings` of an identification from torque of the kind `torque`.
 
     Args:
-        earlier: list of `Earlier`. A fit with another kind of torque provides links and payload. A fit with the
-            same kind provides all values, friction family and terms, so that both identifications share a model.
-        last: whether this is the last kind of torque. Earlier kinds use only stated values of links and payload.
+        earlier: list of `Earlier`, whose links and payload enter the prior. An `Earlier` with the same kind of torque
+            also provides all other values, friction family and terms, so that both identifications share a model.
+        last: whether r2s fits this kind of torque last; earlier fits use only the stated values of links and payload.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings
@@ -117,7 +117,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the initial dynamics of a fit: `earlier`, or `nominal` with its links if the kinds of torque differ."""
+    """Return the start of a fit: `earlier.arm`, or if the kinds of torque differ `nominal` with the earlier links."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -1,7 +1,7 @@
 """Find and read the recordings of stage=identify and `r2s check`: one or several files, each with a kind of torque.
 
 `data.path` and `data.validation` each name a file, a pattern such as "logs/*.csv", a dict such as
-{path: FILE, torque: motor}, or a list of these. The keys of a dict override those of `data`.
+{path: FILE, torque: motor}, or a list of these. The keys of such a dict override the settings in `data`.
 """
 
 import glob
@@ -18,14 +18,14 @@ from r2s.stages.parts import plain
 
 OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints", "payload")
 FIND = "find"  # value of `payload` for a recording whose payload is to be identified
-ORDER = ("measured", "motor", "commanded")  # order of fits; the last fit has the friction that a command overcomes
+ORDER = ("measured", "motor", "commanded")  # order of fits; the last identifies the friction that a command overcomes
 
 
 @dataclass(frozen=True)
 class Group:
     """Recordings with one kind of torque; `train` and `validation` are {label: recording}.
 
-    loaded: recordings with a payload that is to be identified.
+    loaded: {label: recording} of the arm with an unknown payload, which r2s identifies.
     """
 
     torque: str
@@ -72,7 +72,7 @@ def _matching(where: str, path: str) -> Iterator[str]:
 
 
 def of_one_reader(files):
-    """Return the files; if the first is a bag, files of other formats lose its settings `topic` and `joints`."""
+    """Return the files; if the first is a bag, unset `topic` and `joints` of all files that are no bags."""
     from r2s.recordings.readers import is_bag
 
     if not is_bag(Path(files[0].path)):
@@ -87,11 +87,11 @@ def labels_of(files):
 
 
 def read_groups(robot, files, validation, share, cutoff_hz):
-    """Read the recordings; return one `Group` per kind of torque, in the order ORDER of the fits.
+    """Read the recordings; return one `Group` per kind of torque, in the order in which r2s fits the groups.
 
     Args:
-        files, validation: `FileData` of each file. share: part at the end of each recording, or of every period, that
-            r2s holds out if `validation` is empty. cutoff_hz: see `without_payload`.
+        files, validation: `FileData` of each file. share: share of each recording, or of every period, that r2s holds
+            out at the end if `validation` is empty. cutoff_hz: Hz, cut-off frequency for `without_payload`.
     """
     made: dict[str, Group] = {}
 
@@ -132,7 +132,7 @@ def read_groups(robot, files, validation, share, cutoff_hz):
 
 
 def _read(robot, file, several, cutoff_hz):
-    """Return a checked recording without the torque of a known payload. several: whether errors name the file."""
+    """Return a checked recording without the torque of a known payload; if `several`, errors name the file."""
     from r2s.identification.checks import check_recording
     from r2s.identification.payload.unloaded import without_payload
     from r2s.physics.payload import payload_of

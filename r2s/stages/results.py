@@ -21,14 +21,14 @@ CLONE = "checkout"  # name of the clone in the run folder
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads, except the commands of other pages."""
+    """Return the config keys that stage=results reads: of `results.pages`, only the commands of one page."""
     return {"results.page", "results.data", f"results.pages.{cfg.results.page}"}
 
 
 def commands_of(settings):
-    """Return the commands (lists of words) that make the page `results.page` from the folder `results.data`.
+    """Return the commands, as lists of words, that produce the page `results.page` from the folder `results.data`.
 
-    A command is `make ...` or consists of arguments for python.
+    A command begins with `make`, or consists of arguments for python.
 
     Raises:
         UserError: the page does not exist, r2s is not a checkout, or the data for the page are missing.
@@ -78,8 +78,8 @@ def results(cfg, overrides):
 def cloned(clone, paths):
     """Clone this commit unless the clone exists; return {page: committed text, or ""} and the hash of the commit.
 
-    The clone's pages have tables without rows, so that a table stays empty if no command writes it. An incomplete
-    clone has a temporary name.
+    In the clone's pages, all tables lose their rows, so that a table that no command writes stays empty. The clone
+    has a temporary name until it is complete.
     """
     from r2s.reporting.page_comparison import without_rows
 
@@ -100,7 +100,7 @@ def cloned(clone, paths):
 
 
 def execute(words, clone, log):
-    """Run `python WORDS`, or WORDS if they begin with make, with the clone's r2s; append the output to `log`.
+    """Run `python WORDS`, or WORDS if they begin with make, in the clone; append the output to the file `log`.
 
     Raises:
         UserError: the command fails; the message quotes the last line of output.

@@ -1,4 +1,4 @@
-"""Read config.yaml of a run folder safely: anybody may have written it, so r2s refuses unknown parts."""
+"""Read config.yaml of a run folder safely: r2s refuses code that is neither part of r2s nor trusted by the user."""
 
 import os
 import re
@@ -39,7 +39,7 @@ def modules(trust) -> list[str]:
     """Return the module names in the option `trust=`: a name, comma-separated names, a list, or None.
 
     Raises:
-        UserError: the option has another type.
+        UserError: the option is neither a string, nor a list of strings, nor None.
     """
     names = trust.strip("[]").split(",") if isinstance(trust, str) else trust
     if names is None:
@@ -67,13 +67,13 @@ def checked(cfg, where, trust=None):
     """Return a run folder's config with resolved interpolations; raise UserError for untrusted code.
 
     r2s calls every part (`_target_`) that a config names. So conf/ must name the same part in the same group, or a
-    module in `trust` must define the part. Resolvers can read the environment, so r2s treats them as parts of `oc`.
+    module in `trust` must define the part. Resolvers can read the environment, so they need `oc` in `trust`.
 
     Args:
-        where: file name for errors. trust: value of `trust=`, see `modules`; replaces the config's `trust`.
+        where: file name for error messages. trust: value of `trust=` (`modules`), instead of the config's `trust`.
 
     Raises:
-        UserError: the config names an untrusted part, which r2s has neither imported nor called.
+        UserError: the config names untrusted code, which r2s has neither imported nor called.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -111,7 +111,7 @@ def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...],
 
 
 def _is_own(key, value) -> bool:
-    """Return whether a setting is no dotted path of a part, or is a part that conf/ names in the same group."""
+    """Return whether a setting names no code, or only a part that conf/ names in the same group."""
     if key == ("friction", "family"):
         return "." not in str(value)
     if key[-1:] != ("_target_",):
@@ -121,7 +121,7 @@ def _is_own(key, value) -> bool:
 
 
 def _is_defined_in(key, value, trusted) -> bool:
-    """Return whether a trusted module defines the part at a dotted path; merely importing the part is not enough."""
+    """Return whether a trusted module defines the part at a dotted path, rather than only importing it."""
     head = str(value).split(".")[0]
     if head not in trusted or key[-1] != "_target_":
         return head in trusted

@@ -41,20 +41,20 @@ UPDATE_THREADS = 4  # largest number of threads for updates; networks of 128 uni
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads."""
+    """Return the config keys that stage=train reads."""
     keys = {"robot", "dr", "algo", "task", "control", "safety", "evaluation.episodes", "calibration"}
     if not cfg.calibration:
         keys |= {"friction", "inertia"}
-    if "n_envs" in cfg.algo:  # an algorithm that learns
+    if "n_envs" in cfg.algo:  # the algorithm learns
         keys |= {"budget", "reward", "costs", "evaluation", "compile", "matmul", "device"}
     return keys
 
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a training. r2s makes them before the run folder, so that a config error creates no folder.
+    """The parts of a training, made before the run folder, so that a config error creates no folder.
 
-    For a controller without learning, only the first five attributes are set, and `algo` is the controller.
+    For a controller without learning, `algo` is the controller, and `env` and all later attributes are None.
     """
 
     robot: Any
@@ -121,7 +121,7 @@ def check_length(budget, loop, n_envs, key):
 
 
 class Selection:
-    """The best and the last evaluation of a training. Of evaluations with equal scores, the latest is the best."""
+    """The best and the last evaluation of a training; of equal scores, the latest is the best."""
 
     def __init__(self, task):
         self._task, self.best, self.last = task, {}, {}
@@ -199,7 +199,7 @@ def share_threads(cfg):
 
 
 def split_algo(cfg):
-    """Return settings of conf/algo: number of arms, env steps of demonstrations, `Loop`, algorithm arguments."""
+    """Return the settings of conf/algo: number of arms, env steps of demonstrations, `Loop`, algorithm arguments."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
@@ -214,7 +214,7 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config; a resumed training reads the copies of models in its run folder: originals may be gone."""
+    """Return the config; a resumed training reads its own copies of the models, because the originals may be gone."""
     if not cfg.resume:
         return cfg
     model = cfg.copy()
@@ -228,7 +228,7 @@ def with_own_calibration(cfg):
 
 
 def keep_calibration(cfg, folder):
-    """Copy identified parameters and surface into the run folder, so that a transfer needs no other run folder."""
+    """Copy identified parameters and surface into the run folder, so that a transfer needs only this folder."""
     import shutil
 
     from r2s.files import atomic_write
@@ -252,7 +252,7 @@ def title(cfg):
 
 
 def evaluate_reference(cfg, overrides, parts):
-    """Evaluate a controller, which needs no training, in the same way as a trained policy."""
+    """Evaluate a controller without training, in the same way as a trained policy."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures

@@ -36,14 +36,14 @@ WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trai
 
 
 def reads(cfg):
-    """Return the config keys that this stage reads."""
+    """Return the config keys that stage=transfer reads."""
     return {"policy", "simulator", "arm", "adapt", "safety", "evaluation.episodes"}
 
 
 def trained_config(cfg, option="policy"):
-    """Return the run folder `policy=` and its config; errors begin with `option`.
+    """Return the run folder `policy=` and its config; error messages begin with `option`.
 
-    The config names the run folder's own copies of calibration and surface, so that no other folder is needed.
+    The config names the copies of calibration and surface in this run folder, so that no other folder is needed.
 
     Raises:
         UserError: the folder contains no finished training.
@@ -66,12 +66,12 @@ def trained_config(cfg, option="policy"):
 
 @dataclass(frozen=True)
 class Request:
-    """A policy, and the episodes in which it runs in every simulator and on the arm.
+    """A policy, and the start postures and goals of its episodes in every simulator and on the arm.
 
     Attributes:
         robot, task: robot and task of the training. center: center of the training's randomization.
-        source: run folder of the training. policy: trained policy or controller. starts, goals: a row per episode.
-        draw: randomization of the training; None with simulator=none. soft_start_s: soft start of the arm, s.
+        source: run folder of the training. policy: trained policy or controller. starts, goals: one per episode.
+        draw: randomization of the training; None for simulator=none. soft_start_s: s, duration of the soft start.
     """
 
     robot: Any
@@ -86,7 +86,7 @@ class Request:
 
 
 def make_request(cfg):
-    """Return the `Request`; with an arm, check first that a safe path leads to every start posture.
+    """Return the `Request`; for a transfer to an arm, first check that the arm can safely reach each start posture.
 
     Raises:
         UserError: the training is unfinished, simulator and arm are none, the arm is unsuitable, or a path is unsafe.
@@ -163,10 +163,10 @@ class ArmResult:
     """Result of running the episodes on an arm.
 
     Attributes:
-        tried: (k,) indices of the goals whose episodes began. episodes: these k episodes; None if k = 0.
+        tried: (k,) indices of the goals whose episodes began. episodes: the k episodes that began; None if k = 0.
         stops: stops that ended episodes early. timing: durations of the 1 kHz cycles; None if unknown.
         halted: reason why the remaining episodes did not run; None: all episodes ran.
-        blocked: reason of a stop in the last episode that the operator has to confirm; None: no such stop.
+        blocked: reason of the last episode's stop if the operator has to confirm this stop, else None.
     """
 
     tried: Any = ()
@@ -178,7 +178,7 @@ class ArmResult:
 
 
 def run_on_arm(cfg, request, runner, predicted):
-    """Run the episodes without a predicted collision or near collision; return the `ArmResult`."""
+    """Run the episodes for which no collision or near collision is predicted; return the `ArmResult`."""
     import numpy as np
 
     from r2s.physics.collision import CollisionCheck
@@ -234,7 +234,7 @@ def predict(cfg, request, robot):
 def save_arm_result(run, request, name, result, predicted):
     """Write stops.txt, timing.csv and episodes_<arm>.csv with a row per episode; return the measures on the arm.
 
-    predicted: episodes of the model, for a comparison with those of the arm; None: no comparison.
+    predicted: episodes that the model predicted, to compare with the arm's episodes; None: no comparison.
     """
     import pandas as pd
 
@@ -254,9 +254,9 @@ def save_arm_result(run, request, name, result, predicted):
 
 
 def rest_warning(rows, name):
-    """Return a warning if fewer episodes than predicted end at rest on the arm, else None.
+    """Return a warning if fewer episodes end at rest on the arm than predicted, else None.
 
-    A policy that shakes the joints hardly moves the end effector. So success and path gap do not reveal the shaking
+    A policy that shakes the joints hardly moves the end effector, so success and path gap do not reveal the shaking
     (benchmarks/results/transfer.md).
     """
     seen, expected = (rows.get(k, {}).get("rest") for k in (name, "predicted"))
@@ -287,7 +287,7 @@ def transfer(cfg, overrides):
     with opened as runner, open_run(cfg, overrides, parents=[str(request.source)]) as run:
         shutil.copyfile(request.source / "config.yaml", run.folder / "policy.yaml")
         write_measures(run.folder, task.measure_table)
-        if twin:  # first, because this forks processes, and a fork must precede any thread
+        if twin:  # before any thread starts, because the twins run in forked processes
             result = run_on_twins(cfg, request, open_runner)
         if request.draw is not None:
             rows, episodes = run_in_simulators(cfg, request, engine)

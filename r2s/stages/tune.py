@@ -23,12 +23,12 @@ from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 MOST_STARTS = 3  # attempts to start a training that the system ends, for example because memory is short
 POLL_S = 0.2
 STOP_S = 20.0  # s, time for a training to end after each signal; a step or an evaluation takes less
-EDGE = 0.05  # share of a range at each end; a value in this share is at an edge
+EDGE = 0.05  # share of a range at each end in which a value is at an edge
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 
 def reads(cfg):
-    """Return the config keys that this stage and its trainings read."""
+    """Return the config keys that stage=tune and its trainings read."""
     return {"tune", *train.reads(cfg)}
 
 
@@ -37,11 +37,11 @@ class Tune:
     """Settings of the config group `tune`.
 
     Attributes:
-        trials: total number of trials. workers: number of parallel trainings, one thread each; None: `threads`.
+        trials: total number of trials. workers: number of parallel trainings with one thread each; None: `threads`.
         startup: number of random trials before TPE and the pruner start.
         measure: key of the task's measure to optimize, in the last evaluation of each training.
         space: {option: list of values, or a range for `parse_range`}.
-        against: pattern of run folders of trainings for comparison, for example a grid; None: no comparison.
+        against: pattern of the run folders of trainings to compare with, such as a grid; None: no comparison.
 
     Raises:
         UserError: a number is outside its range, the space is invalid, or the pattern matches nothing.
@@ -74,7 +74,7 @@ def parse_range(key: str, axis: Any) -> tuple[float, float, bool]:
     """Return (low, high, whether logarithmic) of a range such as "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
 
     Raises:
-        UserError: the text describes no such range.
+        UserError: the text `axis` does not describe a range.
     """
     found = re.fullmatch(r"(log|interval)\(([^,]+),([^,]+)\)", str(axis).replace(" ", ""))
     try:
@@ -125,7 +125,7 @@ def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
 
 
 def training_words(cfg, overrides, settings):
-    """Return a training's overrides: the typed ones that a training reads, and `settings` {option: value}."""
+    """Return a training's overrides: `settings` {option: value}, and the user's overrides that stage=train reads."""
     step = cfg.copy()
     step.stage = "train"
     typed = [o for o in overrides_for(overrides, step) if not o.startswith(("resume=", "skip_completed="))]
@@ -147,7 +147,7 @@ def check_trainings(cfg, overrides, space):
 
 
 def logged_measures(parts):
-    """Return {key: Measure} of the measures that a training logs, which a short evaluation determines."""
+    """Return {key: Measure} for the measures that a training logs, found by a short evaluation."""
     import torch
 
     from r2s.learning.evaluate import make_evaluation
@@ -159,9 +159,9 @@ def logged_measures(parts):
 
 
 class TrialRun:
-    """The training of an Optuna trial: a run folder of stage=train, and the process that writes in the folder.
+    """The training of an Optuna trial: a run folder of stage=train, and the process that writes in this folder.
 
-    A training may outlive a killed stage=tune. While such a training runs in the folder, no second training starts.
+    A training may outlive a killed stage=tune. While a training writes in the folder, no second training starts.
 
     Args:
         trial: Optuna's trial. folder: run folder. words: command that starts the training. log: file for stderr.
@@ -183,7 +183,7 @@ class TrialRun:
     def stop(self) -> None:
         """End the training as Ctrl-C does, so that the status in its run folder becomes stopped.
 
-        Background processes of a shell ignore SIGINT. If the training still runs, SIGTERM and SIGKILL follow.
+        Background processes of a shell ignore SIGINT; a training that does not end receives SIGTERM, then SIGKILL.
         """
         if self._process is None:
             return
@@ -196,7 +196,7 @@ class TrialRun:
                 continue
 
     def status(self) -> str:
-        """Return started (by this process), left (in another process), none, or the status in the run folder."""
+        """Return started (by this process), left (by an earlier stage=tune), none, or the status in meta.json."""
         from r2s.runs import is_locked, read_meta
 
         if self._process is not None and self._process.poll() is None:
@@ -278,13 +278,13 @@ def search(study: Any, how: Tune, make: Callable[[Any], TrialRun], workers: int)
 
 
 def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize", "maximize"]) -> Any:
-    """Return the Optuna study from study.db in a run folder; a resumed search draws with another seed."""
+    """Return the Optuna study from study.db in a run folder; a resumed search samples with a new random seed."""
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     storage = f"sqlite:///{run.folder / 'study.db'}"
     study = optuna.create_study(study_name="tune", storage=storage, direction=direction, load_if_exists=True)
-    # study.db stores the drawn settings, but not the state of the random generator
+    # study.db stores the sampled settings, but not the state of the random generator
     study.sampler = optuna.samplers.TPESampler(
         seed=(seed + 1000 * len(study.trials)) % 2**32, n_startup_trials=startup
     )
@@ -337,7 +337,7 @@ def tune(cfg, overrides):
 
 
 def make_trial(cfg, overrides, run, space, trial):
-    """Return the `TrialRun` of an Optuna trial, with the settings that Optuna suggests for this trial."""
+    """Return the `TrialRun` of an Optuna trial with the settings that Optuna suggests."""
     name = f"{run.folder.name}_{trial.number}"
     words = training_words(cfg, overrides, suggest(trial, space))
     words += [f"root={cfg.root}", f"name={name}", "skip_completed=true"]

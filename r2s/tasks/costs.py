@@ -1,10 +1,10 @@
 """Costs that a training limits in addition to the reward, with one adaptive Lagrange multiplier per cost.
 
 A training maximizes the mean reward r subject to mean costs c_k <= d_k (constrained Markov decision process, Altman
-1999). The policy maximizes r - sum_k lambda_k c_k / d_k. The rate of lambda_k is proportional to c_k / d_k - 1, and
-lambda_k stays at or above 0 (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization, ICLR 2019). The
-replay buffer stores the costs in their units, and each update multiplies the costs by the current -lambda_k / d_k. So
-costs need no separate critic, and stored transitions stay valid. The means c_k include all training steps.
+1999). The policy maximizes r - sum_k lambda_k c_k / d_k, where the rate of the multiplier lambda_k is proportional to
+c_k / d_k - 1, and lambda_k is never negative (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization,
+ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies by the current -lambda_k / d_k. So
+stored transitions stay valid, and costs need no separate critic. The means c_k include all training steps.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ from r2s.tasks.task import State
 
 MARGIN_RAD = 0.1  # rad, distance from a position limit at which the safety filter starts to fade the torque
 PATIENCE = 50_000  # env steps in which a multiplier grows by 1 while its cost is twice the limit; see rewards.py
-MOST = 50.0  # largest multiplier; without it, a limit that no policy can meet would dominate the reward
+MOST = 50.0  # largest multiplier; if unlimited, a cost limit that no policy can meet would dominate the reward
 
 
 def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
@@ -30,7 +30,7 @@ def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np
 
 
 def impact_speed(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
-    """Return (m,) m/s, the speed of the tip into the surface during contact, else 0."""
+    """Return (m,) m/s, the speed of the tip into the surface, or 0 without contact."""
     inwards = -(task.tip_velocity(state) * task.normals(goals)).sum(1)
     return np.where(task.forces(state, goals)[:, 0] > TOUCH_N, inwards.clip(0.0), 0.0)
 
@@ -49,7 +49,7 @@ COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {
 
 
 class ConstrainedReward(Reward):
-    """A reward with costs: the terms of `reward`, then the costs in their units with the weights -lambda / limit.
+    """A reward with costs: its terms are those of `reward`, then the costs with the weights -lambda / limit.
 
     Args:
         reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost, in its unit}.
@@ -91,13 +91,13 @@ class ConstrainedReward(Reward):
         return distance, np.column_stack([terms, *costs])
 
     def weights(self, task: Any, progress: float, factor: Any = None) -> np.ndarray:
-        """Return the weights (k,) of reward terms and costs; argument and attribute `factor` have the same shape."""
+        """Return the weights (k,) of reward terms and costs; for `factor`, see the attribute of the same name."""
         factor = self.factor if factor is None else factor
         return np.array([*self._reward.weights(task, progress, factor[0]), *(-factor[1:] / self._limits)])
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> np.ndarray:
-        """Return the new `factor` after `env_steps` env steps in which terms and costs had the means `seen` (k,)."""
+        """Return the new `factor`; seen: (k,), means of terms and costs over the last `env_steps` env steps."""
         own = len(seen) - len(self._names)
-        beyond = seen[own:] / self._limits - 1.0  # not clipped: otherwise rare large costs would hardly matter
+        beyond = seen[own:] / self._limits - 1.0  # not clipped: clipping would make rare large costs irrelevant
         multipliers = (factor[1:] + beyond * env_steps / PATIENCE).clip(0.0, MOST)
         return np.array([self._reward.adapt(factor[0], progress, seen[:own], env_steps), *multipliers])

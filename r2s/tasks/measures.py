@@ -1,7 +1,7 @@
 """Descriptions of a task's measures: key, unit, which direction is better, and how tables and figures show them.
 
-Each task class has a `measure_table`. Training and transfer write this table into their run folder as measures.json,
-so that tables, pages and comparisons of run folders do not need the task's class.
+Each task class has a `measure_table`, which training and transfer write to measures.json in their run folder, so that
+tables, pages and comparisons of run folders do not need the task's class.
 """
 
 import json
@@ -22,9 +22,9 @@ class Measure:
     """One measure of a policy's episodes, a column of evaluations.csv.
 
     Attributes:
-        key: column of evaluations.csv. short: column heading of a table. title: name in figures and sentences.
-        unit: unit of the shown value, "" if dimensionless. scale: shown value / stored value.
-        digits: decimals shown. lower_is_better: whether lower values are better.
+        key: column of evaluations.csv. short: name in table headings. title: name in figures and sentences.
+        unit: unit for display, "" if dimensionless. scale: displayed value divided by the stored value.
+        digits: number of displayed decimals. lower_is_better: whether lower values are better.
         root_mean_square: whether several values are averaged as the root of their mean square.
     """
 
@@ -39,12 +39,12 @@ class Measure:
 
     @property
     def column(self) -> str:
-        """Short name and unit, for a table."""
+        """Heading of the measure's column in a table: short name and unit."""
         return f"{self.short}, {self.unit}" if self.unit else self.short
 
     @property
     def heading(self) -> str:
-        """Title and unit, for a figure."""
+        """Label of the measure in a figure: title and unit."""
         return f"{self.title}, {self.unit}" if self.unit else self.title
 
     @property
@@ -80,18 +80,18 @@ class MeasureTable:
     """The measures of a task, and the keys of the measures that each table and figure shows.
 
     Attributes:
-        measures: the measures of the task itself; the measures COMMON are always added.
-        selection: measures that compare trainings. Rows must have the first; the last ranks groups of trainings.
-        rows: columns of the table with a row per simulator and arm.
-        comparison: columns of the table of trainings. curves: panels of the figure with learning curves.
-        scores: panels of the figure of scores.
+        measures: the task's own measures, to which r2s adds the measures COMMON.
+        selection: measures that compare trainings; every row must contain the first, and the last ranks trainings.
+        rows: columns of the table that has a row for each simulator and arm; by default all `measures`.
+        comparison: columns of the table of trainings. curves: panels of the figure of learning curves.
+        scores: panels of the figure that compares the scores of trainings.
         transfer: measures that compare adapters episode by episode in transfers to an arm.
-        diagnostics: columns of a transfer's second table.
-        corner: heading of the column with the row labels. description: what a policy does, in one sentence.
-        error: name, unit and scale of `Episodes.distance`. error_levels: lines in the error's figure, in its unit.
+        diagnostics: columns of a transfer's second table; by default COMMON.
+        corner: heading of the column of row labels. description: sentence that describes what a policy does.
+        error: name, unit and scale of `Episodes.distance`. error_levels: reference values in the figure of the error.
         reward: name of `Episodes.reward`.
 
-    An empty `rows` means all `measures`, an empty `diagnostics` COMMON, any other empty list `selection`.
+    By default, `comparison`, `curves`, `scores` and `transfer` contain the measures `selection`.
     """
 
     measures: tuple[Measure, ...]
@@ -122,14 +122,14 @@ class MeasureTable:
 
     @property
     def known(self) -> dict[str, Measure]:
-        """{key: Measure} of all measures, COMMON included."""
+        """{key: Measure} of the task's own measures and of the measures COMMON."""
         return {m.key: m for m in (*COMMON, *self.measures)}
 
     def __getitem__(self, key: str) -> Measure:
         return self.known[key]
 
     def in_words(self, row: Mapping[str, Any]) -> list[str]:
-        """Return texts on the measures of `selection` in the row, such as ["success at 1 cm 98 %", ...]."""
+        """Return a text for each measure in `selection` that `row` contains, such as "success at 1 cm 98 %"."""
         return [self[key].in_words(float(row[key])) for key in self.selection if row.get(key) not in (None, "")]
 
 

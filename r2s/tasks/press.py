@@ -17,7 +17,7 @@ from r2s.tasks.surface_task import FAR_N, FINE_N, HARD_N, NORMAL, SurfaceTask, n
 from r2s.tasks.task import Episodes, State
 
 LEAST_STEP = 0.2  # smallest force step, as a share of the range `force`
-REVERSAL_S = 0.2  # s, duration of the friction feedforward's reversal after a force step down
+REVERSAL_S = 0.2  # s, time in which the friction feedforward reverses after a downward force step
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class PressTask(SurfaceTask):
         check_number("task.episode_s", self.episode_s, f"[{self.step_s + WINDOW_S:g}, 60]")
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task with the model of one arm; see `SurfaceTask.with_model`."""
+        """Return the task with the model `dynamics` of one arm, and with `creep`; see `SurfaceTask.with_model`."""
         task = super().with_model(robot, dynamics)
         jacobian, mobility = Tip(robot)(robot.q_home)[1], np.linalg.inv(task.model.mass(robot.q_home[None])[0])  # type: ignore[union-attr]
         moves = np.linalg.solve(jacobian @ mobility @ jacobian.T, jacobian @ mobility).T @ self.plane(robot)[1]
@@ -58,7 +58,7 @@ class PressTask(SurfaceTask):
         return away * np.array([[np.cos(about), np.sin(about)]]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return two forces, N, ~ U(force), which differ by at least LEAST_STEP times the width of `force`."""
+        """Return two forces ~ U(force), N, that differ by at least LEAST_STEP times the width of this range."""
         low, high = self.force
         first = rng.uniform(low, high)
         second = first
@@ -71,18 +71,18 @@ class PressTask(SurfaceTask):
         return self.at(np.zeros(len(goals)), goals)
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force, N, for hybrid control at t (m,) s; the step has the slope `force_rate`."""
+        """Return (m, 4), normal and force, N, for hybrid control at t (m,) s; the force changes at `force_rate`."""
         first, second = goals[:, 6], goals[:, 7]
         moved = (self.force_rate * (t - self.step_s)).clip(0.0)
         force = first + np.sign(second - first) * np.minimum(moved, np.abs(second - first))
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of an impedance: position, m, and a velocity, m/s, for the friction feedforward.
+        """Return the target (m, 6) of impedance control: position, m, and velocity, m/s.
 
-        The target position moves against the normal through the nominal plane, so deep that the spring exerts the
-        larger of the two forces even on a surface at the lowest allowed position. Only the friction feedforward uses
-        the target velocity, as the expected direction of motion, which is along the normal after a force step down,
+        The target position moves through the nominal plane, against the normal, until the spring would exert the
+        larger of the two forces even on a surface at the lowest allowed position. The target velocity only gives the
+        friction feedforward the expected direction of motion, which is along the normal after a downward force step,
         and against the normal otherwise.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
@@ -99,8 +99,8 @@ class PressTask(SurfaceTask):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the force error (m,) N, and the reward terms (m, 5).
 
-        Terms: force = -tanh(error / 5 N), precision = `near`(error, 5 N, 0.5 N), excess = -tanh(excess force / 10 N),
-        smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2), filter_penalty = -`State.limited`.
+        Terms: force = -tanh(error / 5 N); precision = `near`(error, 5 N, 0.5 N); excess = -tanh(excess force / 10 N);
+        smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty = -`State.limited`.
         """
         beyond = -np.diff(self.forces(state, goals))[:, 0]
         error, excess = np.abs(beyond), np.tanh(beyond.clip(0.0) / HARD_N)

@@ -5,7 +5,7 @@ import numpy as np
 from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.task import Episodes
 
-WINDOW_S = 1.0  # s, windows of the RMS force error: before the force step, and before the end
+WINDOW_S = 1.0  # s, the RMS force error is measured in this time before the force step and before the end
 IMPACT_S = 0.1  # s, duration of the impact, which begins at the first touch
 TOUCH_N = 0.5  # N, force above which the tip is in contact
 GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # limits of success: RMSE N in each window; overshoot N or share
@@ -39,13 +39,13 @@ PRESS = MeasureTable(
 
 
 def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv.
+    """Return the measures of task press, one row of evaluations.csv.
 
     force_rmse_first_N, force_rmse_last_N: RMS force error in the second before the force step, and the last second.
     overshoot_N: largest excess over the new force in the direction of the force step. overshoot_share: overshoot_N
     divided by the force step. impact_N: largest force within IMPACT_S of the first touch. contact: share of the time
-    after the first touch with contact. These measures average the episodes that were not stopped. success: share of
-    all episodes without a stop, with both RMS errors within GOOD_N and the overshoot within OVER_N or OVER_SHARE.
+    after the first touch in which the tip touches. Episodes with a stop enter only the measure success, the share of
+    all episodes without a stop, with both RMS errors <= GOOD_N, and with an overshoot within OVER_N or OVER_SHARE.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]
@@ -71,7 +71,7 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
 
 
 def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> tuple[float, ...]:
-    """Return an episode's RMSE N before the step and in the last second, overshoot N and share, impact N, contact."""
+    """Return six measures of one episode: both RMS errors, overshoot N and share, impact N, share in contact."""
     window = round(WINDOW_S * ctrl_hz)
     error, change = force - asked, asked[-1] - asked[0]
     rmse = [float(np.sqrt((error[part] ** 2).mean())) for part in (slice(step - window, step), slice(-window, None))]
@@ -80,7 +80,7 @@ def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> 
 
 
 def impact_of(force: np.ndarray, ctrl_hz: int) -> tuple[float, float]:
-    """Return the peak of `force` (T,) N within IMPACT_S of the first touch, and then the share of time in contact."""
+    """Return the peak force N within IMPACT_S of the first touch, and the share of contact after the first touch."""
     touched = np.flatnonzero(force > TOUCH_N)
     if not len(touched):
         return 0.0, 0.0

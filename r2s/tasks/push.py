@@ -1,7 +1,7 @@
-"""Task push: push a box of unknown mass and friction to a pose on its table.
+"""Task push: push a box of unknown mass and friction to a pose on the table.
 
-The table and the size of the box are known. Observations contain the pose of the box with `pose_noise`, as a camera
-measures it. Mass and friction of the box are part of the dynamics (`dr=box`, `arm.surface`), not of an observation.
+The table and the size of the box are given. Observations contain the pose of the box with `pose_noise`, as from a
+camera, but not the mass and friction of the box, which are part of the dynamics (`dr=box`, `arm.surface`).
 """
 
 from collections.abc import Mapping
@@ -62,13 +62,13 @@ class PushTask(TipTask):
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         size: (3,) m, edges of the box. away: (low, high) m, distance of a goal from the box's nominal position.
         bearing: degrees, goals lie within +- this angle of straight ahead. goal_yaw: degrees, largest yaw of a goal.
-        spread: m, first_yaw: degrees, largest deviation of the box's start pose from nominal; used by `dr=box`.
+        spread, first_yaw: m and degrees, largest deviation of the box's start pose from nominal, for `dr=box`.
         pose_noise: m and degrees, standard deviation of the perceived pose in simulation.
-        point, normal: nominal position of the box on its table, m, and normal of the table; None: see `table_frame`.
-        displacement: m, by which an action of 1 shifts the tip's target under the default controller.
+        point, normal: nominal position of the box on the table, m, and the table's normal; None: see `table_frame`.
+        displacement: m, distance by which an action of 1 shifts the tip's target in the default controller.
         tool, pool: see `SurfaceTask`. torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
-        tip_radius, frame, own, parameters: radius of the tip, m, frame of the table, default controller and its
-            parameters, all set by `with_model`.
+        tip_radius, frame: radius of the tip, m, and frame of the table. own, parameters: default controller and its
+            parameters. `with_model` sets these four attributes.
     """
 
     ctrl_hz: int = 25
@@ -145,7 +145,7 @@ class PushTask(TipTask):
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(k,), the weights of the reward terms."""
+        """Weights (k,) of the reward terms, in the order of `reward_terms`."""
         return np.array(list(WEIGHTS.values()))
 
     @property
@@ -155,7 +155,7 @@ class PushTask(TipTask):
 
     @property
     def table(self) -> TableFrame:
-        """The frame of the table."""
+        """The frame of the table on which the box stands."""
         return self.of_model("frame")
 
     @property
@@ -176,10 +176,10 @@ class PushTask(TipTask):
         return goals[:, START : START + starts.shape[1]]
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return random goals (count, 6 + n); the class describes a goal.
+        """Return random goals (count, 6 + n); the class docstring describes a goal.
 
-        A goal has distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts at
-        a distance BEHIND from the rearmost possible corner of a box, shifted sideways by U(-half edge, half edge).
+        A goal has distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts
+        BEHIND m behind the rearmost possible corner of the box, with a random sideways shift of up to half an edge.
 
         Raises:
             UserError: the tip cannot reach its start position, or the far side of the box at its goal.
@@ -250,7 +250,7 @@ class PushTask(TipTask):
         return np.concatenate(rows, axis=1, dtype=np.float32)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the magnitude of the force on the box, and zeros, because the task requests no force."""
+        """Return (m, 2) N: the magnitude of the force on the box, and 0, because the task requests no force."""
         none = np.zeros(len(goals))
         return np.stack([none if state.force is None else np.linalg.norm(state.force, axis=1), none], 1)
 
@@ -266,9 +266,9 @@ class PushTask(TipTask):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance d (m,) m of the box from its goal, and the reward terms (m, 7).
 
-        Terms with the yaw error e: distance = -tanh(d / 10 cm), yaw = -tanh(|e| / 0.5 rad), precision =
-        `near`(d, 10 cm, 3 cm) `near`(|e|, 0.5 rad, 10 degrees), gap = -tanh(distance of the tip from the box / 5 cm),
-        height = -tanh(height error of the tip / 2 cm), smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2),
+        Terms, with the yaw error e: distance = -tanh(d / 10 cm); yaw = -tanh(|e| / 0.5 rad); precision =
+        `near`(d, 10 cm, 3 cm) `near`(|e|, 0.5 rad, 10 degrees); gap = -tanh(distance of the tip from the box / 5 cm);
+        height = -tanh(height error of the tip / 2 cm); smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2);
         filter_penalty = -`State.limited`.
         """
         place, _ = self.tip(state.q)

@@ -25,7 +25,7 @@ OBSERVED = (  # terms of `observe`, for metadata
 SPEED_NOISE = 0.05  # rad/s, speed noise of trainings for an identified arm; equals REST (rollout.py)
 CLOSE_M = 1e-3  # m, lower bound of the initial distance by which the reward divides
 MIDDLE = 0.05, 0.95  # quantiles of the distance from the shoulder in random postures: default goal region
-POSTURES = 500  # random postures for these quantiles
+POSTURES = 500  # number of random postures from which r2s computes the quantiles MIDDLE
 
 REACH = MeasureTable(
     measures=(
@@ -62,14 +62,14 @@ class ReachTask(BaseTask):
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        torque_fraction: share of tau_max that an action of 1 commands; one number for all joints, or one each.
+        torque_fraction: share of tau_max that an action of 1 commands: a number for all joints, or one per joint.
         cutoff_hz: cut-off frequency of the low-pass on the torque.
-        start_spread: rad, episodes start at q_home + U(-spread, spread).
-        reach: (low, high) m, distance of goals from the shoulder (the second or only joint); None: the quantiles
-            MIDDLE of this distance in random postures.
+        start_spread: rad, largest random deviation of a joint from q_home in a start posture.
+        reach: (low, high) m, distance of goals from the shoulder (the second joint, or a single joint); None: the
+            quantiles MIDDLE of the end effector's distance in random postures.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
         speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise learns not to react to noise. Such a policy excites no oscillations of
+            else 0. A policy trained with noise learns not to react to noise, and so does not excite oscillations of
             elastic gears, which rigid models do not have (benchmarks/results/transfer.md).
     """
 
@@ -96,13 +96,13 @@ class ReachTask(BaseTask):
             check_number("task.speed_noise", self.speed_noise, "[0, 1]")
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "ReachTask":
-        """Return the task with the speed noise that a training for an arm with these dynamics uses."""
+        """Return the task; if `speed_noise` is None, set the default for an arm with these dynamics."""
         if self.speed_noise is not None:
             return self
         return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the controller's torque limit, or without one the torque that an action of 1 commands."""
+        """Return (n,) Nm, the controller's torque limit; if unset, the torque that an action of 1 commands."""
         if self.controller is not None and self.controller.torque_limit is not None:
             return self.controller.torque_limit
         share = np.array(self.torque_fraction, dtype=float)
@@ -115,16 +115,16 @@ class ReachTask(BaseTask):
 
     @property
     def observation_summary(self) -> str:
-        """Terms and units of an observation."""
+        """Text that lists the terms and units of an observation."""
         return f"{OBSERVED}; rad, rad/s, m"
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(5,), weights of the terms of eq. (2)."""
+        """Weights (5,) of the reward terms in eq. (2) of the paper."""
         return rewards.PAPER
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, n) rad: q_home + U(-start_spread, start_spread)."""
+        """Return (count, n) rad, random start postures: q_home + U(-start_spread, start_spread)."""
         return robot.q_home + rng.uniform(-self.start_spread, self.start_spread, (count, robot.n))
 
     def region(self, robot: Robot) -> tuple[float, float]:
@@ -133,7 +133,7 @@ class ReachTask(BaseTask):
             return self.reach
         postures = zip(range(POSTURES), _postures(robot, np.random.default_rng(0)), strict=False)
         low, high = np.quantile([away for _, (_, away) in postures], MIDDLE)
-        return float(low) - 1e-6, float(high) + 1e-6  # with one joint all distances are equal
+        return float(low) - 1e-6, float(high) + 1e-6  # widen the range: with one joint, all distances are equal
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
         """Return (count, 3) m: end-effector positions of random joint angles, so that every goal is reachable.
@@ -156,14 +156,14 @@ class ReachTask(BaseTask):
         )
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 3) m of an impedance controller, which is the goal."""
+        """Return the target (m, 3) m of impedance control: the goal itself."""
         return goals
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (6 n + 12,) that normalize observations: fixed scales of the task.
 
-        Statistics of random motion would be unsuitable: random torques spin the wrist at 10 rad/s, whereas 0.1 rad/s
-        matters for stopping at a goal.
+        Scales from random motion would be too large: random torques spin the wrist at 10 rad/s, but near a goal even
+        0.1 rad/s matters.
         """
         n, far = robot.n, self.region(robot)[1]
         centre = np.zeros(6 * n + 12)
@@ -179,11 +179,11 @@ class ReachTask(BaseTask):
         return observe(state.q, state.dq, state.ee, goals, state.jacobian, state.effort, torque)
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms of an observation, in the order of `observe`."""
+        """Return the terms of an observation in the order in which `observe` returns them."""
         return observation_terms(self.torque_limit(robot))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, the initial distances from the goals, but at least CLOSE_M."""
+        """Return (m,) m, the initial distance from each goal, or CLOSE_M if that distance is smaller."""
         return np.maximum(np.linalg.norm(goals - state.ee, axis=-1), CLOSE_M)
 
     def judge(
@@ -193,12 +193,12 @@ class ReachTask(BaseTask):
         return _judge(state.ee, goals, scale, state.dq, ddq, state.limited)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
-        """Return one row of evaluations.csv."""
+        """Return one row of evaluations.csv; see `r2s.tasks.rollout.measures`."""
         return measures(episodes)
 
 
 def observation_terms(torque: np.ndarray) -> list[ObservationTerm]:
-    """Return the terms of an observation, in the order of `observe`; torque (n,) Nm: the torque limit."""
+    """Return the terms of an observation in the order of the result of `observe`; torque: (n,) Nm, torque limit."""
     return [
         ObservationTerm("q", "rad", "q"),
         ObservationTerm("dq", "rad/s", "dq"),
@@ -239,9 +239,9 @@ def observe(
     effort: np.ndarray,
     torque: np.ndarray,
 ) -> np.ndarray:
-    """Return the observation (m, 6 n + 12) float32 in SI units, for arms and simulators alike.
+    """Return the observation (m, 6 n + 12) float32 in SI units, the same for arms and simulators.
 
-    Terms: q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm),
+    Terms: q; dq; ee; goal; error; effort / torque; tanh(error / 2 cm); J^T error; tanh(J^T error / 1.5 cm);
     tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector toward the goal; otherwise a network
     would have to learn the Jacobian. The effort is part of the state, because torque changes by at most 1 Nm per ms.
 

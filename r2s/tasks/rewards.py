@@ -1,8 +1,8 @@
-"""The paper's reward, eq. (2), and a curriculum toward this reward.
+"""The paper's reward, eq. (2), and a curriculum that approaches this reward.
 
-A reward is a weighted sum of named terms. The replay buffer stores the terms, and each update applies the current
-weights. So stored transitions stay valid when a curriculum changes the weights. Three terms are not in the paper,
-namely a bonus for precision and penalties for motion close to the goal and for commands changed by the safety filter.
+A reward is a weighted sum of named terms. The replay buffer stores the terms without weights, and each update applies
+the current weights, so that stored transitions stay valid when a curriculum changes the weights. r2s adds three terms
+to the paper's: a bonus for precision, and penalties for motion near the goal and for action of the safety filter.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # m, tanh scales of the precision bonus
-STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint's speed; the end effector can rest on this joint's axis
+STILL = (0.2, 0.05)  # rad/s, tanh scales of the largest joint speed; an end effector on a moving joint's axis rests
 TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 
 
@@ -24,18 +24,18 @@ TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 def terms(
     distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray, limited: np.ndarray
 ) -> np.ndarray:
-    """Return the reward terms (m, 5): two whose sum is eq. (2) of the paper, and three that are not in the paper.
+    """Return five reward terms (m, 5): the first two sum to eq. (2) of the paper, the others are not in the paper.
 
-    distance = -k1 d, where d = distance / distance0,
-    smoothness = -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d),
-    precision = 1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2,
-    stillness = -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2),
+    Terms, with d = distance / distance0: distance = -k1 d;
+    smoothness = -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d);
+    precision = 1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2;
+    stillness = -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2);
     filter_penalty = -limited.
 
     Args:
         distance, distance0: (m,) m, distance from the goal now and at the start of the episode.
-        dq: (m, n) rad/s.
-        ddq: (m, n) rad/s^2, mean over the last control period.
+        dq: (m, n) rad/s, joint speeds.
+        ddq: (m, n) rad/s^2, joint accelerations, mean over the last control period.
         limited: (m,), share of the last control period's cycles in which the safety filter changed the command.
     """
     out = np.empty((len(distance), 5))
@@ -64,55 +64,55 @@ MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2
 
 
 class Reward:
-    """Reward with the terms and weights of the task: `reward=task`. Subclasses define other rewards.
+    """Reward with the terms and weights of the task, `reward=task`; subclasses change weights or terms.
 
-    `reward._target_` names the class. The other keys of the yaml are the arguments of the class.
+    `reward._target_` names the class of the reward; the remaining keys in conf/reward/*.yaml are its arguments.
 
     Attributes:
-        factor: initial value of the argument `factor` of `weights` and `adapt`, a number or an array.
+        factor: number or array, the first value that `weights` and `adapt` receive as `factor`.
     """
 
     factor: Any = 1.0
 
     def terms(self, task: Any) -> tuple[str, ...]:
-        """Return the names of the terms, in the order of `judge`."""
+        """Return the names of the reward terms in the order in which `judge` returns the terms."""
         return task.reward_terms
 
     def judge(
         self, task: Any, state: Any, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (m,) m and the terms (m, k); arguments as in `Task.judge`."""
+        """Return the distance (m,) m and the reward terms (m, k); arguments as in `Task.judge`."""
         return task.judge(state, ddq, goals, reference)
 
     def weights(self, task: Any, progress: float, factor: Any = 1.0) -> np.ndarray:
-        """Return the weights (k,) of the terms.
+        """Return the weights (k,) of the reward terms.
 
         Args:
-            task: task of the training. progress: spent fraction of the budget. factor: last result of `adapt`.
+            task: task of the training. progress: used fraction of the budget. factor: last result of `adapt`.
         """
         return task.paper_weights
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> Any:
-        """Return the next `factor` after `env_steps` env steps in which the terms had the means `seen` (k,)."""
+        """Return the new `factor`; seen: (k,), means of the terms over the last `env_steps` env steps."""
         return factor
 
 
 @dataclass(frozen=True)
 class Curriculum(Reward):
-    """A reward whose weights change in the course of a training.
+    """A reward whose weights change during a training.
 
-    Eq. (2) alone makes exploration difficult, because its acceleration terms reward early stopping. So a training
-    starts with a small weight of smoothness and a bonus for precision. Between the `anneal` fractions of the budget,
-    the weights change linearly toward eq. (2). reward=paper has constant weights: smoothness 1, the others 0.
+    Eq. (2) alone makes exploration difficult, because its acceleration terms reward early stopping. So trainings with
+    a curriculum start with a small smoothness weight and a bonus for precision, and the weights then change linearly
+    toward eq. (2). With reward=paper, the weights are constant: 1 for distance and smoothness, 0 for other terms.
 
     Attributes:
-        smoothness, precision, stillness, filter_penalty: (before, after), weights before and after the change.
-        anneal: fractions of the budget at which the change starts and ends.
-        max_filter_rate: largest filter rate, exploration included; None: no limit. From the start of the change on, a
-            higher filter rate raises the weight of the filter penalty. A lower filter rate reduces this weight, but
-            not below that of the curriculum. With a fixed weight, the filter rate varies with the seed from 1 to 6 %
-            (benchmarks/results/minutes.md). The weight follows integral control of a Lagrange multiplier's logarithm
-            (Stooke, Achiam and Abbeel, ICML 2020).
+        smoothness, precision, stillness, filter_penalty: (before, after), weight of the term before and after the
+            change. anneal: fractions of the budget at which this change of weights starts and ends.
+        max_filter_rate: largest filter rate in a training, exploration included; None: no limit. Once the weights
+            change, a filter rate above `max_filter_rate` raises the weight of the filter penalty. A lower filter rate
+            reduces this weight, but not below the value of the curriculum. With a fixed weight, the filter rate is 1
+            to 6 %, depending on the seed (benchmarks/results/minutes.md). Integral control adapts the logarithm of
+            the weight, as for a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.
@@ -136,7 +136,7 @@ class Curriculum(Reward):
             check_number("reward.max_filter_rate", self.max_filter_rate, "(0, 1]")
 
     def terms(self, task: Any) -> tuple[str, ...]:
-        """Return TERMS; raise UserError if the task has other terms."""
+        """Return the names TERMS; raise UserError if the task's reward terms have different names."""
         if task.reward_terms != TERMS:
             raise UserError(
                 f"reward: a curriculum weights {', '.join(TERMS)}; {type(task).__name__} has "
@@ -154,7 +154,7 @@ class Curriculum(Reward):
         return np.array([1.0, *moving])
 
     def adapt(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
-        """Return the next factor of the filter penalty; see `Reward.adapt`."""
+        """Return the new factor of the filter penalty's weight; see `Reward.adapt`."""
         if self.max_filter_rate is None or progress < self.anneal[0]:
             return factor
         limited = -seen[TERMS.index("filter_penalty")]

@@ -1,4 +1,4 @@
-"""One rollout function for policies in simulators and on arms, and the measures of task reach."""
+"""Run policies in simulators and on arms with one function; compute the measures of task reach."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -27,9 +27,9 @@ class Arms(Protocol):
     """Arms that run episodes, one control period at a time: a simulated batch, one arm in an engine, or a real arm.
 
     Attributes:
-        robot: model of each arm. width: number of episodes that run at once.
-        speeds: (width, T, n) rad/s after each control step of the finished episodes, with the measurement noise
-            smoothed out; None if speeds have no noise.
+        robot: model of each arm. width: number of episodes that run at the same time.
+        speeds: (width, T, n) rad/s, joint speeds of the finished episodes after each control step, smoothed to remove
+            measurement noise; None if the measured speeds have no noise.
     """
 
     @property
@@ -40,11 +40,11 @@ class Arms(Protocol):
     def speeds(self) -> np.ndarray | None: ...  # noqa: D102
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Begin the episodes first, first + 1, ... at rest in postures `starts` (width, n) rad; return the state."""
+        """Begin the episodes `first`, `first` + 1, ... at rest in `starts` (width, n) rad; return the state."""
         ...
 
     def step(self, command: np.ndarray) -> State:
-        """Run one control period with the commands (width, c) of the controller; a stopped arm stays stopped."""
+        """Run one control period with the controller's commands (width, c); stopped arms do not move again."""
         ...
 
     def end(self) -> np.ndarray:
@@ -64,12 +64,12 @@ def rollout(
     """Run one episode for each goal, and return the `Episodes`.
 
     A stop ends an episode, and so does a contact of the arm with itself or the table (r2s/physics/collision.py)
-    that `task.may_touch` does not allow. `rollout` checks contacts after every control step. An ended episode repeats
-    its last state, and its last distance is infinite.
+    that `task.may_touch` does not allow. `rollout` checks contacts after every control step. An episode that ended
+    early repeats its last state, and its distance in the last step is infinite.
 
     Args:
         policy: maps observations to actions. arms: simulated or real arms. task: the task with its controller.
-        starts: (E, n) rad, start postures. goals: (E, ...), see `Task.goals`; E is a multiple of `arms.width`.
+        starts: (E, n) rad, start postures of E episodes. goals: (E, ...), as in `Task.goals`; `arms.width` divides E.
         progress: callback with the number of finished episodes and their total.
     """
     robot, count, shape = arms.robot, len(goals), (len(goals), task.steps)
@@ -112,7 +112,7 @@ def _run(
     contacts: CollisionCheck,
     out: Episodes,
 ) -> None:
-    """Run the episodes with the indices `now` from their first state, and write the results into `out`."""
+    """Run the episodes with the indices `now` from the initial state `state`, and write the results into `out`."""
     weights, scale, before = task.paper_weights, task.distance_scale(state, goals), state.dq.copy()
     over = np.zeros(arms.width, dtype=bool)  # whether a contact has ended the episode
     for k in range(task.steps):
@@ -149,23 +149,23 @@ def _run(
 
 
 def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
-    """Return the state with the `last` q, dq, ee and tau of those arms whose episode is `over` (m,) bool."""
+    """Return the state; where the episode is `over` (m,) bool, q, dq, ee and tau have the values in `last`."""
     names, here = ("q", "dq", "ee", "tau"), over[:, None]
     kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
     return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
 
 
 def measures(episodes: Episodes) -> dict[str, float]:
-    """Return one row of evaluations.csv.
+    """Return the measures of task reach, one row of evaluations.csv.
 
     success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
-    of the mean distance in the last 0.5 s. return_paper: mean sum of eq. (2) over an episode. return_smooth: mean sum
-    without speed noise, which eq. (2) mistakes for acceleration. time_to_reach_s: median time after which the end
-    effector stays within 2 cm, over the episodes in which this occurs. overshoot_m: mean over episodes of the largest
-    distance beyond 2 cm after the first time within 2 cm. rest: share of episodes in which every joint is slower than
-    REST throughout the last 0.5 s (an end effector on the axis of a moving joint rests as well). q_left_rad: 5 %
-    quantile over episodes of the distance from the position limits. limited: mean filter rate. collision: share of
-    episodes that a contact ended.
+    of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth: the
+    same mean without speed noise, from which eq. (2) would compute false accelerations. time_to_reach_s: median time
+    after which the end effector stays within 2 cm, over the episodes that achieve this. overshoot_m: mean over
+    episodes of the largest distance beyond 2 cm after the first time within 2 cm. rest: share of episodes in which
+    every joint is slower than REST throughout the last 0.5 s; an end effector at rest is not enough. q_left_rad: 5 %
+    quantile over episodes of the smallest distance from the position limits. limited: mean filter rate. collision:
+    share of episodes that a contact ended.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)
@@ -214,9 +214,9 @@ def select_episodes(episodes: Episodes, which: slice | np.ndarray) -> Episodes:
 
 
 def episode_measures(task: Task, episodes: Episodes, predicted: Episodes | None = None) -> list[dict[str, float]]:
-    """Return a row per episode: measures, `gap` to the same episode in `predicted`, and whether the arm stopped.
+    """Return one row per episode: measures, `gap` to the predicted episode, and whether the arm stopped.
 
-    In a stopped episode, the values of `gap` are nan.
+    If the arm stopped in an episode, the columns of `gap` are nan.
     """
     rows = []
     for k in range(len(episodes.goal)):

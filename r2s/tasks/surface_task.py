@@ -1,6 +1,6 @@
 """Base class of tasks on a surface: nominal plane, approach, force estimate, and functions for reward terms.
 
-A task contains only the nominal plane. The true plane, its stiffness and its friction are part of the dynamics
+The task contains only the nominal plane. The surface's true plane, stiffness and friction are part of the dynamics
 (`dr=contact`, `arm.surface`). The policy observes a force estimate from q, dq and the commanded torque. Neither
 observation nor controller uses the true force.
 """
@@ -30,30 +30,30 @@ FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N:
 # 1/rad, see `cartesian_impedance`; low, because a null-space torque reaches the tip if joints stick. On models of
 # twins 0 and 1 the reference's force errors are similar from 0.02 to 0.05, and up to twice as large at 0.2
 NULL_STIFFNESS = 0.05
-REGULAR = 1e-3  # m^2/rad^2, regularizes the force estimate: 0 in directions in which no joint moves the tip
+REGULAR = 1e-3  # m^2/rad^2, regularizes the force estimate to 0 in directions in which no joint moves the tip
 EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: middle of conf/dr/contact.yaml
-POSTURES = 12  # about this many points of a path must be within reach
+POSTURES = 12  # approximate number of points per path for which r2s checks the reach
 
 
 @dataclass(frozen=True)
 class SurfaceTask(TipTask):
     """A task that presses a tool's tip on a surface whose position is known roughly.
 
-    A goal begins with (9 + n,) numbers: first touched point of the nominal plane, m; normal of the plane; two forces,
-    N; start height of the tip's center above the point, m; start posture, rad.
+    A goal begins with 9 + n numbers: point of the nominal plane that the tip touches first, m; normal of the plane;
+    two forces, N; start height of the tip's center above that point, m; start posture, rad.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        force: (low, high) N, range of the requested forces. force_rate: N/s, rate of a change of force.
+        force: (low, high) N, range of the requested forces. force_rate: N/s, rate at which this force changes.
         approach_speed: m/s, speed of the target along the nominal normal, thus the highest closing speed at contact.
         clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
-            from `point`. place: m, tilt: degrees, largest deviation of the true from the nominal plane.
+            from `point`. place, tilt: m and degrees, largest offset and tilt of the true plane from the nominal.
         point, normal: the nominal plane in the base frame, m; None: a table below the tip at home.
         tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
-        pool: number of goals that a training draws from.
-        stop: how a stop of the arm treats a contact force, a key of `r2s.physics.push_limit.STOPS`; None: release.
-        model, own, parameters: model of the arm, default controller and its parameters, all set by `with_model`.
+        pool: number of different goals in a training.
+        stop: kind of stop in contact, a key of `r2s.physics.push_limit.STOPS`; None: release.
+        model: model of the arm. own, parameters: default controller and its parameters. `with_model` sets all three.
     """
 
     ctrl_hz: int = 100
@@ -96,7 +96,7 @@ class SurfaceTask(TipTask):
             )
 
     def _check_range(self, name: str, unit: str, equal: bool = False) -> None:
-        """Raise UserError unless an attribute is (low, high) with 0 < low < high; `equal` allows low = high."""
+        """Raise UserError unless attribute `name` is (low, high) with 0 < low < high; `equal` allows low = high."""
         pair = getattr(self, name)
         numbers = isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(x, int | float) for x in pair)
         if not numbers or not 0 < pair[0] <= pair[1] or (pair[0] == pair[1] and not equal):
@@ -127,7 +127,7 @@ class SurfaceTask(TipTask):
         return {}
 
     def controlled_by(self, controller: Controller) -> Self:
-        """Return the task with this controller; raise UserError if the controller cannot exert the largest force."""
+        """Return the task with `controller`; raise UserError if this controller cannot exert the largest force."""
         self._check_force(controller)
         return super().controlled_by(controller)
 
@@ -151,7 +151,7 @@ class SurfaceTask(TipTask):
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(k,), the weights of the reward terms."""
+        """Weights (k,) of the reward terms."""
         return np.ones(len(self.reward_terms))
 
     def plane(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +180,7 @@ class SurfaceTask(TipTask):
         raise NotImplementedError
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return random goals (count, 9 + n or more); the class describes a goal.
+        """Return random goals (count, 9 + n or more); the class docstring describes a goal.
 
         Raises:
             UserError: the tip cannot reach a randomly drawn point.
@@ -210,7 +210,7 @@ class SurfaceTask(TipTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return the values from `path` (k, 3) m that a goal stores after its start posture; by default none."""
+        """Return the part of a goal after the start posture, computed from `path` (k, 3) m; by default empty."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -218,9 +218,9 @@ class SurfaceTask(TipTask):
         return goals[:, POINT]
 
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, the depth of the target of the tip's center below the nominal plane at t (m,) s.
+        """Return (m,) m, the depth of the tip's target below the nominal plane at t (m,) s.
 
-        The target moves at approach_speed until the tip certainly touches; then the force rises at force_rate.
+        The target moves at `approach_speed` until it is below any allowed surface. Then force rises at `force_rate`.
         """
         height, K = goals[:, HEIGHT], self.spring
         touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` refers to the tip's center
@@ -231,12 +231,12 @@ class SurfaceTask(TipTask):
 
     @property
     def down_s(self) -> float:
-        """Time, s, after which the tip certainly touches the surface."""
+        """Time, s, after which the tip touches even the lowest allowed surface."""
         return (self.beyond + LAG_M + self.clearance) / self.approach_speed
 
     @property
     def spring(self) -> float:
-        """Stiffness, N/m, of the controller's spring, or else of the default controller's spring."""
+        """Stiffness, N/m, of the spring in `controller`, or if `controller` has none, in the default controller."""
         for control in (self.controller, self.own):
             if isinstance(control, Impedance) and control.parameters[K_DEFAULT] > 0:
                 return float(control.parameters[K_DEFAULT])
@@ -266,7 +266,7 @@ class SurfaceTask(TipTask):
         return np.concatenate([*rows, state.effort / torque, state.limited[:, None]], axis=1, dtype=np.float32)
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms of an observation, in the order of `observe`."""
+        """Return the terms of an observation in the order in which `observe` returns them."""
         torque = tuple(self.torque_limit(robot).tolist())
         return [
             ObservationTerm("q", "rad", "q"),
@@ -283,10 +283,10 @@ class SurfaceTask(TipTask):
         ]
 
     def estimate(self, state: State, normal: np.ndarray, jacobian: np.ndarray | None = None) -> np.ndarray:
-        """Return (m,) N, the force against the normal (m, 3) that q, dq and the last command imply.
+        """Return (m,) N, the contact force against `normal` (m, 3), estimated from q, dq and the last command.
 
-        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest, joint
-        friction causes an error of up to friction / lever arm. Model errors bias the estimate.
+        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest, joint friction
+        causes an error of up to friction / lever arm. Errors of the arm's model bias the force estimate.
         """
         jacobian = self.tip(state.q)[1] if jacobian is None else jacobian
         q, dq = np.ascontiguousarray(state.q), np.ascontiguousarray(state.dq)

@@ -26,20 +26,20 @@ TORQUE_STD = 0.3  # share of the torque limit, standard deviation that normalize
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The state of m arms with n joints. The next step may overwrite the arrays.
+    """The state of m arms with n joints; the next control step may overwrite the arrays.
 
     Attributes:
-        t: (m,) s, time since the episode began. q, dq: (m, n) rad, rad/s.
-        ee: (m, 3) m, the end effector. jacobian: (m, 3, n) m/rad, its translational Jacobian.
+        t: (m,) s, time since the episode began. q, dq: (m, n) rad, rad/s, joint angles and speeds.
+        ee: (m, 3) m, end-effector position. jacobian: (m, 3, n) m/rad, the end effector's translational Jacobian.
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target torque after the low-pass.
         stopped: (m,), whether the arm has stopped before the end of its episode.
         limited: (m,), share of the last control period in which the safety filter changed the command.
-        noise: (m, n) rad/s, sensor noise, which `measured` adds to the true speed dq. None: dq includes the sensor
-            noise, or the sensors are exact.
+        noise: (m, n) rad/s, sensor noise that `measured` adds to the true speed dq; None: dq already includes sensor
+            noise, or the sensors have none.
         force: (m, 3) N, force that the tool exerts, in base axes: the true force in simulation and on twins, the
             reported force on other arms; None: unknown. Rewards and measures use this force, observations do not.
-        box: (m, 6), perceived pose of the box that the tool pushes, in the base frame: its center, m, and its first
-            axis; None: the task has no box.
+        box: (m, 6), perceived pose of the box in the base frame: the box's center, m, and the direction of the box's
+            first axis; None: the task has no box.
     """
 
     t: np.ndarray
@@ -69,18 +69,18 @@ class State:
 
 @dataclass(frozen=True)
 class Episodes:
-    """E finished episodes of T control steps; index k along T is the state after step k.
+    """E finished episodes of T control steps; index k along T means the state after step k.
 
     Attributes:
-        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) if the goal moves; see
-            `Task.goal_positions`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m.
-        reward: (E, T), with the weights `Task.paper_weights`; in task reach, eq. (2).
+        t: (T,) s, time. q, dq: (E, T, n) rad, rad/s, angles and speeds. ee: (E, T, 3) m, end effector. goal: goal
+            positions, (E, 3) m, or (E, T, 3) m if goals move. tau: (E, T, n) Nm, command at the end of each step.
+        distance: (E, T), error of the task. reward: (E, T), weighted by `Task.paper_weights`; eq. (2) in task reach.
         reward_smooth: (E, T), the reward computed from speeds without measurement noise.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
         collision: (E,) str, time and bodies of the contact that ended the episode; "" without contact.
         force: (E, T, 2) N, force on the surface and requested force; None: the task touches no surface.
-        box: (E, T, 11), see `Task.boxes`; None: the task moves no box.
+        box: (E, T, 11), state of the box, see `Task.boxes`; None: the task moves no box.
     """
 
     t: np.ndarray
@@ -104,11 +104,11 @@ class ObservationTerm:
     """One term of an observation, described so that a program without r2s can compute it.
 
     Attributes:
-        name: name of the term. unit: its SI unit, "1" if dimensionless.
-        of: source of the term: q, dq, ee, goal, error (goal - ee), effort, pull (J^T error), or control (torque of a
-            controller with `observes_torque`). In a plan, goal is the current reference position. A plan has the
-            further sources ahead (next positions - ee), velocity (of the path), limited, q_off, dq_off (plan - arm).
-        divided_by: divisor, one number or one per element; None: 1. tanh: whether tanh is applied afterwards.
+        name: name of the term. unit: SI unit of the term, "1" if dimensionless.
+        of: signal in the term: q, dq, ee, goal, error (goal - ee), effort, pull (J^T error), control (torque of a
+            controller with `observes_torque`). For tasks with a planned path, goal is the current path position, and
+            there are also ahead (next positions - ee), velocity (of the path), limited, q_off, dq_off (plan - arm).
+        divided_by: divisor of the signal: a number, or one per element; None: 1. tanh: whether tanh is applied last.
     """
 
     name: str
@@ -119,17 +119,17 @@ class ObservationTerm:
 
 
 class Task(Protocol):
-    """Interface of a task that an arm does in episodes of `steps` control steps.
+    """Interface of a task that an arm performs in episodes of `steps` control steps.
 
     Attributes:
         ctrl_hz: policy rate. cutoff_hz: cut-off of the low-pass on the torque. steps: control steps per episode.
         substeps: physics steps per control step.
         observation_summary: terms and units of an observation, for the metadata of policy.onnx.
         reward_terms: names of the reward terms. paper_weights: (k,), their weights in `Episodes.reward`.
-        pool: number of goals that a training draws from.
-        speed_noise: rad/s; in training, each arm draws a lower bound of its speed noise (standard deviation) from
-            U(0, speed_noise). None or 0: no lower bound.
-        measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
+        pool: number of different goals in a training.
+        speed_noise: rad/s; in training, the speed noise of each arm has at least the standard deviation ~
+            U(0, speed_noise); with None or 0, training sets no lower bound.
+        measure_table: the measures that `measures` returns, with their presentation (r2s/tasks/measures.py).
         may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
         touches: whether the tool touches a surface; simulated arms then need `Dynamics.surface`.
         moves_box: whether the surface is a box that the tool pushes; arms must then perceive the box (`State.box`).
@@ -174,13 +174,13 @@ class Task(Protocol):
         ...
 
     def controlled_by(self, controller: Controller) -> "Task":
-        """Return a copy of the task with this controller."""
+        """Return a copy of the task that uses `controller`."""
         ...
 
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "Task":
-        """Return the task with limits of contact force, N, and speed, m/s, for arms with joint friction (n,) Nm."""
+        """Return the task with limits of contact force, N, and speed, m/s; friction: (n,) Nm, joint friction."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -196,11 +196,11 @@ class Task(Protocol):
         ...
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, n) rad, the start postures of episodes with these goals; `starts`: proposed postures."""
+        """Return (m, n) rad, the start postures in `goals`, or `starts` if goals of this task contain none."""
         ...
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
-        """Return the goals as positions to plot: (m, 3) m, or (m, steps, 3) m, the reference after each step."""
+        """Return goal positions to plot: (m, 3) m, or for moving goals (m, steps, 3) m, after each step."""
         ...
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -212,7 +212,7 @@ class Task(Protocol):
         ...
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, divisors of the distances in the reward; `state`: first state of the episodes."""
+        """Return (m,) m, divisors of the distances in the reward, computed from the episodes' first state."""
         ...
 
     def judge(
@@ -222,16 +222,16 @@ class Task(Protocol):
 
         Args:
             state: state after a control period. ddq: (m, n) rad/s^2, mean over this period.
-            goals: (m, ...). scale: (m,) m, result of `distance_scale`.
+            goals: (m, ...), goals of the episodes. scale: (m,) m, result of `distance_scale`.
         """
         ...
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
-        """Return (m, 2) N, the force against a surface and the requested force; None: no requested force."""
+        """Return (m, 2) N, force against a surface and requested force, or None if the task requests no force."""
         ...
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 11): `State.box`, yaw error rad, the tip's height above the table m, the box's edges m."""
+        """Return (m, 11): pose and yaw error of the box, height of the tip above the table m, edges of the box m."""
         ...
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
@@ -239,7 +239,7 @@ class Task(Protocol):
         ...
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
-        """Return one row of evaluations.csv."""
+        """Return the measures of the episodes, one row of evaluations.csv."""
         ...
 
     def score(self, row: Mapping[str, float]) -> float:
@@ -251,7 +251,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, goals: see `Task.observe`. controller: the task's controller. state: state without sensor noise.
+        task, controller: the task and its controller. goals: (m, ...), goals. state: state without sensor noise.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()
@@ -286,12 +286,12 @@ class BaseTask:
 
     @property
     def steps(self) -> int:
-        """Control steps of an episode."""
+        """Number of control steps per episode."""
         return round(self.episode_s * self.ctrl_hz)
 
     @property
     def substeps(self) -> int:
-        """Physics steps of a control step."""
+        """Number of physics steps per control step."""
         return round(1.0 / (self.ctrl_hz * SIM_DT))
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
@@ -299,7 +299,7 @@ class BaseTask:
         return self
 
     def controlled_by(self, controller: Controller) -> Self:
-        """Return a copy of the task with this controller."""
+        """Return a copy of the task that uses `controller`."""
         return self._with("controller", controller)
 
     def pushing_within(

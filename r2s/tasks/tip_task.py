@@ -1,4 +1,4 @@
-"""Base class of tasks for a tool's tip: default controller, torque limit, and start postures from the goals."""
+"""Base class of tasks for a tool's tip: a default controller, a torque limit, and goals with start postures."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ class TipTask(BaseTask):
         return value
 
     def control(self, robot: Robot) -> Controller:
-        """Return the controller that `controlled_by` set, or else the default controller."""
+        """Return the controller that `controlled_by` set, or if none was set the default controller."""
         return self.controller or self.own or super().control(robot)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
@@ -55,9 +55,9 @@ class TipTask(BaseTask):
         return self.as_reach().torque_limit(robot) if limit is None else limit
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return home postures (count, n) rad; `begin` replaces them by the start postures in the goals."""
+        """Return home postures (count, n) rad; `begin` returns the start postures in the goals instead."""
         return np.tile(robot.q_home, (count, 1))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones: the reward uses forces in N and distances in m, without a scale."""
+        """Return (m,) ones, because the rewards of these tasks need no initial distance as a scale."""
         return np.ones(len(goals))

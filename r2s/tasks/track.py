@@ -24,8 +24,8 @@ from r2s.tasks.trajectory import KINDS, Curve, Paths, V, X, at_time, curve
 FAR_M, NEAR_M, FINE_M = 0.03, 0.01, 0.003  # m, tanh scales of the reward
 SPEED, ACCELERATION = 1.0, 10.0  # rad/s, rad/s^2, tanh scales of deviations from the plan
 NEAR_RAD = 0.02  # rad, scale of observed joint errors
-CHECKED = 12  # about this many postures of a path are checked for contacts
-TRIES = 60  # most draws per path, on average
+CHECKED = 12  # approximate number of postures per path that r2s checks for contacts
+TRIES = 60  # largest number of attempts per path, on average
 JERK_S = 0.1  # s, window of the fitted cubic whose third derivative is the jerk
 
 TRACK = MeasureTable(
@@ -57,18 +57,18 @@ TRACK = MeasureTable(
 class TrackTask(BaseTask):
     """Follow a path on time; a `Task` (r2s/tasks/task.py) from conf/task/track.yaml.
 
-    A goal is a plan (steps + 1 + preview, 6 + 3 n) of r2s/tasks/trajectory.py, with a row for each control step.
+    A goal is a plan (steps + 1 + preview, 6 + 3 n) from `Paths.plan`, with one row per control step.
 
     Attributes:
-        ctrl_hz: policy rate, 50 to 200. episode_s: length of a path, s. ramp_s: s, duration of the
-            acceleration, and of the deceleration.
+        ctrl_hz: Hz, policy rate, 50 to 200. episode_s: s, duration of a path.
+        ramp_s: s, duration of the acceleration at the start and of the deceleration at the end of a path.
         torque_fraction, boost: the largest target torque is boost x torque_fraction x tau_max, at most tau_max.
         cutoff_hz: cut-off frequency of the low-pass on the torque.
-        preview: samples of the path ahead in an observation.
-        speed: (low, high) m/s, drawn peak speed; lower where the arm's limits require it.
-        size: (low, high) m, drawn radius of a path about its center. kinds: subset of KINDS, equally probable.
+        preview: number of future path positions in an observation.
+        speed: (low, high) m/s, range of random peak speeds; a path is slower if the arm's limits require it.
+        size: (low, high) m, range of random path radii. kinds: subset of KINDS, equally probable.
         reach, height, azimuth: region that contains the paths, see `ReachTask`.
-        pool: number of paths that a training draws from.
+        pool: number of different paths in a training.
         model: dynamics of the arm for the default controller, set by `with_model`.
     """
 
@@ -95,7 +95,7 @@ class TrackTask(BaseTask):
         if not isinstance(self.ctrl_hz, int) or not 50 <= self.ctrl_hz <= 200 or cycles % self.ctrl_hz:
             raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; 50, 100, 125 and 200 are")
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
-        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # plans are stored whole
+        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # plans are stored in full
         check_number("task.boost", self.boost, "(0, inf)")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.pool", self.pool, "[1, inf)", whole=True)
@@ -112,7 +112,7 @@ class TrackTask(BaseTask):
         for kind in self.kinds or ("",):
             if kind not in KINDS:
                 raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
-        replace(self._region)  # raises if it is invalid
+        replace(self._region)  # raises if the region is invalid
 
     @property
     def _region(self) -> ReachTask:
@@ -120,7 +120,7 @@ class TrackTask(BaseTask):
 
     @property
     def observation_summary(self) -> str:
-        """Terms and units of an observation."""
+        """Text that lists the terms and units of an observation."""
         own = (
             f"{OBSERVED} {self.preview} x ahead - ee velocity tanh(error/{FINE_M:g}) limited plan q - q plan dq - dq"
         )
@@ -128,7 +128,7 @@ class TrackTask(BaseTask):
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(5,), weights of the reward terms: 1 for distance and smoothness, 0 for the others."""
+        """Weights (5,) of the reward terms: 1 for distance and smoothness, 0 for the others."""
         return PAPER
 
     def region(self, robot: Robot) -> tuple[float, float]:
@@ -147,13 +147,13 @@ class TrackTask(BaseTask):
         return replace(self, model=dynamics)
 
     def control(self, robot: Robot) -> Controller:
-        """Return the controller: with a model `control=computed_torque`, without one `control=torque`."""
+        """Return the controller: by default `control=computed_torque`, or without a model `control=torque`."""
         if self.controller is None and self.model is not None:
             return computed_torque(robot, self, self.model)
         return super().control(robot)
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return home postures (count, n) rad; `begin` replaces them by the first postures of the paths."""
+        """Return home postures (count, n) rad; `begin` returns the first postures of the paths instead."""
         return np.tile(robot.q_home, (count, 1))
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -201,11 +201,11 @@ class TrackTask(BaseTask):
     def plan(self, robot: Robot, start: Sequence[float], shape: Curve, pace: float) -> np.ndarray:
         """Return the plan (steps + 1 + preview, 6 + 3 n) of a custom curve.
 
-        This method checks neither for contacts nor whether trainings contain such curves.
+        This method does not check for contacts, or whether the curve resembles the paths of a training.
 
         Args:
-            robot: the arm. start: (3,) m, first end-effector position. shape: maps u (T,) m, the arc length, to the
-                offset (T, 3) m from `start`. pace: peak du/dt, m/s; lower where the arm's limits require it.
+            robot: the arm. start: (3,) m, first end-effector position. shape: function from the arc length u (T,) m
+                to the offset (T, 3) m from `start`. pace: m/s, peak du/dt; reduced if the arm's limits require this.
 
         Raises:
             UserError: the arm cannot follow the curve.
@@ -236,7 +236,7 @@ class TrackTask(BaseTask):
         return np.concatenate([centre, np.zeros(len(more))]), np.concatenate([scale, more])
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, d) float32 for the plans `goals`; see `observation_terms`."""
+        """Return the observations (m, d) float32, where `goals` are plans; see `observation_terms`."""
         n = state.q.shape[1]
         rows, k = np.arange(len(goals)), self._at(state.t)
         now = goals[rows, k]
@@ -248,7 +248,7 @@ class TrackTask(BaseTask):
         return np.concatenate([first, *own], axis=1, dtype=np.float32)
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms of an observation, in the order of `observe`."""
+        """Return the terms of an observation in the order in which `observe` returns them."""
         torque = self.torque_limit(robot)
         own = [
             ObservationTerm(f"the next {self.preview} places - ee", "m", "ahead"),
@@ -263,16 +263,16 @@ class TrackTask(BaseTask):
     def trajectory(
         self, t: np.ndarray, goals: np.ndarray, ahead_s: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, dq, ddq (m, n) of the plans `goals` at the times t (m,) s + ahead_s."""
+        """Return q, dq, ddq (m, n) of the plans in `goals`, `ahead_s` seconds after the times t (m,) s."""
         return at_time(goals, self._at(t), ahead_s, self.ctrl_hz)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of an impedance, m and m/s: position and velocity of the plans at t (m,) s."""
+        """Return the target (m, 6) of impedance control: planned position, m, and velocity, m/s, at t (m,) s."""
         now = goals[np.arange(len(goals)), self._at(t)]
         return np.concatenate([now[:, X], now[:, V]], axis=1)
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones: the reward uses distances in m, without a scale."""
+        """Return (m,) ones, because the reward of this task needs no initial distance as a scale."""
         return np.ones(len(goals))
 
     def judge(
@@ -287,13 +287,13 @@ class TrackTask(BaseTask):
         return _judge(now[:, X] - state.ee, state.dq - speed, excess, state.limited)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
-        """Return one row of evaluations.csv.
+        """Return the measures of task track, one row of evaluations.csv.
 
         path_rmse_mm: RMS distance between end effector and reference over the steps of the paths without a stop.
-        path_max_mm: mean over these paths of the largest distance. within_x: share of steps with a distance below x;
-        steps of stopped paths never qualify. return_track: mean sum of the reward under `paper_weights`.
-        torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS of the end effector, from cubic fits over
-        JERK_S. stopped: share of stopped paths. q_left_rad, limited: see `r2s.tasks.rollout.measures`.
+        path_max_mm: mean over the paths without a stop of the largest distance. within_x: share of steps with a
+        distance below x; steps of stopped paths never qualify. return_track: mean over paths of the summed reward.
+        torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector, from cubic fits
+        over JERK_S. stopped: share of stopped paths. q_left_rad, limited: see `r2s.tasks.rollout.measures`.
         """
         ended = ~np.isfinite(episodes.distance).all(1)
         error = 1e3 * episodes.distance[~ended]
@@ -323,7 +323,7 @@ class TrackTask(BaseTask):
         return -(row["path_rmse_mm"] if np.isfinite(row["path_rmse_mm"]) else 1e3) - 100 * row["stopped"]
 
     def _at(self, t: np.ndarray) -> np.ndarray:
-        """Return (m,), the indices of the plan rows at t (m,) s."""
+        """Return (m,), the index of the plan row at each time t (m,) s."""
         return np.minimum(np.rint(t * self.ctrl_hz).astype(np.int64), self.steps)
 
 
@@ -349,14 +349,14 @@ class _Inside:
 def _judge(error, dq, ddq, limited):
     """Return the distance (m,) m and the reward terms (m, 5).
 
-    distance = -2 tanh(distance / 3 cm),
-    smoothness = -0.03 sum tanh(|dq| / 1 rad/s) - 0.03 sum tanh(|ddq| / 10 rad/s^2),
-    precision = 1 - tanh(distance / 1 cm) / 2 - tanh(distance / 3 mm) / 2,
-    stillness = 0, because the path defines where the arm rests,
+    Terms, with the path error d: distance = -2 tanh(d / 3 cm);
+    smoothness = -0.03 sum tanh(|dq| / 1 rad/s) - 0.03 sum tanh(|ddq| / 10 rad/s^2);
+    precision = 1 - tanh(d / 1 cm) / 2 - tanh(d / 3 mm) / 2;
+    stillness = 0, because the path defines where the arm rests;
     filter_penalty = -limited.
 
     Args:
-        error: (m, 3) m. dq, ddq: (m, n) rad/s, rad/s^2, deviations from the plan. limited: (m,), see `State`.
+        error: (m, 3) m, path error. dq, ddq: (m, n) rad/s, rad/s^2, deviations from the plan. limited: as in `State`.
     """
     m = len(error)
     distance, out = np.empty(m), np.empty((m, 5))

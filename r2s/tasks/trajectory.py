@@ -28,7 +28,7 @@ INSIDE = 0.05  # rad, least distance of a path from the position limits of the s
 # Shares of the largest target torque, and of the filter's speed limit and acceleration bound, that a path may use;
 # the rest remains for friction, feedback and errors of the nominal model.
 TORQUE, SPEED, ACCELERATION = 0.5, 0.9, 0.8
-SLOWEST = 0.02  # share of the drawn pace; a path that must be slower is rejected
+SLOWEST = 0.02  # share of the requested pace; a path that must be slower is rejected
 CHECK_HZ = 50  # Hz, rate at which a path is checked against limits
 TRIES = 20  # largest number of paces tried for a path
 PEAK = 1.875  # peak over mean speed of a minimum-jerk motion
@@ -93,9 +93,9 @@ def smooth(s: np.ndarray) -> np.ndarray:
 
 
 def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return u, du/dt and d2u/dt2 at t (T,) s of a clock with pace 1 that runs from 0 to `seconds`.
+    """Return u, du/dt and d2u/dt2 at t (T,) s for a path parameter u(t) that moves at pace 1 from 0 s to `seconds`.
 
-    The pace du/dt rises along `smooth` in the first `ramp` s and falls in the last `ramp` s. Outside, du/dt is 0.
+    The pace du/dt rises as `smooth` in the first `ramp` s and falls in the last `ramp` s. Before and after, it is 0.
     """
 
     def integral(s: np.ndarray) -> np.ndarray:
@@ -110,11 +110,11 @@ def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.nd
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths that an arm can follow.
+    """Planner of paths that an arm can follow.
 
     Attributes:
         robot: the arm. torque: (n,) Nm, largest target torque.
-        seconds: s, duration of a path. ramp: s, duration of the acceleration, and of the deceleration.
+        seconds: s, duration of a path. ramp: s, duration of acceleration and of deceleration.
     """
 
     robot: Robot
@@ -131,7 +131,7 @@ class Paths:
     def postures(self, start: np.ndarray, shape: Curve, pace: float) -> tuple[CubicSpline, np.ndarray] | None:
         """Return the spline q(u) and the points (T, 3) m of the curve from `start` (3,) m.
 
-        Return None if a point is out of reach, or a posture is too close to a position limit.
+        The result is None if a point of the curve is out of reach, or a posture is too close to a position limit.
         """
         home, hand, limits = self.robot.q_home, self._hand, self._limits  # type: ignore[attr-defined]
         first = hand.place(home[None])[0]
@@ -155,8 +155,8 @@ class Paths:
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
         """Return the largest ratio of a path's torque to the allowed torque, or of its motion to the allowed motion.
 
-        The nominal model predicts the torque. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq), where
-        v is the allowed speed at q.
+        The nominal model predicts the path's torque. The safety filter requires -RATE (v + dq) <= ddq and
+        ddq <= RATE (v - dq), where v is the speed limit in the posture q.
         """
         limits = self._limits  # type: ignore[attr-defined]
         shares = [np.abs(self._model.rigid(q, dq, ddq)) / (TORQUE * self.torque)]  # type: ignore[attr-defined]
@@ -172,7 +172,7 @@ class Paths:
     def plan(self, start: np.ndarray, shape: Curve, pace: float, t: np.ndarray) -> np.ndarray | None:
         """Return the plan (T, 6 + 3 n) at t (T,) s, or None if infeasible; reduce `pace` m/s until `strain` <= 1.
 
-        Columns: position and velocity of the end effector, m, m/s; q, dq, ddq of the joints. t may exceed `seconds`.
+        The columns are position and velocity of the end effector, m, m/s, then q, dq, ddq. t may exceed `seconds`.
         """
         found = self.postures(start, shape, pace)
         if found is None:
@@ -189,14 +189,14 @@ class Paths:
         return None
 
     def rows(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the plan (T, 6 + 3 n) of a joint motion (T, n)."""
+        """Return the plan (T, 6 + 3 n) for the joint motion q, dq, ddq, each (T, n)."""
         hand, h = self._hand, 1e-5  # type: ignore[attr-defined]
         v = (hand.place(q + h * dq) - hand.place(q - h * dq)) / (2 * h)
         return np.hstack([hand.place(q), v, q, dq, ddq])
 
 
 def at_time(plans: np.ndarray, k: np.ndarray, ahead_s: float, hz: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, dq, ddq (m, n) of the plans `ahead_s` s after their rows k (m,), with ddq linear between rows."""
+    """Return q, dq, ddq (m, n) of the plans, `ahead_s` seconds after the rows k (m,); ddq is linear between rows."""
     n, whole = (plans.shape[2] - 6) // 3, int(ahead_s * hz)
     rows, last = np.arange(len(plans)), plans.shape[1] - 1
     a, b = plans[rows, np.minimum(k + whole, last)], plans[rows, np.minimum(k + whole + 1, last)]

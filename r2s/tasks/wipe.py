@@ -31,12 +31,12 @@ STEADY = 0.25  # integral rate as a share of its stability limit: a gain margin 
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal begins as in `SurfaceTask`; `goals` draws equal forces for the start and the end of the path. Then
-    the goal contains the path as rows of position, velocity and acceleration (9,), at the start and after each step.
+    A goal begins as in `SurfaceTask`; random goals have equal forces at the start and the end of the path. The rest
+    of a goal is the path, as rows (9,) of position, velocity and acceleration, at the start and after each step.
 
     Attributes:
-        speed: (low, high) m/s, drawn peak speed. size: (low, high) m, drawn radius of a path. kinds: subset of
-            KINDS, equally probable. ramp_s: s, duration of the path's acceleration, and of its deceleration.
+        speed: (low, high) m/s, range of random peak speeds. size: (low, high) m, range of random path radii. kinds:
+            subset of KINDS, equally probable. ramp_s: s, duration of a path's acceleration, and of its deceleration.
         friction: expected friction coefficient of the surface. Other attributes: see `SurfaceTask`.
         inertia: (3, 3) kg, effective mass of the tip at the nominal plane.
     """
@@ -66,39 +66,39 @@ class WipeTask(SurfaceTask):
                 raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
         check_number(
             "task.size", self.size[1], f"(0, {self.spread / np.sqrt(2):.3g}]"
-        )  # the middle of a path is that of its bounding box
+        )  # `path` centers the path's bounding box
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
         check_number("task.friction", self.friction, "[0, inf)")
         check_number("task.episode_s", self.episode_s, f"[{self.begin_s + 2 * self.ramp_s + REST_S:g}, 60]")
 
     @property
     def begin_s(self) -> float:
-        """Time, s, of the start of the path, when the tip certainly touches and the largest force has built up."""
+        """Time, s, at which the path starts: the tip then touches any allowed surface with the full force."""
         return self.down_s + self.force[1] / self.force_rate + REST_S
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task with the model of one arm; see `SurfaceTask.with_model`."""
+        """Return the task with the model `dynamics` of one arm, and with `inertia`; see `SurfaceTask.with_model`."""
         tip = Tip(robot)
         q = tip.posture(self.plane(robot)[0])
-        q = robot.q_home if q is None else q  # out of reach: `goals` raises
+        q = robot.q_home if q is None else q  # if out of reach, `goals` raises an error
         jacobian, mass = tip(q)[1], InverseDynamics(robot, dynamics).mass(q[None])[0]
         inertia = np.linalg.inv(jacobian @ np.linalg.solve(mass, jacobian.T))
         return super(WipeTask, replace(self, inertia=inertia)).with_model(robot, dynamics)
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """Stiffness K, N/m, and rate r of the integral action, 1/s, from the tip's effective mass at the plane.
+        """Stiffness K, N/m, and integral rate r, 1/s, of the default controller, from the tip's effective mass.
 
-        A path needs the stiffest spring that the latency allows: K = m w^2 with the smallest effective mass m. With
-        critical damping, the largest effective mass M has the characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s
-        + K r = 0. The motion is stable for r < 2 (K / M)^(1/2) (Routh and Hurwitz), and r is STEADY times this limit.
+        To follow a path, the spring is as stiff as the latency allows: K = m w^2, with the smallest effective mass m
+        and w of `fastest_spring`. Critically damped, the largest effective mass M has the characteristic equation
+        M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0, stable for r < r0 = 2 (K/M)^(1/2) (Routh, Hurwitz). r = STEADY r0.
         """
         masses = np.linalg.eigvalsh(self.inertia)
         K = float(masses[0] * fastest_spring(self) ** 2)
         return {"stiffness": K, "integral_rate": float(STEADY * 2.0 * np.sqrt(K / masses[-1]))}
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
-        """Return (steps + 1, 3) m, a curve of random kind with speed ~ U(speed) at a random place within `spread`."""
+        """Return (steps + 1, 3) m, a random curve with peak speed ~ U(speed) at a random position within `spread`."""
         size, speed = rng.uniform(*self.size), rng.uniform(*self.speed)
         shape = curve(self.kinds[rng.integers(len(self.kinds))], rng, size, axes)
         t = np.arange(self.steps + 1) / self.ctrl_hz - self.begin_s
@@ -109,12 +109,12 @@ class WipeTask(SurfaceTask):
         return path - middle + away * np.array([np.cos(about), np.sin(about)]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return a random force ~ U(force), N, as the force at start and end of the path."""
+        """Return a random force ~ U(force), N, twice: for the start and for the end of the path."""
         force = rng.uniform(*self.force)
         return force, force
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return (9 (steps + 1),), position m, velocity m/s and acceleration m/s^2 in each row of the path."""
+        """Return the path as 9 (steps + 1) numbers: rows of position m, velocity m/s and acceleration m/s^2."""
         spline = CubicSpline(np.arange(len(path)) / self.ctrl_hz, path)
         return np.hstack([path, spline(spline.x, 1), spline(spline.x, 2)]).ravel()
 
@@ -139,13 +139,13 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and requested force, N, for hybrid control; linear in time between the two forces."""
+        """Return (m, 4), normal and requested force, N, for hybrid control; the force is linear in time."""
         share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
         force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return an impedance's target (m, 6), position and velocity, half a control period after t (m,) s."""
+        """Return the target (m, 6) of impedance control, m and m/s, half a control period after t (m,) s."""
         middle, normal = t + 0.5 / self.ctrl_hz, goals[:, NORMAL]
         now, down = self.now(middle, goals), self.depth(middle, goals)[:, None] * normal
         return np.concatenate([now[:, X] - down, now[:, V]], axis=1)
@@ -170,7 +170,7 @@ class WipeTask(SurfaceTask):
         return np.concatenate([first, np.tanh(away / GOOD_M), now[:, V]], axis=1, dtype=np.float32)
 
     def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
-        """Return the terms of an observation, in the order of `observe`."""
+        """Return the terms of an observation in the order in which `observe` returns them."""
         return [
             *super().observation_terms(robot),
             ObservationTerm(f"tanh(path error / {GOOD_M:g} m)", "1", "path_error", divided_by=GOOD_M, tanh=True),
@@ -186,9 +186,9 @@ class WipeTask(SurfaceTask):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance d (m,) m from the path along the nominal plane, and the reward terms (m, 6).
 
-        Terms with the force error e: force = -tanh(|e| / 5 N), path = -tanh(d / 1 cm), precision =
-        `near`(|e|, 5 N, 2 N) `near`(d, 1 cm, 3 mm), excess = -tanh(max(e, 0) / 10 N),
-        smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2), filter_penalty = -`State.limited`.
+        Terms, with the force error e: force = -tanh(|e| / 5 N); path = -tanh(d / 1 cm); precision =
+        `near`(|e|, 5 N, 2 N) `near`(d, 1 cm, 3 mm); excess = -tanh(max(e, 0) / 10 N);
+        smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty = -`State.limited`.
         """
         beyond, normal = -np.diff(self.forces(state, goals))[:, 0], goals[:, NORMAL]
         offset = self.tip(state.q)[0] - self.at(state.t, goals)

@@ -38,12 +38,12 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv for the steps of the path, which starts at step `begin`.
+    """Return the measures of task wipe, one row of evaluations.csv; the path starts at step `begin`.
 
-    within_2N, within_3mm: share of steps with a force error within 2 N, or a path error within 3 mm. wiped: share of
-    steps within both limits. contact: share of steps above TOUCH_N. Steps of stopped episodes meet no limit here.
-    success: share of episodes wiped to SUCCESS. Without stopped episodes: force_rmse_N, path_rmse_mm are RMS errors,
-    and impact_N is the mean of the largest force within IMPACT_S of the first touch, even before `begin`.
+    within_2N, within_3mm: share of steps with a force error <= 2 N, and with a path error <= 3 mm. wiped: share of
+    steps within both limits. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes never
+    qualify. success: share of episodes with `wiped` >= SUCCESS. For episodes without a stop: force_rmse_N and
+    path_rmse_mm are RMS errors; impact_N is the mean peak force in IMPACT_S after the first touch, at any step.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = ~ended[:, None]

@@ -11,7 +11,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
 
 OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to this value, so that no reflex acts
-# Share of the cautious thresholds that friction and model errors use up: they appear as external torque of up to
+# Share of the cautious thresholds reserved for friction and model errors, which cause an external torque of up to
 # 3.7 Nm (threshold 20 Nm) in joints 1 to 4 of a Panda, and 2.2 Nm (threshold 12 Nm) in its wrist.
 ERROR = 0.2
 FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/contact.yaml
@@ -21,10 +21,10 @@ FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/cont
 class CollisionThresholds:
     """Thresholds of external torque and force above which the arm stops itself.
 
-    libfranka's contact thresholds have the same values. The default values are the lowest in libfranka's examples.
+    r2s sets libfranka's contact thresholds to the same values. The defaults are the lowest in libfranka's examples.
 
     Attributes:
-        torque: (7,) Nm at the joints. force: (6,) N and Nm at the end effector.
+        torque: (7,) Nm, per joint. force: (6,) N and Nm, wrench at the end effector.
 
     Raises:
         UserError: the number of values is wrong, or a value is not above 0.
@@ -45,13 +45,13 @@ CAUTIOUS = CollisionThresholds()
 
 
 def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
-    """Return a task's collision thresholds: above every force that the push limit allows, and at least CAUTIOUS.
+    """Return collision thresholds of at least CAUTIOUS that exceed every force that the push limit allows.
 
-    The tip is assumed to exert the largest normal force that the limit allows on a rigid surface, and
-    FRICTION times this force tangentially. An allowance of ERROR times CAUTIOUS covers model errors.
+    The thresholds assume that the tip exerts the largest normal force that the push limit allows on a rigid surface,
+    and FRICTION times this force tangentially. ERROR times CAUTIOUS is added for model errors.
 
     Raises:
-        UserError: the thresholds would switch the reflexes off.
+        UserError: the thresholds would be so high that they switch the reflexes off.
     """
     cautious = np.array(CAUTIOUS.torque), np.array(CAUTIOUS.force)
     if limit is None:

@@ -9,14 +9,14 @@ import numpy as np
 from r2s.arm.clients.connection_check import Finding
 from r2s.physics.robot import SIM_DT
 
-LOST_SHARE = 0.01  # share of the states; the same limit as for lost commands, because both use the same cable
+LOST_SHARE = 0.01  # largest share of lost states; the limit for lost commands is the same, as both use one cable
 GAP_S = 0.02  # 20 cycles without an answer stop the arm
 REALTIME = Path("/sys/kernel/realtime")  # where libfranka looks for a real-time kernel
 LIMITS = resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK
 
 
 def computer_findings(realtime: bool) -> list[Finding]:
-    """Check kernel and permissions; `realtime`: whether libfranka will require them."""
+    """Check kernel and permissions; if `realtime`, libfranka requires both, so a missing one forbids motion."""
     kernel = REALTIME.is_file() and REALTIME.read_text().strip() == "1"
     fifo, (priority, _), (memory, _) = _may_use_fifo(), *map(resource.getrlimit, LIMITS)
     locked = "unlimited" if memory == resource.RLIM_INFINITY else f"{memory / 2**20:.0f} MiB"
@@ -30,7 +30,7 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check the states of a resting arm; arm, here: their times (k,) s on the arm's clock and on this computer's."""
+    """Check for lost or late states, from their times (k,) s by the arm's clock and by this computer's (`here`)."""
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)

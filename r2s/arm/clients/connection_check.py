@@ -1,4 +1,4 @@
-"""Check at connection, before anything moves, whether the arm at the address matches the model."""
+"""Check whether a newly connected arm matches the model, before the arm moves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,8 +17,8 @@ from r2s.physics.robot import Robot
 PLACE_M, ANGLE_DEG = 1e-3, 0.2  # a tenth of the accuracy of a policy; 0.2 deg are 1 mm at 0.3 m
 LOAD_KG = 0.01  # 0.08 Nm at full reach: less than the friction of any joint, so the arm does not sink
 GRAVITY = 0.1  # m/s^2: 0.6 deg of tilt, 1 % of gravity compensation
-# Without O_ddP_O, the gravity torque is compared. Link models differ, so only tilts above 5 to 12 deg are detected
-GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # allowed error: share of the posture's largest gravity torque, plus Nm
+# Without O_ddP_O, r2s compares gravity torques. Link models differ, so only tilts above 5 to 12 deg are detected
+GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # allowed error: a share of the posture's largest gravity torque, plus 1 Nm
 BEYOND = 0.1  # rad, how far a person may guide a joint beyond its limit
 
 
@@ -27,8 +27,8 @@ class ArmType:
     """A type of Franka arm and its limits (Franka's FCI documentation).
 
     Attributes:
-        name: name of the type. version: version of its FCI.
-        q_min, q_max, dq_max, tau_max: (7,) rad, rad/s, Nm. dtau_max: Nm/s.
+        name: name of the arm type. version: version of the arm's FCI.
+        q_min, q_max, dq_max, tau_max: (7,) rad, rad/s, Nm, joint limits. dtau_max: Nm/s, limit of the torque rate.
     """
 
     name: str
@@ -59,10 +59,10 @@ FR3 = ArmType("FR3", 10, fr3_limits.Q_MIN, fr3_limits.Q_MAX, fr3_limits.DQ_MAX, 
 
 @dataclass(frozen=True)
 class Finding:
-    """The comparison of one quantity of an arm or a computer with its expected value.
+    """Result of comparing a property of the arm or computer with the value that r2s expects.
 
     Attributes:
-        name: the quantity. expected: value in r2s. found: value on arm or computer. refused: True forbids motion.
+        name: the property. expected: expected value. found: actual value. refused: whether the result forbids motion.
     """
 
     name: str
@@ -76,11 +76,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class Connection:
-    """The properties that a client requires of its arm.
+    """Properties that an arm must have before a client moves this arm.
 
     Attributes:
-        arm: type of the arm. declared: payload, with end effector, for which the arm should compensate gravity.
-        moves: False (for `r2s check`): the client only reports a mismatch, and cannot move the arm.
+        arm: type of the arm. declared: payload plus end effector that the arm's gravity compensation should assume.
+        moves: whether the client may move the arm; if False (`r2s check`), the client only reports mismatches.
     """
 
     arm: ArmType
@@ -122,13 +122,13 @@ class Connection:
 
 
 def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
-    """Return the gravity torque (n,) Nm of nominal links and a load (4,) from `mass_and_moment`, at q (n,) rad."""
+    """Return the gravity torque (n,) Nm of the nominal links and a load (4,) (`mass_and_moment`) at q (n,) rad."""
     rest = np.zeros((1, robot.n))
     return nominal_torque(robot, q[None], rest, rest)[0] + LoadTorque(robot)(q, load)
 
 
 def _load_of(robot: Robot, s: Any) -> np.ndarray:
-    """Return mass and first moment (4,) of the end effector plus load that the arm's RobotState declares."""
+    """Return the mass and first moment (4,) that the arm's RobotState declares for end effector plus load."""
     place, axes = ee_pose(robot)
     tool = np.array(s.F_T_EE).reshape(4, 4).T
     flange = axes @ tool[:3, :3].T
@@ -136,7 +136,7 @@ def _load_of(robot: Robot, s: Any) -> np.ndarray:
 
 
 def refuse(findings: Sequence[Finding], what: str) -> None:
-    """Raise UserError, with one line that lists all findings that forbid motion; do nothing if there are none."""
+    """Raise UserError with a one-line list of the findings that forbid motion, if there are any."""
     if wrong := [str(finding) for finding in findings if finding.refused]:
         raise UserError(f"{what}: {'; '.join(wrong)}")
 
@@ -149,7 +149,7 @@ def _posture(arm: ArmType, q: np.ndarray) -> Finding:
 
 
 def _limits(arm: ArmType, robot: Robot) -> list[Finding]:
-    """Compare the limits: torque limits must not exceed the arm's, and home must be within the clipped limits."""
+    """Check that the robot's torque limits do not exceed the arm's and that home lies within the clipped limits."""
     step, torque = robot.dtau_max / arm.dtau_max, robot.tau_max / arm.tau_max
     i, j, home = int(torque.argmax()), int(step.argmax()), robot.q_home
     k = int(np.maximum(robot.q_min - home, home - robot.q_max).argmax())

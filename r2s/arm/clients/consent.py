@@ -10,7 +10,7 @@ CONSENT = "go on"  # the operator types this to allow further motion
 
 
 class Operator(Protocol):
-    """A person who watches the arm."""
+    """Function that asks the person watching the arm for permission to move."""
 
     def __call__(self, reason: str, /) -> bool:
         """Return whether the arm may move again after a stop with this reason."""
@@ -18,7 +18,7 @@ class Operator(Protocol):
 
 
 def find_operator(operator: Operator | str | None) -> Operator | None:
-    """Return the operator for a setting, which is 'terminal', a function, or None."""
+    """Return the operator function for the setting `operator`: 'terminal', a function, or None (no operator)."""
     if not isinstance(operator, str):
         return operator
     if operator != "terminal":
@@ -30,11 +30,11 @@ def operator_agrees(reason: str) -> bool:
     """Ask at the terminal whether a stopped arm may move again; without a terminal the answer is no."""
     if not sys.stdin.isatty():
         return False
-    termios.tcflush(sys.stdin, termios.TCIFLUSH)  # input typed before the question does not count
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)  # discard input typed before the question
     question = f"check the arm; type '{CONSENT}' to let it move again, anything else ends the run:"
     print(
         f"\nthe arm was stopped: {reason}\n{question}", file=sys.stderr
-    )  # a whole line, which a pipeline shows at once
+    )  # a whole line, so that a pipeline shows the question at once
     try:
         answer = input()
     except EOFError:

@@ -34,10 +34,10 @@ def emulated_arm(
     moves: bool = True,
     speed_share: float = 1.0,
 ) -> AbstractContextManager[Franka]:
-    """Open an emulated Panda or FR3; conf/arm/*_emulated.yaml sets these arguments.
+    """Open an emulated Panda or FR3 with the arguments from conf/arm/*_emulated.yaml.
 
     Args:
-        robot: nominal model. client: 'panda' or 'fr3'. seed: seed of the emulated arm, a rigid twin.
+        robot: nominal model. client: 'panda' or 'fr3'. seed: random seed of the rigid twin that replaces the arm.
         realtime: run at 1 kHz instead of in lock-step. noise, payload, declared_payload, surface: see `TwinBase`.
         operator, collision_torque, collision_force, speed_share, moves: see `Panda`.
     """

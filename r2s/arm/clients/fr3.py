@@ -33,7 +33,7 @@ def within_fr3(robot: Robot) -> Robot:
 
 
 def as_driven(robot: Robot) -> Robot:
-    """Return `within_fr3(robot)` if the robot's limits fit an FR3, else the robot."""
+    """Return `within_fr3(robot)` if the robot's limits are within those of an FR3, else the unchanged robot."""
     limits = fr3_limits
     if robot.n != len(limits.Q_MIN) or robot.velocity_envelope is not None:
         return robot
@@ -43,7 +43,7 @@ def as_driven(robot: Robot) -> Robot:
 
 class _FR3Client(Client):
     name, package = "fr3", "pylibfranka"
-    version = 10  # libfranka connects to no other version, and pylibfranka does not report it
+    version = 10  # libfranka connects to no other version, and pylibfranka does not report the version
 
     def __init__(self, address: str, realtime: bool):
         super().__init__(address, realtime)

@@ -1,4 +1,4 @@
-"""Joint limits of an FR3, which differ from a Panda's, and its position-dependent velocity limit.
+"""Joint limits of an FR3, which differ from a Panda's, and the FR3's position-dependent velocity limit.
 
 Source: Franka's FCI documentation, limits for FR3 with system version 5.9 or later.
 """

@@ -1,8 +1,8 @@
 """Implement the `Arm` protocol on a libfranka client, hardware or emulated: the base of Panda and FR3.
 
 libfranka has no point-to-point motion in torque control. So `move_to` follows a slow, checked joint path with the
-recorder's tracking controller, in the same 1 kHz torque loop as every other motion. The path needs no robot model
-from libfranka, and tests on the emulator run the same code that moves the hardware.
+recorder's tracking controller, in the same 1 kHz torque loop as every other motion. So `move_to` needs no robot model
+from libfranka, and tests on the emulator run the code that also moves the hardware.
 """
 
 import weakref
@@ -36,7 +36,7 @@ from r2s.recordings.recording import SIGNALS
 SPEED = 0.2  # share of dq_max
 ACCELERATION = 0.2  # share of ddq_max
 TORQUE_SHARE = 0.2  # share of tau_max that the driver allows
-MAX_DEVIATION = 0.1  # rad off the path, less where an obstacle is near; beyond it `move_to` gives up
+MAX_DEVIATION = 0.1  # rad off the path, less where an obstacle is near; a larger deviation aborts `move_to`
 SETTLE_S = 3.0  # s, longest time to settle at the end of the path
 INTEGRAL_GAIN = 15.0  # share of tau_max per rad s; overcomes breakaway torque at the end of the path
 INTEGRAL_SHARE = 0.15  # share of tau_max, limit of the integral's torque
@@ -51,23 +51,23 @@ class Franka:
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked: see `Operated`. Every end of a motion except `stop` sets `blocked`: a reflex, the stop
-            button (even if released since), a rejected command, a failed `move_to`. hold: see `Holds`.
+        operator, blocked: see `Operated`. A reflex, the stop button (even if released since), a rejected command or a
+            failed `move_to` sets `blocked`; `stop` does not. hold: see `Holds`.
         findings: results of the check at connection.
-        realtime: whether motions run in a `realtime_section`. Recordings and episodes are then rejected if less
-            than 99 % of the commands arrive in time.
+        realtime: whether motions run in a `realtime_section`. In real time, r2s rejects recordings and episodes in
+            which less than 99 % of the commands arrive in time.
 
     Args:
         robot: limits and nominal model.
         client: the connection.
-        operator: called with the reason of a stop before the arm moves again. None: after a stop, `move_to` raises
-            NotCleared until a new connection finds the arm ready.
+        operator: asked after a stop before the arm moves again. Without an operator (None), `move_to` raises
+            NotCleared after a stop until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
-        connection: properties that the arm must have; None: no check.
-        speed_share: factor on all allowed speeds, in every motion.
+        connection: properties that the arm must have; None skips this check.
+        speed_share: factor on all allowed speeds in every motion.
 
     Raises:
-        UserError: the arm does not match the model; nothing has moved.
+        UserError: the arm does not match the model; the arm has not moved.
     """
 
     def __init__(
@@ -105,12 +105,12 @@ class Franka:
     def move_to(self, q: np.ndarray) -> ArmState:
         """Move to q (7,) rad at up to a fifth of the speed limits; do not move if the arm is within 2 mrad of q.
 
-        The path is the first candidate of r2s/excitation/paths.py without a violation of limits or clearances.
+        The arm follows the first path of r2s/excitation/paths.py that respects the limits and clearances.
 
         Raises:
-            NotCleared: the arm stopped before, and no operator agreed that it may move.
+            NotCleared: the arm stopped before, and no operator agreed that the arm may move.
             StopRequested: a signal requested a stop, or the policy's process ended; the arm is at rest.
-            ArmStopped: q is outside the limits, the arm is not ready, or no path exists (the arm has not moved); or
+            ArmStopped: before a motion, q is outside the limits, the arm is not ready, or no path exists. In motion,
                 the arm stopped itself, deviated from the path by 0.1 rad, or ended more than 10 mrad from q.
 
         """
@@ -127,15 +127,15 @@ class Franka:
         return self._state
 
     def read(self) -> ArmState:
-        """Return the state of the current cycle; before a motion's first command, the state of the arm at rest."""
+        """Return the state of the current cycle, or of the arm at rest if the motion has had no command yet."""
         return self._state
 
     def command(self, tau: np.ndarray) -> None:
-        """Send tau (7,) Nm without gravity and wait for the next cycle; the first one starts the motion.
+        """Send tau (7,) Nm, without gravity, and wait for the next cycle; the first command starts the motion.
 
         Raises:
-            ArmStopped: the arm stopped itself (libfranka's message), or it would reject the command. A rejected
-                command is not sent; the arm is brought to rest instead.
+            ArmStopped: the arm stopped itself (libfranka's message), or the arm would reject the command. This method
+                does not send a command that the arm would reject, but brings the arm to rest.
 
         """
         if self._stopped is not None:
@@ -151,7 +151,7 @@ class Franka:
         self._send(tau)
 
     def stop(self) -> None:
-        """Damp the motion for at most 0.5 s, then end the motion; `blocked` retains an earlier reason."""
+        """Damp the motion for at most 0.5 s, then end the motion; do not overwrite an earlier reason in `blocked`."""
         if self._damping:  # the command loop calls `stop` while it damps
             return
         for part in (self._damp, self._end):  # `_end` also runs if damping failed
@@ -167,7 +167,7 @@ class Franka:
             self._stopped = "stop was called"
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of the arm at rest; return their times (k,) s on the arm's clock and on this computer's."""
+        """Read k states of the arm at rest; return the times (k,) s by the arm's clock and by this computer's."""
         return self._client.watch(seconds)
 
     def close(self) -> None:
@@ -229,14 +229,14 @@ class Franka:
         return found
 
     def _read_idle(self) -> None:
-        """Read the state between motions, and set tau_J_d to 0 instead of the torque of the arm's own controller."""
+        """Read the state between motions; replace tau_J_d, the torque of the arm's own controller, by 0."""
         s = self._client.idle()
         self._begun = _ms(s)
         sample = self._sample(s)
         self._state = replace(sample, t=0.0, tau_J_d=np.zeros(self.robot.n))
 
     def _prepare(self) -> None:
-        """Raise ArmStopped unless the arm can move; after a stop the operator must agree first."""
+        """Prepare a motion; ask the operator after a stop, and raise ArmStopped if the arm cannot move."""
         if self._closed:
             raise ArmStopped("the connection was closed")
         if self._connection is not None and not self._connection.moves:
@@ -262,7 +262,7 @@ class Franka:
         self._read_idle()
 
     def _plan(self, q: np.ndarray) -> np.ndarray:
-        """Return the postures (k, 7) rad of the path to q (7,) rad; k is 0 if the arm is already at q."""
+        """Return the k postures (k, 7) rad of a joint path to q (7,) rad; k is 0 if the arm is already at q."""
         here = self._state.q
         if np.abs(here - q).max() <= ARRIVED:
             return q[:0, None]
@@ -274,7 +274,7 @@ class Franka:
             raise ArmStopped(self._stopped) from None
 
     def _follow(self, q: np.ndarray) -> None:
-        """Follow the straight joint path to q (7,) rad."""
+        """Move along a straight line in joint space to q (7,) rad."""
         path, moving = _slow_path(self.robot, self._state.q, q, self.speed_share)
         assert self._space is not None  # set by `_plan`
         allowed = DeviationLimits.along(self._space, path, MAX_DEVIATION)
@@ -318,7 +318,7 @@ def _ms(state: Any) -> int:
 
 
 def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray, share: float) -> tuple[Excitation, int]:
-    """Return a minimum-jerk path with SETTLE_S of rest at its end, and the number of rows before this rest."""
+    """Return a minimum-jerk motion that ends with a rest of SETTLE_S, and the number of rows before this rest."""
     distance = np.abs(end - start)
     # peaks of minimum jerk: velocity 15/8 distance / T, acceleration 10/sqrt(3) distance / T^2
     duration = max(

@@ -23,7 +23,7 @@ class Client:
     If libfranka reports an error, a method raises ArmStopped with libfranka's message.
 
     Attributes:
-        name: option of the group `arm`, and the extra that installs the package. package: name of its module.
+        name: option of the group `arm`, also the name of the extra to install. package: name of the Python module.
         version: version of the arm's FCI.
 
     Args:
@@ -54,11 +54,11 @@ class Client:
         raise NotImplementedError
 
     def idle(self) -> Any:
-        """Return a fresh RobotState while no motion runs; read twice, because the first state may be outdated."""
+        """Return a new RobotState between motions; read twice, because the first state may be outdated."""
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of an arm at rest; return their times (k,) s on the arm's clock and on this computer's."""
+        """Read k states of an arm at rest; return the times (k,) s by the arm's clock and by this computer's."""
         times, begun = [], time.perf_counter()
         while time.perf_counter() < begun + seconds:
             times.append((self._call(self._robot.read_once).time.to_sec(), time.perf_counter()))
@@ -100,9 +100,9 @@ def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
 
 
 def is_reachable(address: str) -> bool:
-    """Return whether a computer answers at the address; a refused connection is an answer too.
+    """Return whether a computer answers at the address, if only by refusing a connection.
 
-    Try the FCI port second, because a connection to this port occupies the arm's only client slot.
+    The FCI port is tried last, because a connection to this port occupies the arm's only client slot.
     """
     for port in (DESK_PORT, fci.PORT):
         try:

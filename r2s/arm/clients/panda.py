@@ -1,8 +1,8 @@
 """Connect to a Panda (FER) through panda-python (libfranka 0.9): hardware, or the emulator in FCI version 5.
 
 libfranka calls a callback once per millisecond, but r2s calls the methods of an `Arm`. So libfranka's loop runs in a
-thread, in which the callback passes each state to r2s and waits for the command. libfranka's rate limiter and
-low-pass are off: the arm receives unchanged commands.
+thread, in which the callback passes each state to r2s and waits for a command. libfranka's rate limiter and low-pass
+are switched off, so the arm receives unchanged commands.
 """
 
 import threading
@@ -77,11 +77,11 @@ class _Motion:
         return state  # None only follows an answer of None
 
     def answer(self, tau: np.ndarray | None) -> None:
-        """Send the command tau (7,) Nm for the last state from `next`; None ends the motion."""
+        """Answer the last state from `next` with the command tau (7,) Nm; None ends the motion."""
         self._answers.put(tau if tau is None else tau.tolist())
 
     def join(self) -> None:
-        """Wait until the motion has ended, after `answer(None)`."""
+        """Wait until the motion has ended; call `answer(None)` first."""
         self._thread.join()
         while not self._states.empty():  # an interrupted reader may leave a state in the queue
             end = self._states.get()
@@ -122,7 +122,7 @@ class Panda(Franka):
     """A Franka Emika Panda.
 
     Attributes:
-        arm_type, client_type: types of arm and client. within: function that clips a robot's limits to the arm's.
+        arm_type: type of the arm. client_type: class of the client. within: function that clips limits to the arm's.
 
     Args:
         robot: limits and nominal model.
@@ -131,7 +131,7 @@ class Panda(Franka):
         realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
         collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
         declared_payload: payload that the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
-            `payload_of`; the connection is refused if the arm declares another mass. moves: see `Connection`.
+            `payload_of`; r2s refuses an arm that declares a different mass. moves: see `Connection`.
 
     Raises:
         UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm there does

@@ -1,6 +1,6 @@
 """Emulate the control box between FCI server and arm: modes, cycles, missed answers, reflexes, injected faults.
 
-The control box (Franka's Control) has no sockets and no clock here: a call of `cycle` is one millisecond.
+This model of the control box (Franka's Control) has no sockets and no clock: each call of `cycle` simulates 1 ms.
 """
 
 from collections import deque
@@ -42,8 +42,8 @@ class Fault:
             'joint_limit': the arm reports a position limit. 'estop': the stop button is pressed and stays pressed.
             'press': the stop button is pressed for `cycles` ms. 'hold': an external force stops the first link; the
             arm needs the attribute `external`.
-        cycle: first control cycle of the fault, from 0.
-        motion: number of the server's motion, from 0; each straight part of a `move_to` path is a motion.
+        cycle: control cycle in which the fault begins, from 0.
+        motion: motion with the fault, from 0; a `move_to` runs one motion per straight segment of the joint path.
         cycles: number of consecutive cycles with the fault; 20 late or dropped cycles stop the arm.
 
     """
@@ -67,12 +67,12 @@ class Control:
     """Runs torque motions on an arm of 7 joints and maintains its RobotState.
 
     Attributes:
-        state: RobotState of `version`, without message_id.
-        running: whether a motion is active.
-        stopped_by: why the last motion was aborted; None if the motion was not aborted.
+        state: RobotState in the format of `version`; the server sets message_id.
+        running: whether a motion is in progress.
+        stopped_by: reason why the last motion was aborted; None: no abort.
 
     Args:
-        arm: arm of the box. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
+        arm: the arm. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
         version: version of the FCI. faults, max_missed: see `Emulator`.
         desk: settings of `DESK` by name, such as {"m_ee": 0.73}; they may differ from the arm's true settings.
     """
@@ -125,11 +125,11 @@ class Control:
 
     @property
     def dropped(self) -> bool:
-        """Whether the state of this cycle does not reach the client."""
+        """Whether a fault prevents the state of this cycle from reaching the client."""
         return self.running and self._has("drop")
 
     def begin(self) -> None:
-        """Start a motion at the arm's posture; `first_answer` must come before the first `cycle`."""
+        """Start a motion at the arm's posture; call `first_answer` before the first `cycle`."""
         self.running, self.stopped_by = True, None
         self._motion, self._cycle, self._missed = self._motion + 1, 0, 0
         self._answered.clear()
@@ -143,7 +143,7 @@ class Control:
         self._sense()
 
     def cycle(self, tau: np.ndarray | None) -> None:
-        """Advance the arm by 1 ms under tau (7,) Nm, or under its last torque if tau is None (no answer)."""
+        """Advance the arm by 1 ms under tau (7,) Nm; without an answer (None), the last torque continues to act."""
         if self._has("late"):
             tau = None
         self._answered.append(tau is not None)
@@ -260,10 +260,10 @@ class Control:
             self._arm.external = np.zeros(7)
 
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
-        """Filter the external torque, set wrench and contact flags; return a collision's error and message, or None.
+        """Filter the external torque, set wrench and contact flags; after a collision, return error and message.
 
-        As in libfranka, external torque is tau_J minus the model's torque: what the joints exert on the surroundings,
-        plus the effect of wrong `DESK` settings. Friction and model errors do not affect it here.
+        As in libfranka, the external torque is tau_J minus the model's torque, so wrong `DESK` settings change it.
+        Unlike on a real arm, friction and model errors have no effect on the emulated external torque.
 
         Args:
             gain: gain of the low-pass; 1 (no filtering) for an arm at rest.
@@ -300,7 +300,7 @@ class Control:
         arm, s, version = self._arm.read(), self.state, self._version
         s["q"] = s["q_d"] = s["theta"] = arm.q
         s["dq"] = s["dtheta"] = arm.dq
-        # at rest the box's own controller holds the arm, also where a simulated one would sink
+        # at rest the box's own controller holds the arm, even where a simulated arm would sink
         s["tau_J"] = arm.tau_J if self.running else self._model.compensation(arm.q, s) + self._external
         s["tau_J_d"] = arm.tau_J_d
         pose = self._model.pose(arm.q, s["F_T_EE"].reshape(4, 4).T)

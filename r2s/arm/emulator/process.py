@@ -3,7 +3,7 @@
     with Emulator(partial(RigidTwin, robot, 3), version=5) as address:
         arm = Panda(robot, address, operator=lambda reason: True)
 
-The emulated box can use any `Arm`. In lock-step, the default, the arm's clock advances only with a command: the same
+The emulated box can control any `Arm`. In lock-step, the default, the arm's clock advances only with a command: equal
 commands cause the same motion, bit for bit, even on a slow computer. In real time the clock runs at 1 kHz, and an
 answer that arrives after its millisecond has no effect.
 
@@ -31,10 +31,10 @@ class Emulator:
     """Runs a `Server` in a separate process, which ends when the context or this process ends.
 
     Args:
-        make_arm: creates the arm in the other process, so must be picklable: `partial(RigidTwin, robot, 3)`.
-        version: version of the FCI. 5: libfranka 0.9 (the Panda). 10: 0.18 and later (the FR3).
+        make_arm: picklable function that creates the arm in the server's process: `partial(RigidTwin, robot, 3)`.
+        version: FCI version: 5 for libfranka 0.9 (Panda), 10 for libfranka 0.18 and later (FR3).
         realtime: run at 1 kHz instead of in lock-step.
-        faults: the faults to inject.
+        faults: faults that the emulator injects.
         max_missed: consecutive cycles without an answer that stop the arm. desk: settings of the box, see `Control`.
     """
 

@@ -23,9 +23,9 @@ BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's fi
 class Server:
     """Serves one client at a time, in one thread.
 
-    A motion begins when the client has answered the newest state. Until then the arm stands still and the server
-    repeats states, because a starting client may skip some. The server does not execute the first answer. The
-    first executed command answers the first state whose control_command_success_rate is above zero.
+    A motion begins when the client answers the newest state. Until this first answer, the arm stands still and the
+    server sends more states, because a starting client may skip some. The server does not execute the first answer.
+    The first executed command answers the first state whose control_command_success_rate is above zero.
     """
 
     def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
@@ -37,7 +37,7 @@ class Server:
         self._reset()
 
     def serve(self, parent: int) -> None:
-        """Run until the pipe `parent` closes."""
+        """Serve the client until the parent process, watched through the file descriptor `parent`, ends."""
         with realtime_section() if self._realtime else contextlib.nullcontext():
             self._serve(parent)
 
@@ -163,7 +163,7 @@ class Server:
     # --- the cycle, by UDP
 
     def _commands(self) -> None:
-        """Process the client's commands; ignore those that do not answer the newest state."""
+        """Process the client's commands; ignore every command that does not answer the newest state."""
         assert self._udp is not None
         kind = fci.COMMAND[self._version]
         with contextlib.suppress(BlockingIOError):
@@ -188,7 +188,7 @@ class Server:
                     self._ahead = True
 
     def _cycle(self, tau: np.ndarray | None) -> None:
-        """Run one cycle, then all cycles whose states are dropped, because the client cannot answer these states."""
+        """Run one cycle, then all cycles whose states a fault drops; the client cannot answer dropped states."""
         self._control.cycle(tau)
         while self._control.dropped and not self._realtime:
             self._message_id += 1
@@ -203,7 +203,7 @@ class Server:
             self._finish(self._control.aborted_as)
 
     def _tick(self) -> None:
-        """Send the state that is due, and schedule the next state."""
+        """Send the state that was scheduled for this time, and schedule the next state."""
         assert self._due is not None
         if self._started and self._realtime:
             if not self._ahead:

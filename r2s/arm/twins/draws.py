@@ -21,7 +21,7 @@ def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
 
 
 def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return kinetic friction (n,), range of |offset| (n, 2), largest cable drag (n,) and torque noise (n,), Nm.
+    """Return kinetic friction (n,), range of |offset| (n, 2), largest cable torque (n,) and torque noise (n,), Nm.
 
     The magnitudes for a Panda follow the paper's Tables I and IV; for other arms they depend on the torque limits.
     """
@@ -36,10 +36,10 @@ def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw (8, n): torque offset, Nm; four parameters of `drag`; standard deviations of noise on q, dq and tau_J.
+    """Draw 8 parameters per joint (8, n): torque offset, Nm, four for `drag`, and the noise of q, dq and tau_J.
 
     Args:
-        robot: the arm. rng: random number generator. hold: (n,) Nm, lower bound of static friction.
+        robot: the arm. rng: random number generator. hold: (n,) Nm, lower bound of each joint's stiction.
         unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
     """
     _, offset_range, drag_max, noise_max = magnitudes(robot)
@@ -62,5 +62,5 @@ def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, 
 
 @njit(cache=True)
 def drag(own, along, waves, phase, q, q_next):
-    """Return a cable's torque, Nm, on a joint at the angle q, rad, if the next joint is at q_next, rad."""
+    """Return a cable's torque, Nm, on a joint with angle q, rad; the next joint has the angle q_next, rad."""
     return own * np.sin(waves * q + phase) + along * np.sin(q_next - phase)

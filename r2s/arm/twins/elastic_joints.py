@@ -32,7 +32,7 @@ FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: friction power, W, at which h
 HELP, HELP_VISCOUS, HELP_WIDTH = range(18, 21)  # the arm's own friction compensation: Nm, Nm s/rad, rad/s
 ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
 OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
-# ... of the state (STATES, n); *_AT: at the time of measurement; ADDED: Nm, torque that the arm adds to the command
+# ... of the state (STATES, n); *_AT: at the time of measurement; ADDED: Nm, torque that the arm adds to a command
 LINK_Q, LINK_V, THETA, W, MOTOR, HEAT, Q_MEASURED, DQ_MEASURED, TAU_MEASURED, THETA_AT, W_AT, S_AT, ADDED, STATES = (
     range(14)
 )
@@ -66,11 +66,11 @@ def level(p, w, load, side, i):
 
 @njit(cache=True)
 def _next_velocity(p, w, middle, push, load, factor, h, i):
-    """Return a motor's velocity, rad/s, after h s under friction and the torque `push`, Nm, of all other effects.
+    """Return a motor's velocity, rad/s, after h s under friction and all other torques, whose sum is `push`, Nm.
 
     Args:
-        p, i: parameters, index of the joint. w: present velocity, rad/s. middle: mid-step velocity, rad/s, at which
-            friction is evaluated if it has the motor's direction. load: gear torque, Nm. factor: scale of friction.
+        p: parameters. i: joint index. w: present velocity, rad/s. middle: mid-step velocity, rad/s, for evaluating
+            friction, if it has the direction of w. load: gear torque, Nm. factor: scale of friction.
     """
     side = np.sign(w)
     if w != 0.0:
@@ -78,7 +78,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
         after = w + h / p[ROTOR, i] * (push - side * f)
         if after * side >= 0.0:
             return after
-        h *= 1.0 - w / (w - after)  # the time left after the motor has come to rest
+        h *= 1.0 - w / (w - after)  # the rest of the step, after the motor has come to rest
     side = np.sign(push)
     edge = factor * level(p, 0.0, load, side, i)
     if abs(push) <= edge:
@@ -89,7 +89,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
 
 @njit(cache=True)
 def _active(line, cycle, t, delay):
-    """Return the row of `line` with the newest command whose delay has passed at time t, cycles; -1 if none has."""
+    """Return the row of the newest command in `line` that is effective at time t, cycles; -1: no such command."""
     slots, arrival = len(line), line.shape[1] - 1
     for k in range(cycle, max(cycle - slots, -1), -1):
         if line[k % slots, arrival] + delay <= t:
@@ -99,7 +99,7 @@ def _active(line, cycle, t, delay):
 
 @njit(cache=True)
 def _commanded(line, cycle, begin, end, delay, i):
-    """Return the mean of joint i's delayed command, Nm, between the times `begin` and `end`, cycles."""
+    """Return joint i's delayed command, Nm, averaged from the time `begin` to the time `end`, both in cycles."""
     older, newer = _active(line, cycle, begin, delay), _active(line, cycle, end, delay)
     after = line[newer, i] if newer >= 0 else 0.0
     if older == newer:
@@ -110,7 +110,7 @@ def _commanded(line, cycle, begin, end, delay, i):
 
 @njit(cache=True)
 def compensate(p, s, gravity):
-    """Set ADDED, the torque that the arm adds to a command: gravity (n,) Nm and partial friction compensation."""
+    """Compute the torque that the arm adds to a command (row ADDED): gravity (n,) Nm plus part of the friction."""
     for i in range(s.shape[1]):
         dq = s[DQ_MEASURED, i]
         s[ADDED, i] = gravity[i] + p[HELP, i] * np.tanh(dq / p[HELP_WIDTH, i]) + p[HELP_VISCOUS, i] * dq
@@ -118,13 +118,13 @@ def compensate(p, s, gravity):
 
 @njit(cache=True)
 def advance(p, s, arm, line, cycle, steps, age):
-    """Advance the arm by one cycle in `steps` steps; the sensors measure `age` cycles before the end of the cycle.
+    """Simulate one cycle in `steps` steps; the sensors measure `age` cycles before the end of the cycle.
 
     Args:
-        p: parameters. s: state, updated in place.
-        arm: (links, gravity, touch) of the true arm, where touch is (contact, Jacobian, frames, axes, whether there
-            is a surface), see `Touch`.
-        line: (slots, n + 1), the last commands, Nm, and their arrival times, cycles. cycle: number of this cycle.
+        p: joint parameters (ROWS, n). s: joint states (STATES, n), updated in place.
+        arm: (links, gravity, touch) of the true arm; touch contains the attributes contact, jacobian, frames, axes
+            and there of `Touch`.
+        line: (slots, n + 1), the last commands, Nm, and the arrival time of each, cycles. cycle: index of this cycle.
     """
     links, gravity, touch = arm
     n, h = s.shape[1], SIM_DT / steps
@@ -181,7 +181,7 @@ def _touch(s, links, touch, h, out):
 
 @njit(cache=True)
 def _external_forces(p, s, f, line, cycle, begin, end, h):
-    """Set motor torque, friction factor, spring torque and velocities in `f` for a step from `begin` to `end`."""
+    """Write motor and spring torques, friction factors and velocities of a step (`begin` to `end`, cycles) to `f`."""
     for i in range(s.shape[1]):
         target = s[ADDED, i] + _commanded(line, cycle, begin, end, p[DELAY, i], i)
         change = (target - s[MOTOR, i]) * -np.expm1(-h / p[LAG, i])
@@ -194,7 +194,7 @@ def _external_forces(p, s, f, line, cycle, begin, end, h):
 
 @njit(cache=True)
 def _accelerate(p, s, f, bias, root, h, last):
-    """Predict the velocities at mid-step; if `last`, complete the step with the velocities predicted before."""
+    """Predict the velocities at mid-step; if `last`, use this prediction to compute the velocities after the step."""
     n, q = s.shape[1], s[LINK_Q]
     for i in range(n):
         gear = f[F_SPRING, i] + p[GEAR, i] * (f[F_W, i] - f[F_LINK_V, i])
@@ -217,7 +217,7 @@ def _accelerate(p, s, f, bias, root, h, last):
 
 @njit(cache=True)
 def sense(p, s, noise, dq_filter):
-    """Compute the sensor values from the state in the rows *_AT and the standard normal `noise` (3, n)."""
+    """Compute the sensor values from the rows *_AT of the state and the standard normal `noise` (3, n)."""
     for i in range(s.shape[1]):
         s[Q_MEASURED, i] = ENCODER * np.round((s[THETA_AT, i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
         s[DQ_MEASURED, i] += dq_filter * (s[W_AT, i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_MEASURED, i])

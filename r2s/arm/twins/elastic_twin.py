@@ -1,13 +1,13 @@
 """The elastic variant of the hidden twin, with effects that the identification's models lack.
 
-The gears are elastic and oscillate. Friction holds a resting motor exactly, has another Stribeck curve, decreases
-with heat, and ripples with the gears' rotation (elastic_joints.py). The control box compensates part of the friction,
-has a clock that jitters, and occasionally loses a command. Delay and lag differ between joints. Links, offsets, cable
-drag, noise and quantization are drawn as in the rigid variant. The seed determines the robot's parameters, which only
-this file reads. Seeds 0-9 are for development, seeds of 200 and above for final evaluation.
+The gears are elastic and oscillate. Friction holds a resting motor without creep, follows a different Stribeck curve
+than in the rigid variant, decreases with heat, and ripples with the gear angle (elastic_joints.py). The control box
+compensates part of the friction, has a clock that jitters, and occasionally loses a command. Delay and lag differ
+between joints. Links, offsets, cable drag, noise and quantization are as in the rigid variant. The seed determines
+the robot's parameters, which only this file reads. Seeds 0-9 are for development, seeds >= 200 for evaluation.
 
-In each 1 ms cycle the control box adds its compensation to the command, elastic_joints.py integrates rotors and links
-in steps of at most 0.05 ms, and the sensors measure the motors up to 0.5 ms before the end of the cycle.
+In each 1 ms cycle the control box adds its compensation to the command. elastic_joints.py then integrates rotors and
+links in steps of at most 0.05 ms. The sensors measure the motors up to 0.5 ms before the end of the cycle.
 """
 
 from typing import Any
@@ -31,13 +31,13 @@ STATIC_ROUNDS = 50  # fixed-point iterations that find the posture in which the 
 
 
 class ElasticTwin(TwinBase):
-    """The elastic twin; its arguments are those of `TwinBase`.
+    """The elastic twin, with the arguments of `TwinBase`.
 
     Each `move_to` resets time, noise and oscillation. The joints do not cool in `move_to`, so a motion depends on the
     twin's earlier motions. A new twin is cold.
 
     Args:
-        stiffness: None: gear stiffness drawn at random, like the other parameters.
+        stiffness: as in `TwinBase`; if None, the gear stiffness is drawn at random, like all other parameters.
 
     Raises:
         UserError: the gears are so stiff, or rotors and links so light, that a cycle needs more than MAX_STEPS steps.

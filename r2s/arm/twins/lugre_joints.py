@@ -43,7 +43,7 @@ def cable_drag(p, q, i):
 
 @njit(cache=True)
 def rest(p, s, q, compensation, gravity):
-    """Set the state to rest at q (n,) rad, with friction equal to compensation + offset + cable drag - gravity."""
+    """Initialize an arm at rest at q (n,) rad; friction balances compensation + offset + cable drag - gravity."""
     s[:] = 0
     for i in range(len(q)):
         s[Q, i] = q[i]
@@ -66,9 +66,9 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
     z' = (z + h w) / (1 + k |w|), k = h s0 / g, it is quadratic in w and has one root of the right sign.
 
     Args:
-        p, s: parameters and state. line: (slots, n) Nm, the last commands. cycle: number of this cycle.
-        tau, compensation: (n,) Nm, command and gravity compensation. mass: (n, n) kg m^2.
-        touch: (contact, Jacobian, whether the tip may touch the surface), see r2s/physics/contact.py.
+        p: joint parameters. s: joint states. line: (slots, n) Nm, the last commands. cycle: index of this cycle.
+        tau: (n,) Nm, command. compensation: (n,) Nm, gravity compensation. mass: (n, n) kg m^2, mass matrix.
+        touch: contact, Jacobian (r2s/physics/contact.py), and whether the tip may touch the surface.
     """
     n, slots, h = len(tau), len(line), SIM_DT
     q, v, w = s[Q], s[V], s[V_GUESS]
@@ -114,7 +114,7 @@ def _solve(p, s, damping, mass):
 
 @njit(cache=True)
 def _solve_touch(p, s, damping, mass, contact, jacobian):
-    """Solve the step including the contact force, and store the joint torque of this force in TOUCH."""
+    """Solve the step with a contact force, and store the joint torque due to the contact force in the row TOUCH."""
     n, h = len(damping), SIM_DT
     added, soft, guess = np.empty(n * (n + 1) // 2), np.empty((n, n)), np.empty(GUESS)
     start_guess(contact, jacobian, s[V], h, guess)
@@ -157,8 +157,8 @@ def sense(p, s, mass, noise):
     """Update bristles, friction, bias torque and sensor values after the engine has taken its step.
 
     Args:
-        p: parameters. s: state, with Q and V after the step and V_BEFORE before the step.
-        mass: (n, n) kg m^2. noise: (3, n), standard normal, of q, dq and tau_J.
+        p: joint parameters. s: joint states: Q and V after the step, V_BEFORE (velocity) before the step.
+        mass: (n, n) kg m^2, mass matrix. noise: (3, n), standard normal, for the sensors of q, dq and tau_J.
     """
     n, h, v, before = s.shape[1], SIM_DT, s[V], s[V_BEFORE]
     for i in range(n):

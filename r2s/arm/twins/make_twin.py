@@ -24,7 +24,7 @@ def make_twin(
     extra_delay_s: float = 0.0,
     surface: Any = False,
 ) -> TwinBase:
-    """Return a hidden twin with the settings of conf/arm/twin.yaml, which `TwinBase` explains.
+    """Return a hidden twin; `TwinBase` explains the arguments, which conf/arm/twin.yaml sets.
 
     Args:
         variant: 'rigid': LuGre friction and rigid or quasi-static gears, simulated in DART. 'elastic': effects that

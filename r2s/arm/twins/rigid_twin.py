@@ -5,8 +5,8 @@ dependence, breakaway), torque offsets, delay and lag, cable drag, sensor noise 
 centers and tensors differ from the nominal values that gravity compensation uses. The seed determines the robot's
 parameters, which only this file reads. Seeds 0-9 are for development, seeds of 100 and above for final evaluation.
 
-In each cycle the command passes delay and lag. lugre_joints.py then solves the next step implicitly for joint
-velocities, friction and contact force. DART takes the step with this contact force and with the friction linearized
+In each cycle, delay and lag act on the command first. lugre_joints.py then solves the next step implicitly for joint
+velocities, friction and contact force. DART integrates this step with the contact force and with friction linearized
 about the solution. Finally the sensors measure the new state.
 """
 
@@ -26,13 +26,13 @@ STOP_MARGIN = 0.1  # rad by which the mechanical stops lie beyond the position l
 
 
 class RigidTwin(TwinBase):
-    """The rigid twin; its arguments are those of `TwinBase`.
+    """The rigid twin, with the arguments of `TwinBase`.
 
-    Each `move_to` also resets clock and bristles, so an evaluation on a new twin is reproducible.
+    Each `move_to` resets the clock and the friction bristles, so an evaluation on a new twin is reproducible.
 
     Args:
-        stiffness: None: rigid gears. Elastic gears deflect without oscillation, and the encoders, on the motors'
-            side, do not measure this deflection.
+        stiffness: as in `TwinBase`; None: rigid gears. Elastic gears deflect without oscillation. Encoders on the
+            motors' side do not measure this deflection.
     """
 
     def __init__(self, robot: Robot, seed: int, **settings: Any):
@@ -105,7 +105,7 @@ class RigidTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw the parameters (ROWS, n) of all joints except delay, lag and speed filter.
+    """Draw the parameters (ROWS, n) of all joints; the caller sets delay, lag and speed filter.
 
     Args:
         robot: the arm. rng: random number generator.

@@ -1,6 +1,6 @@
 """Draw a twin's surface from the twin's seed, and compute the tool's contact with this surface.
 
-The surface may be a box on a table, which has a new random place in each episode.
+The surface may be a box on a table. Each episode draws a new position of the box.
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ CAMERA = 33, 1e-3, np.radians(0.5)  # cycles between two images, and noise of a 
 
 @dataclass(frozen=True)
 class BoxSurface:
-    """A box that serves as surface: the frame of its table, and the drawn box at the nominal place."""
+    """A box as surface: frame of the table, and surface of the randomly drawn box at the box's nominal pose."""
 
     frame: TableFrame
     surface: Surface
@@ -51,11 +51,11 @@ class Touch:
     """The contact of a tool's tip with a surface, stored in arrays for the compiled code of a twin.
 
     Attributes:
-        contact, jacobian: (COLUMNS,) and (ROWS, n), see contact_layout.py. frames, axes: (n, POSE) and (n, 3).
-        links: nominal links, see `links_of`. there: whether the twin has a surface.
+        contact, jacobian: (COLUMNS,) and (ROWS, n), state and Jacobian of the contact, see contact_layout.py.
+        frames, axes: (n, POSE), (n, 3), link frames and joint axes. links: nominal links. there: a surface exists.
 
     Args:
-        robot: the arm. surface: the drawn surface; None: no surface.
+        robot: the arm. surface: surface from `draw_surface`; None: no surface.
     """
 
     def __init__(self, robot: Robot, surface: Surface | BoxSurface | None):
@@ -71,9 +71,9 @@ class Touch:
         self._first = self.contact.copy()
 
     def start(self, q: np.ndarray, seed: list[int]) -> float:
-        """Reset the contact, draw the place of a box, and return the tip's penetration depth, m, at q (n,) rad.
+        """Reset the contact, draw the pose of a box, and return the tip's penetration depth, m, at q (n,) rad.
 
-        `seed` is the episode's seed. Far from the surface the depth is -inf. The friction bristle is undeflected.
+        `seed` is the episode's seed. Far from the surface the depth is -inf. The friction bristle starts undeflected.
         """
         self.contact[DEFLECTION:] = self._first[DEFLECTION:]
         if self._table is not None:
@@ -88,7 +88,7 @@ class Touch:
         return float(self.contact[DEPTH]) if self.near(q, np.zeros_like(q)) else -np.inf
 
     def near(self, q: np.ndarray, dq: np.ndarray) -> bool:
-        """Return whether the tip may touch the surface in a cycle that begins at q, dq (n,); update `jacobian`."""
+        """Return whether the tip may touch the surface in a cycle that starts at q, dq (n,); update `jacobian`."""
         if not self.there:
             return False
         link_frames(self.links, q, self.frames, self.axes)
@@ -118,11 +118,11 @@ class Touch:
 
 
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
-    """Draw a twin's surface near the nominal place that the setting `surface` describes.
+    """Draw a twin's surface near the nominal pose that the setting `surface` describes.
 
-    False: no surface. True: a table below the tip at home. {point: m, normal}: a plane at this place. box: a box of
-    the edges `r2s.physics.box.SIZE` on a table in front of the tip at home. {box: [3 edges, m]}: a box of these
-    edges; with point and normal, the box stands at that place.
+    False: no surface. True: a table below the tip at home. {point: m, normal}: a plane through this point. box: a box
+    with edges `r2s.physics.box.SIZE` on a table in front of the tip at home. {box: [3 edges, m]}: a box with these
+    edges; if point and normal are also given, the box stands at that point.
 
     Raises:
         UserError: `surface` is invalid, the robot has no tool, or the tip at home would be inside the surface.
@@ -166,7 +166,7 @@ def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) 
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nominal place that the setting `surface` describes, as a point, m, and a unit normal."""
+    """Return a point, m, and the unit normal of the nominal plane that the setting `surface` describes."""
     if not isinstance(surface, Mapping):
         raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):

@@ -21,7 +21,7 @@ STAYS = 2e-3  # rad; a `move_to` that moves each joint by less may leave the tip
 
 
 class TwinBase:
-    """An `Arm` (r2s/arm/interface.py) whose parameters are hidden: only its seed is known.
+    """An `Arm` (r2s/arm/interface.py) with hidden parameters, of which only the random seed is known.
 
     The same seed, noise stream and calls produce bit-identical states. Each `move_to` begins an episode with its own
     random numbers, so the noise of the k-th episode does not depend on earlier episodes.
@@ -37,10 +37,10 @@ class TwinBase:
     Args:
         robot: the nominal arm. seed: random seed; the hidden robot is drawn near the nominal arm.
         payload: carried body, a point mass in kg or a mapping, see `r2s.physics.payload.payload_of`.
-        declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), given like
+        declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), in the format of
             `payload`; None: no payload.
         stiffness: Nm/rad, gear stiffness of the strongest joints; gears of other joints scale with the torque limit.
-        noise: number of the random stream of sensor noise; two recordings of one robot need different numbers.
+        noise: stream number of the sensor noise; two recordings of one robot need different numbers.
         friction_scale: factor on the drawn friction, except on its load-dependent part; below 1 for a warm arm.
         extra_delay_s: s, delay of commands in addition to the twin's own delay; whole milliseconds.
         surface: surface that the tool may touch, drawn from the seed. False: no surface. True: a table below the tip
@@ -89,7 +89,7 @@ class TwinBase:
     def move_to(self, q: np.ndarray) -> ArmState:
         """Place the arm at rest at q (n,) rad, where friction balances the error of the gravity compensation.
 
-        A tip that presses on the surface may stay there. Otherwise the tip must not be inside the surface at q.
+        The tip must not be inside the surface at q, unless the arm is already at q and presses on the surface.
         """
         q = np.array(q, dtype=float)
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
@@ -107,7 +107,7 @@ class TwinBase:
         return self.read()
 
     def read(self) -> ArmState:
-        """Return the state of this cycle; its external torque (undeclared payload, contact) has no sensor error."""
+        """Return the state of this cycle; external torque (undeclared payload, contact) has no sensor error."""
         q, dq, tau_J = self._sensors()
         load = mass_and_moment(self.robot, self._payload if self._carries else None) - self._declared
         external, wrench = self._load_torque(self._q, load), None
@@ -152,7 +152,7 @@ class TwinBase:
 
     @property
     def _last_command(self) -> np.ndarray:
-        """(n,) Nm, the command sent last or, without extra delay, the command executed last."""
+        """(n,) Nm, the last sent command if there is an extra delay, else the last executed command."""
         return self._sent if self._extra_delay else self._tau_J_d
 
     def _delayed(self, tau: np.ndarray) -> np.ndarray:
@@ -164,7 +164,7 @@ class TwinBase:
         return executed + np.clip(self._pending.popleft() - executed, -step, step)
 
     def _update_payload(self) -> None:
-        """Attach or detach the payload at the time that its `on_s` and `off_s` set."""
+        """Attach the payload at the time `on_s`, and detach the payload at the time `off_s`."""
         payload = self._payload
         if payload is not None and self._carries != (now := bool(payload.attached(self._cycle * SIM_DT))):
             self._attach(payload if now else None)

@@ -30,7 +30,7 @@ class IdentifiedSurface:
     Attributes:
         surface: the estimate. interval: {name: (low, high)} of stiffness, exponent, damping, friction, bristle, slope
             (N/m at 10 N), height (m along the normal) and tilt_deg (angle from the normal).
-        identifiable: {name: whether the recording determines it}; names include plane and slope.
+        identifiable: {name: whether the recording determines this value}; names include plane and slope.
         draws: surfaces drawn from the posterior.
     """
 
@@ -41,10 +41,10 @@ class IdentifiedSurface:
 
 
 def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mapping[str, Any]) -> None:
-    """Write contact.yaml, and contact_posterior.npz to the same folder.
+    """Write contact.yaml at `path`, and contact_posterior.npz in the same folder.
 
     Args:
-        path: the contact.yaml to write. robot: the arm with its tool. source: recording, calibration and run.
+        path: the contact.yaml to write. robot: the arm with its tool. source: names of recording, calibration, run.
     """
 
     def number(value: float) -> float:
@@ -83,7 +83,7 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
 def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurface:
     """Return the surface from a run folder of stage=identify or from a contact.yaml.
 
-    where: the option through which the user named the folder, for error messages.
+    where: the option with which the user named the folder, for error messages.
 
     Raises:
         UserError: a file is missing or damaged.
@@ -100,7 +100,7 @@ def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurfac
 
 
 def _parse(document: dict[str, Any], draws: dict[str, np.ndarray]) -> IdentifiedSurface:
-    """Parse the document for `load_contact`; a malformed one raises KeyError, ValueError or a similar error."""
+    """Parse the document for `load_contact`; a malformed document raises KeyError, ValueError or a similar error."""
     found, plane = document["parameters"], document["plane"]
     interval = {n: (float(v["interval95_low"]), float(v["interval95_high"])) for n, v in found.items()}
     interval["slope"] = interval.pop(f"slope_at_{LOAD:g}N")

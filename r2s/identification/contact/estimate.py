@@ -16,11 +16,11 @@ from r2s.identification.result import SHARPER
 from r2s.physics.surface import UNIT_DEPTH, Surface
 from r2s.recordings.recording import Recording
 
-STEPS, ROUNDS = 25, 4  # most Jacobians of a search; number of searches, with reweighting before each
-AT_BOUND = 0.02  # a stiffness closer to a bound than this share of its logarithmic range is at the bound
+STEPS, ROUNDS = 25, 4  # largest number of Jacobians per search; number of searches, each after a reweighting
+AT_BOUND = 0.02  # a stiffness nearer to a bound than this share of the logarithmic range is at the bound
 COVERED = (2.5, 97.5)  # %, percentiles of a 95 % interval
 # Standard deviations of errors that more data do not reduce (from friction laws and time steps): slope relative,
-# damping s/m, height m, tilt rad; seen on simulated arms on exact surfaces (benchmarks/contact_identification.py).
+# damping s/m, height m, tilt rad; measured on simulated arms and surfaces (benchmarks/contact_identification.py).
 SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
 SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
 
@@ -30,12 +30,12 @@ class ContactEstimate:
     """An identified surface.
 
     Attributes:
-        surface: the estimate; `surface.point` is the mean tip center in contact, projected onto the plane.
+        surface: the estimate; `surface.point` is the mean of the tip centers in contact, projected onto the plane.
         draws: posterior draws {name: (S, ...)} of the values of a `Surface`, its point and normal, and of `slope`,
             the slope of the force at LOAD, N/m.
-        identifiable: {name: whether the data determine it}.
+        identifiable: {name: whether the data determine this value}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
-        training: predicted and measured forces of the fitted presses. validation: those of other presses, or None.
+        training: predicted and measured forces of fitted presses. validation: the same for unfitted presses, or None.
     """
 
     surface: Surface
@@ -52,7 +52,7 @@ class ContactEstimate:
 
     @property
     def slope(self) -> float:
-        """Slope of the force curve at LOAD, N/m: its posterior mean, because the exponent is seldom certain."""
+        """Posterior mean, N/m, of the force curve's slope at LOAD; a mean, because the exponent is uncertain."""
         return float(self.draws["slope"].mean())
 
     @property
@@ -64,7 +64,7 @@ class ContactEstimate:
 
     @property
     def tilt_deg(self) -> float:
-        """Angle in degrees from the estimated normal within which 95 % of the drawn normals lie."""
+        """Angle in degrees; 95 % of the normals in `draws` differ from the estimated normal by at most this angle."""
         across = self.draws["normal"] - self.surface.normal
         return float(np.degrees(np.percentile(np.linalg.norm(across, axis=1), 95)))
 
@@ -82,7 +82,7 @@ def identify_contact(
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
         held_out: presses on the same surface for validation; None: a fit without the last press predicts that press.
-        seed: seed of the posterior's draws. report: called with the share of finished work and the next task.
+        seed: seed of the posterior's draws. report: function that receives the share of completed work and a text.
 
     Raises:
         UserError: there is too little contact, or the recording does not determine the stiffness.
@@ -117,7 +117,7 @@ def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.
 
 
 def _check(problem: ContactProblem, u: np.ndarray) -> None:
-    """Raise UserError if joints move too briefly during contact, or if the stiffness is at a bound."""
+    """Raise UserError if joints slide for too short a time in contact, or if the stiffness is at a bound."""
     rows = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum()
     if (touched := problem.torque.row_s * rows) < LEAST_S:
         raise UserError(
@@ -163,5 +163,5 @@ def _concluded(
 
 
 def _systematic(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return random steps (S, 8) of u with the SYSTEMATIC standard deviations."""
+    """Return random errors (S, 8) of the vector u, with the standard deviations SYSTEMATIC."""
     return rng.standard_normal((count, 8)) * [SYSTEMATIC[name] for name in NAMES] / WIDTH

@@ -1,8 +1,8 @@
 """Export an identified surface to other simulators as contact parameters of MuJoCo and SDF, linearized at 10 N.
 
-MuJoCo's contact force is d (aref - a0) / A with impedance d, inverse mass A and the acceleration a0 without contact
-(MuJoCo documentation, Computation: Constraint model). With a small d the contact acts as a spring and damper with
-coefficients solref / A (N/m, Ns/m). A high `impratio` makes friction stiff despite the small d.
+MuJoCo's contact force is d (aref - a0) / A with impedance d, reference acceleration aref, acceleration a0 without
+contact and inverse mass A (MuJoCo documentation, Computation: Constraint model). A contact with small d is a spring
+and damper with coefficients solref / A (N/m, Ns/m). A high `impratio` makes friction stiff although d is small.
 """
 
 import xml.etree.ElementTree as ET
@@ -20,14 +20,14 @@ from r2s.physics.surface import Surface
 from r2s.physics.welds import make_pose
 
 IMPEDANCE = 0.01  # MuJoCo's impedance d, which is also the relative error of the spring
-WIDE = 1.0  # m, half the edge length of a plane when it is drawn
+WIDE = 1.0  # m, half the edge length with which a viewer displays a plane
 IMPRATIO = 1000.0  # makes the impedance of friction 0.91
 
 
 def linearized(surface: Surface, load: float = LOAD) -> tuple[float, float, float]:
     """Return slope (N/m), damping (Ns/m) and depth (m) of the spring that is tangent to the force curve at `load` N.
 
-    The spring exerts no force above `depth`, so a simulated plane with this spring lies `depth` below the surface.
+    The spring's force is zero down to `depth`, so a simulated plane with this spring lies `depth` below the surface.
     """
     depth = float((load / surface.coefficient) ** (1.0 / surface.exponent))
     slope = load * float(surface.exponent) / depth
@@ -35,7 +35,7 @@ def linearized(surface: Surface, load: float = LOAD) -> tuple[float, float, floa
 
 
 def inverse_mass(robot: Robot) -> float:
-    """Return MuJoCo's inverse mass of the last link, 1/kg (`body_invweight0`); MuJoCo uses it for the tip."""
+    """Return the last link's inverse mass `body_invweight0`, 1/kg, which MuJoCo uses for contacts of the tip."""
     model = robot.model(gravity=False)
     return float(model.body_invweight0[model.jnt_bodyid[-1], 0])
 
@@ -43,7 +43,7 @@ def inverse_mass(robot: Robot) -> float:
 def mujoco_contact(surface: Surface, inverse_mass: float) -> dict[str, Any]:
     """Return MuJoCo's contact parameters for a body of `inverse_mass`, 1/kg, on the plane.
 
-    solref is (-stiffness, -damping). The other geom of the contact must be fixed and have equal parameters.
+    solref is (-stiffness, -damping). The plane must be fixed, and body and plane must both have these parameters.
     """
     slope, damping, deeper = linearized(surface)
     share = (1.0 - IMPEDANCE) * inverse_mass
@@ -73,7 +73,7 @@ def sdf_surface(surface: Surface) -> str:
 def write_surface(folder: Path, robot: Robot, surface: Surface) -> None:
     """Write a surface and the tool's tip into arm.xml, the surface into surface.sdf, and the tip into arm.sdf.
 
-    The surface is a plane or a box. In arm.xml, only surface and tip can touch. A missing arm.sdf is skipped.
+    The surface is a plane or a box. In arm.xml, only surface and tip can touch. A missing arm.sdf is not created.
 
     Args:
         folder: output of `write_description`. robot: an arm with a tool. surface: the surface, without batch axes.
@@ -103,7 +103,7 @@ def write_surface(folder: Path, robot: Robot, surface: Surface) -> None:
 
 
 def _write_sdf(folder: Path, surface: Surface, pose: np.ndarray, tip: tuple[np.ndarray, float]) -> None:
-    """Write surface.sdf with the surface at `pose` (4, 4), and add `tip`, (place (3,) m, radius m), to arm.sdf."""
+    """Write surface.sdf with the surface at `pose` (4, 4), and add the sphere `tip` (center, radius) to arm.sdf."""
     root = ET.Element("sdf", version="1.9")
     solid = ET.SubElement(root, "model", name="surface")
     add_text(solid, static="true", pose=pose_words(pose))
@@ -122,7 +122,7 @@ def _write_sdf(folder: Path, surface: Surface, pose: np.ndarray, tip: tuple[np.n
 
 
 def _collision(link: ET.Element, name: str, surface: Surface, pose: str = "0 0 0 0 0 0") -> ET.Element:
-    """Append a collision element with a surface's parameters to an SDF link; return its empty geometry."""
+    """Append a collision with a surface's parameters to an SDF link; return the collision's empty <geometry>."""
     collision = ET.SubElement(link, "collision", name=name)
     add_text(collision, pose=pose)
     geometry = ET.SubElement(collision, "geometry")

@@ -1,4 +1,4 @@
-"""Set up the torque residual of an arm that touches an unknown surface; the arm is known up to its posterior."""
+"""Set up the torque residual of an arm in contact with an unknown surface, given the posterior of the arm."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,11 +15,11 @@ from r2s.identification.search.levenberg_marquardt import minimize
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
-SLOWEST = 0.01  # rad/s, slowest sliding; below it residuals rise: a joint that seems to slide may stick and slip
-DRIFT = 0.02  # sigma of the change of friction and offset since the calibration, relative to a joint's friction
+SLOWEST = 0.01  # rad/s, slowest sliding; slower joints may stick and slip, which increases the residual
+DRIFT = 0.02  # standard deviation of friction drift and offset drift, relative to a joint's friction
 EXACT = 1e-4  # lower limit of a row's sigma, relative to the joint's friction, even in a noise-free simulation
-SEEN = 0.03  # posterior directions with less effect on all rows together, in standard deviations, are dropped
-FTOL = 1e-6  # a search ends when a step lowers the cost by less (relative)
+SEEN = 0.03  # standard deviations; arm errors with a smaller effect on all rows together are dropped
+FTOL = 1e-6  # a search ends when a step reduces the cost by less than this share
 STEP = 1e-5  # finite-difference step on the unit cube
 REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
 PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise below 40 Hz
@@ -31,14 +31,14 @@ class ContactProblem:
     """Least squares over a surface u (8,) and the arm's uncertainty w (r,), whose prior is standard normal.
 
     Each of the R rows is a window in which a joint slides in one direction (see `TorqueResidual`). Resting joints
-    have no rows, since their friction may have any value between the breakaway torques. The residual is linear in w,
-    so w is eliminated in closed form (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+    have no rows, since their friction may have any value between the breakaway torques. A closed form eliminates w,
+    because w acts linearly on the residual (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
     Attributes:
         torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
-        error: (T, n) Nm, the torque residual at x.
-        directions: (T, n, r) Nm, change of the residual per unit of each element of w.
-        sigma: (T, n) Nm, standard deviation of an independent row.
+        error: (T, n) Nm, residual torque of the arm with the parameters x, before subtraction of the contact torque.
+        directions: (T, n, r) Nm, derivative of the residual torque with respect to w.
+        sigma: (T, n) Nm, standard deviation of each residual torque, which the fit treats as independent.
         space: the space of the surface vectors u.
     """
 
@@ -52,18 +52,18 @@ class ContactProblem:
 
     @property
     def motion(self) -> SlidingMotion:
-        """The recording's motion, averaged over windows in which joints slide."""
+        """The arm's motion in the recording, averaged over windows in which joints slide."""
         assert isinstance(self.torque.motion, SlidingMotion)
         return self.torque.motion
 
     @property
     def rows(self) -> np.ndarray:
-        """(T, n) bool, whether a joint's window at a moment is a row of the residual."""
+        """(T, n) bool, whether the residual has a row for a joint's window at a moment."""
         return self.torque.seen
 
     @property
     def clusters(self) -> np.ndarray:
-        """(R,) block of each row; errors in different blocks are treated as independent."""
+        """(R,) block number of each row; errors in different blocks are treated as independent."""
         return np.unique(self.torque.clusters[self.rows.ravel()], return_inverse=True)[1]
 
     def contact_torque(self, u: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ class ContactProblem:
         return self.motion.filtered(self.tip.contact_of(*self.space.plane(u), self.space.law(u))[0])
 
     def data(self, u: np.ndarray) -> np.ndarray:
-        """Return the residual (R,), in standard deviations, for a surface u (8,) and the arm at x (w = 0)."""
+        """Return the residual (R,), divided by its standard deviation, for a surface u (8,) and arm errors w = 0."""
         return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
 
     def slope(self, u: np.ndarray) -> np.ndarray:
@@ -81,7 +81,7 @@ class ContactProblem:
 
     @cached_property
     def arm(self) -> np.ndarray:
-        """(R, r), the derivative of `data` with respect to w."""
+        """Derivative (R, r) of the scaled residual with respect to the arm's errors w."""
         return (self.directions / self.sigma[..., None])[self.rows]
 
     @cached_property
@@ -89,7 +89,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return the arm's errors w (r,) that minimize the sum of squares for a surface u (8,)."""
+        """Return the arm errors w (r,) that minimize the cost of a given surface u (8,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + r + 8) of surfaces u (C, 8) at their best w; u's flat prior is made normal."""
+        """Return residuals (C, R + r + 8) of surfaces u (C, 8), each at its best w, with a normal prior on u."""
         return np.stack([np.concatenate([self._projected(self.data(u)), FLAT * (u - 0.5)]) for u in trials])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
@@ -105,12 +105,12 @@ class ContactProblem:
         return np.concatenate([self._projected(self.slope(u)), FLAT * np.eye(len(u))])
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-        """Return the u (8,) of a local minimum near u, and the sum of squares there."""
+        """Return the surface u (8,) of a local minimum near u, and the sum of squares at this minimum."""
         u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with rows weighted by the size and correlation of their residual at u (8,)."""
+        """Return the problem with each row's weight set from the size and correlation of the residual at u (8,)."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
@@ -120,11 +120,11 @@ class ContactProblem:
         return replace(self, torque=self.torque.within(kept))
 
     def whole(self, u: np.ndarray) -> np.ndarray:
-        """Return the argument (8 + r,) of `linearize`: u (8,), and the best w for u, scaled to the unit cube."""
+        """Return u (8,) and the best w (r,) for u in one vector (8 + r,) on the unit cube, for `linearize`."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return [(residual (R + 8 + r,), its derivative)] at the vector `whole` (8 + r,)."""
+        """Return a list of one pair: the residual (R + 8 + r,) and its derivative at the vector `whole` (8 + r,)."""
         u, w = whole[:8], (whole[8:] - 0.5) * 2 * REACH
         prior = np.concatenate([np.full(8, FLAT), np.full(len(w), 2 * REACH)])
         r = np.concatenate([self.data(u) + self.arm @ w, prior * (whole - 0.5)])
@@ -137,7 +137,7 @@ def contact_problem(
     """Return the least-squares problem for a recording with contact.
 
     Args:
-        space: parameter space of an arm with a tool. x: (P,) its values.
+        space: parameter space of an arm with a tool. x: (P,), values of the arm's parameters.
         samples: (S, P), posterior draws of x; None: the arm's uncertainty consists only of DRIFT.
         recording: recording with commanded torque. surfaces: the space of the unknown surface.
     """
@@ -156,5 +156,5 @@ def contact_problem(
 
 
 def _sigma(torque: TorqueResidual, x: np.ndarray) -> np.ndarray:
-    """Return (T, n) Nm, standard deviation of an independent row."""
+    """Return the standard deviation (T, n) Nm of each residual, at least EXACT times the joint's friction."""
     return np.maximum(torque.scale, EXACT * torque.space.dynamics(x).level)

@@ -1,4 +1,4 @@
-"""Guess an unknown surface from the place, direction and growth of the external force on the tip."""
+"""Guess an unknown surface from the position, direction and increase of the external force on the tip."""
 
 from collections.abc import Iterator
 
@@ -12,20 +12,20 @@ from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.recordings.recording import Recording
 
 MOVING = 0.02  # rad/s, speed below which a joint's friction is treated as unknown
-KNOWN = 0.1  # relative standard error of a moving joint's friction
-SURE = 4.0  # standard deviations from 0 above which a force indicates contact
+KNOWN = 0.1  # standard error of a moving joint's friction, as a share of this friction
+SURE = 4.0  # a force indicates contact if it exceeds this number of standard deviations
 LEAST_S = 0.2  # s, least duration of contact
 STIFFNESS = (5e2, 2e5)  # N/m, range of first guesses
-FLAT = 3.0  # ratio of the positions' spread along a plane to that across it, above which they determine the normal
+FLAT = 3.0  # positions determine the normal if their spread along the plane is above FLAT times that across the plane
 
 
 def first_guesses(
     space: ParameterSpace, x: np.ndarray, recording: Recording
 ) -> tuple[SurfaceSpace, list[np.ndarray]]:
-    """Return the space of surfaces about a first plane, and start vectors u (8,) in it.
+    """Return the space of surfaces near a first guess of the plane, and start vectors u (8,) in this space.
 
     Args:
-        space: parameter space of an arm with a tool. x: (P,) values. recording: recording with commanded torque.
+        space: parameter space of an arm with a tool. x: (P,), parameters. recording: one with commanded torque.
 
     Raises:
         UserError: the recording shows no contact.
@@ -54,7 +54,7 @@ def first_guesses(
 def _starts(
     surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield a start vector u per normal (3,) and exponent; a line fitted to height over force sets its stiffness."""
+    """Yield a start vector u for each normal (3,) and exponent; a line fitted to height over force sets stiffness."""
     for normal in normals:
         height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
         slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0
@@ -67,9 +67,9 @@ def _starts(
 
 
 def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return tip center (T, 3) m, force on the tip (T, 3) N, and whether the force is certain (T,), at T moments.
+    """Return tip center (T, 3) m, force on the tip (T, 3) N, and (T,) whether the force is certainly above 0.
 
-    The force is a least-squares fit over the joints, below 10 Hz; a resting joint's friction is treated as unknown.
+    The force is a least-squares fit to joint torques below 10 Hz; the friction of a resting joint is unknown.
     """
     space, motion = torque.space, torque.motion
     d = space.dynamics(x)

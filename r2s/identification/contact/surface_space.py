@@ -6,8 +6,8 @@ import numpy as np
 
 from r2s.physics.surface import UNIT_DEPTH, Surface
 
-LOAD = 10.0  # N, load at which slope and height are defined, so that they depend little on the exponent
-# bounds from foam to steel; slope of the force at LOAD (N/m) and bristle (m) are logarithms
+LOAD = 10.0  # N, load at which slope and height are defined, so that slope and height depend little on the exponent
+# bounds from foam to steel; the entries for slope of the force at LOAD (N/m) and bristle (m) are logarithms
 TILT = 0.6  # rad about the first plane, whose error is at most the angle of friction
 HEIGHT = 0.02  # m about the first plane
 BOUNDS = {
@@ -38,13 +38,13 @@ class SurfaceSpace:
 
     @property
     def axes(self) -> np.ndarray:
-        """(2, 3), the two unit vectors towards which the normal tilts."""
+        """Two unit vectors (2, 3) in the plane; u[0] tilts the normal towards the first, u[1] towards the second."""
         first = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
         first /= np.linalg.norm(first)
         return np.stack([first, np.cross(self.normal, first)])
 
     def plane(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the plane's point (..., 3) m and normal (..., 3) for u (..., 8)."""
+        """Return a point (..., 3) m and the normal (..., 3) of the plane that u (..., 8) describes."""
         p = LOWER + u * WIDTH
         normal = self.normal + p[..., :2] @ self.axes
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -52,7 +52,7 @@ class SurfaceSpace:
         return self.origin + height[..., None] * normal, normal
 
     def law(self, u: np.ndarray) -> np.ndarray:
-        """Return K, exponent, damping, friction and bristle (..., 5) for u (..., 8), ordered as in `contact_law`."""
+        """Return the force law's five values (..., 5) for u (..., 8), in the order that `contact_law` returns."""
         p = LOWER + u * WIDTH
         K = LOAD / (LOAD * p[..., 4] / np.exp(p[..., 3])) ** p[..., 4]
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
@@ -64,10 +64,10 @@ class SurfaceSpace:
         return Surface(point, normal, K * UNIT_DEPTH ** (rest[0] - 1.0), *rest)
 
     def tilt_of(self, normal: np.ndarray) -> np.ndarray:
-        """Return by how much (2,) u[:2] must change to tilt the first plane to the normal (3,)."""
+        """Return the change (2,) of u[:2] that tilts the first plane's normal to the direction `normal` (3,)."""
         return self.axes @ (normal / (normal @ self.normal)) / WIDTH[:2]
 
     def unit(self, height: float, slope: float, exponent: float, friction: float) -> np.ndarray:
-        """Return u (8,) of an untilted plane whose tip height is `height` m and slope `slope` N/m under LOAD."""
+        """Return u (8,) of an untilted plane, given the tip's height, m, and the force's slope, N/m, under LOAD."""
         p = np.array([0.0, 0.0, height, np.log(slope), exponent, 0.0, friction, np.log(2e-4)])
         return np.clip((p - LOWER) / WIDTH, 0.0, 1.0)

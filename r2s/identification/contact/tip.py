@@ -18,10 +18,10 @@ class TipMotion:
     """Motion of a tool's spherical tip at F instants, on an arm with n joints.
 
     Attributes:
-        step: s, time between instants. starts: (F,) bool, whether a continuous motion starts at the instant.
-        centre: (F, 3) m, center of the tip. radius: m.
-        axes, origins: (F, n, 3), joint axes and their origins in the base frame. dq: (F, n) rad/s.
-        play: m, tip path that encoder noise alone may cause; a path up to `play` only bends bristles elastically.
+        step: s, time between two instants. starts: (F,) bool, whether a new continuous motion starts at an instant.
+        centre: (F, 3) m, center of the tip. radius: m, radius of the tip.
+        axes, origins: (F, n, 3), joint axes, and points on these axes, in the base frame. dq: (F, n) rad/s, velocity.
+        play: m, largest tip path by encoder noise alone; a path shorter than `play` only bends bristles elastically.
     """
 
     step: float
@@ -47,7 +47,7 @@ class TipMotion:
         return TipMotion(step, starts, centre, robot.tool.radius, axes, origins, np.ascontiguousarray(dq), play)
 
     def jacobian(self, at: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Return the Jacobians (A, 3, n) m/rad of the tip's deepest point at the instants `at` (A,)."""
+        """Return Jacobians (A, 3, n) m/rad of the tip's deepest point, at the instants with the indices `at` (A,)."""
         point = self.centre[at] - self.radius * normal
         return np.cross(self.axes[at], point[:, None] - self.origins[at]).swapaxes(1, 2)
 
@@ -58,7 +58,7 @@ class TipMotion:
     def contact_of(
         self, point: np.ndarray, normal: np.ndarray, law: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the result of `contact` for a plane with `point`, `normal` and the values `law` of `contact_law`."""
+        """Return the result of `contact` for a plane with `point` and `normal`; `law`: result of `contact_law`."""
         tau, out = np.empty_like(self.dq), np.empty((3, len(self.dq)))
         motion = self.centre, self.axes, self.origins, self.dq, self.starts
         _contact(motion, (self.radius, self.step, self.play), point, normal, law, tau, out)
@@ -79,11 +79,11 @@ def _frames(links, q, frames, axes):
 
 @njit(cache=True, error_model="numpy")
 def _contact(motion, settings, point, normal, law, tau, out):
-    """Write joint torque into tau (F, n), and normal force, penetration depth and its rate into out (3, F).
+    """Write joint torque into tau (F, n); write normal force, penetration depth and depth rate into out (3, F).
 
-    Friction is mu F z, where z is the deflection of the bristles (Dahl 1968 in two dimensions): dz = (dx - |dx| z) /
-    bristle along the path x of the deepest point over the surface. Encoder noise would lengthen the path of a resting
-    tip and let bristles relax. Therefore they only bend elastically along a path shorter than `play`.
+    Friction is mu F z with the bristle deflection z (Dahl 1968 in two dimensions): dz = (dx - |dx| z) / bristle. Here
+    x is the tip's deepest point, projected onto the surface. Encoder noise of a resting tip adds up in |dx| and would
+    let bristles relax. Therefore a path shorter than `play` only bends bristles elastically.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play = settings

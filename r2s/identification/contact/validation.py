@@ -7,18 +7,18 @@ import numpy as np
 from r2s.identification.contact.problem import ContactProblem
 
 PAUSE_S = 1.0  # s without contact that separates two presses; a slide may lose contact for a moment
-GUARD_S = 0.2  # s added before and after a press, longer than a window
-KNOWN = 0.05  # largest standard error of a force from torques, relative to the largest force (1 N of a Panda's 20 N)
+GUARD_S = 0.2  # s, time added before and after a press; it is longer than a window
+KNOWN = 0.05  # largest standard error of a measured force, as a share of the largest force (1 N of a Panda's 20 N)
 
 
 @dataclass(frozen=True)
 class Press:
-    """Normal force at M moments when joints slide: predicted by the surface, and estimated from joint torques.
+    """Normal force at M moments at which joints slide: the surface's prediction and the estimate from joint torques.
 
     Attributes:
-        t: (M,) s. force: (M,) N, predicted normal force. seen: (M,) N, normal force estimated from joint torques.
-        depth, rate: (M,) m, m/s, penetration depth and its rate.
-        error: (M,) N, standard error of `seen`. row_s: s, time between moments.
+        t: (M,) s, time. force: (M,) N, predicted normal force. seen: (M,) N, normal force from joint torques.
+        depth, rate: (M,) m, m/s, penetration depth and its derivative.
+        error: (M,) N, standard error of the force `seen`. row_s: s, time between two rows of the recording.
     """
 
     t: np.ndarray
@@ -30,19 +30,19 @@ class Press:
     row_s: float
 
     def summary(self) -> dict[str, float]:
-        """Return the entry of summary.json: seconds compared, force RMSE in N, and RMSE in loading and unloading."""
+        """Return the entry of summary.json: compared time, s, and force RMSE, N, in total, loading and unloading."""
         sides = {"loading": 1.0, "unloading": -1.0}
         errors = {f"{name}_force_rmse_N": self.rmse(side) for name, side in sides.items()}
         return {"seconds": len(self.t) * self.row_s, "force_rmse_N": self.rmse(), **errors}
 
     def rmse(self, side: float = 0.0) -> float:
-        """Return the RMSE, N, of force in loading (side 1), unloading (-1) or both (0); nan without such moments."""
+        """Return the force RMSE, N, for loading (side 1), unloading (-1) or both (0); nan if no moment qualifies."""
         some = self.rate * side > 0 if side else np.ones(len(self.t), dtype=bool)
         return float(np.sqrt(np.mean((self.force - self.seen)[some] ** 2))) if some.any() else float("nan")
 
 
 def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
-    """Return a mask (T,) for each press on a surface u (8,), in order of time, with GUARD_S before and after it."""
+    """Return a mask (T,) for each press on a surface u (8,), in order of time, including GUARD_S before and after."""
     motion = problem.motion
     at = motion.instants[_depth(problem, u) > 0]
     if not len(at):
@@ -53,10 +53,10 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 
 
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
-    """Return the forces predicted by a surface u (8,) and those from joint torques, at the moments in `parts`.
+    """Return the forces that a surface u (8,) predicts and the forces from joint torques, in the masks `parts`.
 
-    Joint torques determine only the size of the force; its direction is the predicted one. Weighted least squares
-    fits a factor on the predicted force to the torques of the sliding joints.
+    Assume that the measured force has the direction of the predicted force. A weighted least-squares fit to the
+    torques of sliding joints then determines the ratio of the measured to the predicted force.
     """
     motion = problem.motion
     tau, force, depth, rate = problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))

@@ -1,21 +1,21 @@
-"""Estimate the breakaway torque of each joint from recorded ramps (the paper's Table II).
+"""Estimate the breakaway torque of each joint from recorded ramps (Table II of the paper that r2s follows).
 
 A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). At the end of a ramp, the
 joint has accelerated for 10 to 150 ms and the command has risen further. A real joint also creeps before its release:
-its bristles bend by millirads, ever faster. Neither a threshold nor a parabola can separate creep from release. So
-r2s fits the motion x of a joint that creeps, and slides once its command u exceeds U:
+the joint's bristles bend by millirads, at a growing rate. Neither a threshold nor a parabola can separate creep from
+release. So r2s fits this model, in which a joint at x creeps and then slides when the command u exceeds U:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
-u is the command at the joint in the ramp's direction, and kappa is the inverse inertia. Below the command U, stiction
-balances u, and bristles bend over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976).
-At release, friction falls from U to a lower value (0 in eq. 6 of the paper, which has z = 0); `jump` is this fall
-times kappa. A fit of all these values, the free fit, needs no model of the arm.
+The command u at the joint is positive in the ramp's direction, and kappa is the inverse inertia. Below the command U,
+stiction balances u, and bristles bend over the creep length z (Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976). At
+release, friction falls from U to a lower value (0 in the paper's eq. 6, where z = 0); `jump` is this decrease times
+kappa. The free fit estimates all these parameters and needs no model of the arm.
 
 If friction falls over a range of velocities (Stribeck), motion begins slowly, and the free fit with its sudden `jump`
-overestimates U, by 4 to 22 mNm on an arm with known U. A second fit has jump (1 - exp(-(v / fall)^2)) instead, with
-the parameters `Slide` of an identified arm; its error of U was below 0.2 mNm on the same arm. r2s uses the second fit
-if it explains the motion as well as the free fit.
+overestimates U (by 4 to 22 mNm on an arm with known U). A second fit replaces `jump` by jump (1 - exp(-(v / fall)^2))
+and uses the parameters `Slide` of an identified arm; on the same arm the second fit's error of U was below 0.2 mNm.
+r2s uses the second fit if this fit explains the motion as well as the free fit.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,8 @@ from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.recordings.ramps import Ramps
 
-MOVED = 5e-3  # rad, motion after which rows are not used; real joints and the twin creep 1 to 3 mrad before release
-MIN_ROWS = 10  # least number of rows up to MOVED
+MOVED = 5e-3  # rad, largest motion of the rows in a fit; real joints and the twin creep 1 to 3 mrad before release
+MIN_ROWS = 10  # least number of rows in a fit
 ENCODER = 2e-5  # rad, standard deviation of position residuals: encoder noise of a Panda
 RELEASE_S = 2e-3  # s, accuracy of the fitted time of release
 STEP = 1e-3  # s, longest integration step
@@ -40,10 +40,10 @@ RIGID = 1e-8  # rad, creep length of a joint that does not creep
 DRIFT = 3e-4  # rad/s, prior sigma of a slow drift: a resting joint may still settle
 SIDES = "negative", "positive"
 KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
-WORSE = 1.01  # ratio of misfits, above which an identified slide describes a ramp worse than the free fit
-BACK = 0.0, 0.03, 0.1  # starts of U below the last command, as shares of the ramp
+WORSE = 1.01  # if the misfit of a fit with `Slide` exceeds the free fit's by this ratio, use the free fit
+BACK = 0.0, 0.03, 0.1  # initial values of U: distances below the last command, as shares of the ramp
 DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, which a short motion does not determine
-STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # free fits start at: creep length, rad; share of guessed slide time
+STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # initial creep length, rad, and share of the guessed slide time
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +52,15 @@ class Breakaway:
 
     Attributes:
         command: (n, 2) Nm, mean command at release in negative and positive direction; NaN without a release. The
-            breakaway torque is `command` plus the joint's offset, which ramps do not determine.
-        spread: (n, 2) Nm, standard deviation over ramps; NaN for fewer than two ramps.
+            breakaway torque is the sum of `command` and the joint's offset, but ramps do not determine the offset.
+        spread: (n, 2) Nm, standard deviation of the release command over ramps; NaN for fewer than two ramps.
         count: (n, 2), number of ramps with a release. ramped: (n, 2), number of all ramps.
-        held: (n, 2) Nm, the largest command without motion if no ramp released the joint; 0 otherwise.
-        resolution: (n, 2) Nm, accuracy of the fit to one ramp: `RELEASE_S` times the ramp's rate.
+        held: (n, 2) Nm, largest command that did not move the joint, if no ramp moved the joint, otherwise 0.
+        resolution: (n, 2) Nm, accuracy of a ramp's release command: `RELEASE_S` times the ramp's rate.
         value: (K,) Nm, release command of each ramp; NaN without a release.
-        misfit: (K,) rad, RMS difference between positions and fit. If the misfit is well above the encoder noise (or
-            5e-5 rad for real stick-slip), the joint did not move as the fit assumes.
-        joint, sign, pose: (K,), see `Ramps`.
+        misfit: (K,) rad, RMS difference between measured and fitted positions. A misfit well above the encoder noise
+            (or above 5e-5 rad for real stick-slip) shows that the fitted model does not describe the joint's motion.
+        joint, sign, pose: (K,), joint, direction and pose of each ramp, see `Ramps`.
     """
 
     command: np.ndarray
@@ -77,7 +77,7 @@ class Breakaway:
 
     @property
     def unknown(self) -> dict[str, str]:
-        """Directions without a breakaway torque: {"joint 3, positive": "not reached: held against 2.4 Nm", ...}."""
+        """Reasons for missing breakaway torques, {"joint 3, positive": "not reached: held against 2.4 Nm", ...}."""
         reasons = {}
         for j, side in np.argwhere(self.count == 0):
             held = abs(self.held[j, side])
@@ -88,14 +88,14 @@ class Breakaway:
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """Parameters of the motion after release in K ramps, in each ramp's direction, from an identified arm.
+    """Parameters of an identified arm that describe a joint's motion after release, for K ramps.
 
     Attributes:
-        kappa: (K,) rad/s^2 per Nm, inverse inertia of the joint while the other joints rest.
-        level: (K,) Nm, command that sustains slow sliding above `fall`: Coulomb friction minus other torques.
+        kappa: (K,) rad/s^2 per Nm, inverse inertia of the ramped joint while the other joints rest.
+        level: (K,) Nm, command for slow sliding at a speed above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad, viscous friction.
-        fall: (K,) rad/s, velocity over which friction falls from breakaway to `level`, as exp(-(v / fall)^2).
-        misfit: (K,) rad, RMS misfit of an earlier fit to each ramp (`Breakaway.misfit`), for comparison.
+        fall: (K,) rad/s, Stribeck velocity: friction falls from breakaway to `level` as exp(-(v / fall)^2).
+        misfit: (K,) rad, RMS misfit of the free fit to each ramp (`Breakaway.misfit`), for comparison.
     """
 
     kappa: np.ndarray
@@ -110,16 +110,16 @@ def estimate_breakaway(
 ) -> Breakaway:
     """Estimate the command at which each ramped joint broke away, from t, q and tau.
 
-    The command is NaN if the joint does not move by MOVED in the ramp's direction, or moves before the command rises.
+    The estimate is NaN if the joint moves by less than MOVED rad along the ramp, or moves before the command rises.
 
     Args:
-        ramps: commands that rise (fall for sign -1) from rest, at any rate. With an encoder noise of 2e-5 rad, the
-            estimate's error is the rate times 0.5 to 3 ms, the most for the largest inertia.
-        delay, lag: s, latency of the command in addition to its hold; the estimate accounts for both.
-        slide: parameters of the motion after release; None: only the free fit is made.
+        ramps: recorded ramps at any rate, in which the command rises from rest (falls for sign -1). For an encoder
+            noise of 2e-5 rad, the error is the rate times 0.5 ms (small inertia) to 3 ms (large inertia).
+        delay, lag: s, dead time and time constant between command and torque; the hold of the command adds to these.
+        slide: parameters of the motion after release; None: use only the free fit.
 
     Raises:
-        UserError: delay or lag out of range.
+        UserError: delay or lag is out of range.
     """
     check_number("breakaway: delay", delay, "[0, 0.1)")
     check_number("breakaway: lag", lag, "[0, 0.1)")
@@ -146,7 +146,7 @@ def estimate_breakaway(
 
 
 def _in_direction(ramps: Ramps) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield t (T,) s, x (T,) rad and u (T,) Nm of each ramp, signed by its direction; t and x start at 0."""
+    """Yield each ramp's time t (T,) s, motion x (T,) rad and command u (T,) Nm, positive in the ramp's direction."""
     r = ramps.recording
     for rows, j, sign in zip(r.stretches, ramps.joint, ramps.sign, strict=True):
         yield r.t[rows] - r.t[rows.start], sign * (r.q[rows, j] - r.q[rows.start, j]), sign * r.tau[rows, j]
@@ -155,7 +155,7 @@ def _in_direction(ramps: Ramps) -> Iterator[tuple[np.ndarray, np.ndarray, np.nda
 def _summarize(
     ramps: Ramps, value: np.ndarray, misfit: np.ndarray, held_by: np.ndarray, blur: np.ndarray
 ) -> Breakaway:
-    """Summarize the fits to K ramps by joint and direction."""
+    """Summarize the fits to K ramps for each joint and direction."""
     n = ramps.recording.n_joints
     command, spread, held, resolution = (np.full((n, 2), x) for x in (np.nan, np.nan, 0.0, 0.0))
     count, ramped = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
@@ -176,7 +176,7 @@ def _summarize(
 
 
 def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:
-    """Return the command u (T,) Nm as it acts on the joint at t (T,) s; before t[0] it is u[0]."""
+    """Return the command (T,) Nm that acts on the joint at t (T,) s, after delay and lag; before t[0], use u[0]."""
     late = np.interp(t - delay, t, u)
     if lag == 0:
         return late
@@ -190,7 +190,7 @@ def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarr
 
 
 def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Fit the free motion to x (T,) rad under u (T,) Nm; return U, Nm (NaN: below all commands), and misfit, rad."""
+    """Fit all parameters to x (T,) rad under commands u (T,) Nm; return U, Nm (NaN: below all u), and misfit, rad."""
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -222,7 +222,7 @@ def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, fl
 def _fit_slide(
     t: np.ndarray, x: np.ndarray, u: np.ndarray, kappa: float, level: float, viscous: float, fall: float
 ) -> tuple[float, float]:
-    """Fit the motion with a known `Slide` to x (T,) rad under u (T,) Nm; return U in Nm and misfit in rad."""
+    """Fit U to the motion x (T,) rad under commands u (T,) Nm, with known `Slide`; return U, Nm, and misfit, rad."""
     span = u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -244,16 +244,16 @@ def _fit_slide(
 
 
 def _parts(x: np.ndarray) -> tuple[int, slice]:
-    """Return the last row before x (T,) moves clearly, and the rows to fit."""
+    """Return the index of the last row before clear motion in x (T,) rad, and the slice of rows to fit."""
     near = int(np.flatnonzero(x < x[-1] / 9)[-1])
     return near, slice(near // 4, None)  # in the first rows the joint may still settle
 
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Return positions x (T,) of the motion that the module's docstring defines; fall = 0: sudden jump.
+    """Return positions x (T,) rad from the module docstring's equation; fall = 0: friction falls at once at release.
 
-    Steps are implicit in velocity, so that integration is stable even for creep lengths far below the encoder noise.
+    The integration is implicit in velocity, and therefore stable even for creep lengths far below the encoder noise.
     """
     x = np.zeros(len(t))
     v = 0.0

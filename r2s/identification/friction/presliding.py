@@ -1,7 +1,7 @@
 """Estimate the presliding distance, over which the bristles of friction with memory bend after a reversal.
 
-Torque rows exclude moments at which bristles bend. Replays of short windows include these moments, at reversals, so
-replays determine the presliding distance. The torque fit determines all other parameters.
+The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
+bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,9 +39,9 @@ def estimate_presliding(
     """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of its logarithm}, estimated from replays.
 
     Args:
-        dynamics: fitted values of the other parameters. torque_data: torque residual of that fit.
-        bounds, prior: bounds and prior of all parameters; only those of presliding are used.
-        seed: seed of the posterior's draws.
+        dynamics: dynamics of the arm fitted to torque. torque_data: torque residual that `dynamics` minimizes.
+        bounds, prior: bounds and prior of all parameters; only those of the presliding distance are used.
+        seed: seed of the random draws from the posterior.
     """
     robot = torque_data.space.robot
     space = parameter_space(robot, dynamics, {NAME: bounds[NAME]})

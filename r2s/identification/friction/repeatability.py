@@ -1,10 +1,10 @@
 """Compute the standard error of breakaway commands from repeated ramps.
 
-Friction scatters from ramp to ramp, with posture, load and cable. Two ramps per joint and direction hardly determine
-a variance, because a 95 % interval by Student's t with one degree of freedom is +-12.7 standard errors. So r2s
-averages a joint's variance with the variance among joints of the same size, weighted like `PRIOR_REPEATS` repeats
-(Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). This weight is small, because joints of the same size may differ in
-scatter, on twins by factors of 3 and more. If no ramp was repeated, r2s assumes the scatter `REPEATS`.
+Friction varies between ramps, because of posture, load and cables. Two ramps per joint and direction hardly determine
+a variance, because a 95 % interval by Student's t with one degree of freedom is +-12.7 standard errors. Therefore r2s
+averages a joint's variance with the mean variance of all joints of the same size, which weighs as much as
+PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small, because joints of the
+same size differ in scatter, on twins by factors of 3 and more. Without repeats, the standard deviation is REPEATS.
 """
 
 from typing import NamedTuple
@@ -18,16 +18,16 @@ REPEATS = 1e-3  # standard deviation between repeated ramps, relative to tau_max
 
 
 class Certainty(NamedTuple):
-    """Standard error `sigma` (n, 2) Nm of mean release commands (NaN without a release), and degrees of freedom."""
+    """Standard error `sigma` (n, 2) Nm of mean commands at release (NaN without releases), and degrees of freedom."""
 
     sigma: np.ndarray
     freedom: np.ndarray
 
 
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
-    """Return the certainty of the mean commands; joints with equal torque limit tau_max (n,) Nm are of one size.
+    """Return standard errors of the mean commands at release; joints of equal limit tau_max (n,) Nm are of one size.
 
-    If no joint of one size has repeated ramps, the scatter of all other joints is used, in proportion to tau_max.
+    If no joint of a size has repeated ramps, r2s assumes the mean scatter of all joints, in proportion to tau_max.
     """
     more = np.maximum(found.count - 1, 0)
     square = np.nan_to_num(found.spread, nan=0.0) ** 2 / tau_max[:, None] ** 2

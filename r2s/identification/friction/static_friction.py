@@ -17,7 +17,7 @@ LEAST = 1e-3  # relative to tau_max; all smaller commands have the same standard
 class StaticFriction:
     """Residual of K ramps with a release: net torque at release minus the model's friction at the onset of sliding.
 
-    Stribeck friction rises towards standstill, where recordings of motion contain little information.
+    Recordings of motion contain little information on the rise of Stribeck friction near standstill.
     """
 
     def __init__(self, robot: Robot, ramps: Ramps, edges: Breakaway):
@@ -35,7 +35,7 @@ class StaticFriction:
         self._inertia = regressor(robot, q, still, unit)[own, self.joint].reshape(len(kept), -1)
 
     def net_torque(self, d: Dynamics) -> np.ndarray:
-        """Return the total torque (..., K) Nm on the joint at release, apart from friction."""
+        """Return the torque (..., K) Nm, without friction, that acts on the joint at each of the K releases."""
         standard = LinkInertia(d.mass, d.com, d.inertia).standard()
         left = (standard.reshape(*standard.shape[:-2], -1) - self._nominal) @ self._gravity.T
         drag = d.drag[..., self.joint, :]
@@ -43,7 +43,7 @@ class StaticFriction:
         return self.command + pull - left
 
     def slide(self, d: Dynamics) -> Slide:
-        """Return the motion after each ramp's release (NaN without a release), for a family with Stribeck effect."""
+        """Return the joint's motion after each release (NaN without a release) for a Stribeck friction family."""
         phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
         sign = np.where(self.side, 1.0, -1.0)
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
@@ -56,7 +56,7 @@ class StaticFriction:
         return Slide(kappa, level, viscous, fall, self._misfit)
 
     def breakaway(self, d: Dynamics) -> np.ndarray:
-        """Return breakaway torques (n, 2) Nm: the mean net torques at release, or without a ramp the values of d."""
+        """Return the mean net torques (n, 2) Nm at release; directions without a ramp have the torques of `d`."""
         net, out = self.net_torque(d), d.breakaway.copy()
         for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
             out[j, side] = net[(self.joint == j) & (self.side == side)].mean()

@@ -1,6 +1,6 @@
 """Choose the stiction model of joints at rest and, if no ramps were recorded, the breakaway torques.
 
-r2s scans over models and torques, because the replay error has no useful gradient with respect to either.
+r2s tries every model and a grid of torques, because the replay error has no useful gradient.
 """
 
 from dataclasses import replace
@@ -33,10 +33,10 @@ def choose_stiction(
     stride: int,
     nthread: int,
 ) -> dict[str, np.ndarray | float]:
-    """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm} that replay stops best.
+    """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm}, fitted to replayed stops.
 
-    largest: upper limit of scanned breakaway torques, relative to the identified friction; None: ramps determine
-    them, without a scan. If no trajectory is as long as a window, the values of `dynamics` are returned.
+    largest: largest breakaway torque of the scan, relative to the identified friction; None: no scan, because ramps
+    determine breakaway torques. If all trajectories are shorter than a window, the values of `dynamics` are returned.
     """
     windows = windows_or_none(recording, HORIZON, WINDOWS)
     scanned = largest is None or windows_or_none(recording, window_s, 1) is not None
@@ -72,9 +72,9 @@ def scan_breakaway(
 ) -> np.ndarray:
     """Return the breakaway torques (n, 2) Nm with which `dynamics` replays the recording best.
 
-    A gradient search would fail: the error jumps when a joint is released one step sooner. Each pass varies one
-    torque at a time and minimizes its joint's error. Coarse passes scan [0, largest], (n,) Nm; fine passes scan about
-    the best value. Two passes are coarse, because other joints' torques are still wrong in the first pass.
+    A gradient search would fail, because the replay error jumps if a joint starts to slide one step sooner. A pass
+    varies one breakaway torque at a time and minimizes the replay error of the same joint. Coarse passes scan from 0
+    to `largest` (n,) Nm, fine passes around the best value. Two passes are coarse, because joints affect each other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

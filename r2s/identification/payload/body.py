@@ -1,4 +1,4 @@
-"""Coordinates of a rigid body with positive mass, all physically possible, and a prior for bodies that arms carry."""
+"""Coordinates that describe only physically possible rigid bodies, and a prior for bodies that arms carry."""
 
 from dataclasses import dataclass
 
@@ -20,11 +20,11 @@ class BodySpace:
     """Coordinates z (10,) of a body in the end effector's frame: mass, center of mass, shape of the second moment.
 
     The second moment about the center is mass gyration^2 V V^T, V = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]]
-    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). So every z with positive mass is a possible body.
+    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). Every z with positive mass describes a possible body.
 
     Attributes:
         heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the center's coordinates.
-        gyration: m, radius / sqrt(5) of a ball of water with about the body's mass.
+        gyration: m, radius of a ball of water with about the body's mass, divided by sqrt(5).
     """
 
     heaviest: float
@@ -39,12 +39,12 @@ class BodySpace:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(10,), standard deviation of the prior, whose mean is 0; inf: flat."""
+        """(10,) standard deviations of the prior of z about 0; inf means a flat prior."""
         return np.array([np.inf, *[self.far] * 3, *[SIZE] * 3, *[SHEAR] * 3])
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest coordinates, each (10,)."""
+        """Lower and upper bounds (10,) of the coordinates z."""
         reach = np.array([0.0, *[FARTHEST * self.far] * 3, *[WIDEST * SIZE] * 3, *[WIDEST * SHEAR] * 3])
         return -reach, reach + HEAVIEST * self.heaviest * np.eye(10)[0]
 
@@ -58,7 +58,7 @@ class BodySpace:
         return z[..., 0], z[..., 1:4], np.trace(second, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - second
 
     def standard(self, z: np.ndarray) -> np.ndarray:
-        """Return the standard parameters (..., 10) of z about the end effector: mass, first moments, tensor."""
+        """Return the standard parameters (..., 10) of bodies z: mass, then moments and tensor at the end effector."""
         mass, centre, tensor = self.body(z)
         return LinkInertia(mass, centre, tensor).standard()
 
@@ -68,5 +68,5 @@ class BodySpace:
         return ((self.standard(z + h) - self.standard(z - h)) / (2 * h.diagonal()[:, None])).T
 
     def prior(self, z: np.ndarray) -> np.ndarray:
-        """Return the prior's residual (9,) for all coordinates except the mass, in standard deviations."""
+        """Return the prior's residual (9,) in standard deviations, without the mass, whose prior is flat."""
         return z[1:] / self.sigma[1:]

@@ -27,11 +27,11 @@ class PayloadEstimate:
     """An identified payload, in the end effector's frame.
 
     Attributes:
-        mass: kg. centre: (3,) m. tensor: (3, 3) kg m^2 about the center, physically consistent.
+        mass: kg. centre: (3,) m, center of mass. tensor: (3, 3) kg m^2 about the center, physically consistent.
         draws: posterior draws {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)}; inertia in the order of ELEMENTS.
         identifiable: {name: bool, or one bool per element}, whether the recording determines the value.
-        t: (T,) s. measured: (T, n) Nm, filtered recorded torque. without, predicted: (T, n) Nm, torque of the
-            identified arm without and with payload. seen: (T, n) bool, rows used in the fit.
+        t: (T,) s, sample times. measured: (T, n) Nm, filtered recorded torque. without, predicted: (T, n) Nm, torque
+            of the identified arm without and with payload. seen: (T, n) bool, whether the fit uses a measured torque.
     """
 
     mass: float
@@ -47,11 +47,11 @@ class PayloadEstimate:
 
     @property
     def values(self) -> dict[str, np.ndarray]:
-        """The estimated values {"mass": (), "centre": (3,), "inertia": (6,)}."""
+        """Estimated mass, center of mass and tensor elements: {"mass": (), "centre": (3,), "inertia": (6,)}."""
         return {"mass": np.array(self.mass), "centre": self.centre, "inertia": tensor_elements(self.tensor)}
 
     def interval(self, name: str) -> np.ndarray:
-        """Return (2, ...), the 95 % interval of mass, center or inertia."""
+        """Return both ends (2, ...) of the 95 % interval of mass, center or inertia."""
         return np.percentile(self.draws[name], COVERED, axis=0)
 
     @property
@@ -67,7 +67,7 @@ class PayloadEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _Linearized:
-    """Payload problem linearized at its fit, for `posterior`. u: body z and arm errors w, on the unit cube."""
+    """Payload problem, linearized for `posterior` at the fitted body z and arm errors w."""
 
     rows: Rows
     space: BodySpace
@@ -108,14 +108,14 @@ def identify_payload(
     """Estimate the payload of an arm from a loaded recording.
 
     Args:
-        arm: the arm identified without payload, from the same kind of torque; its uncertainty widens the intervals.
+        arm: the arm, identified without payload from the same kind of torque; errors of the arm widen the intervals.
         recording: motion of the arm with the payload.
         declared: payload declared to gravity compensation (only for commanded torque).
-        cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: seed of the posterior's draws.
+        cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: seed of the random posterior draws.
         report: function that is called with the share of finished work and the name of the next task.
 
     Raises:
-        UserError: no joint moves fast enough, or the payload exceeds HEAVIEST times the rated mass.
+        UserError: all joints are too slow, or the estimated payload exceeds HEAVIEST times the rated mass.
     """
     report(0.0, "torque of the loaded arm")
     loaded = LoadedTorque(arm, recording, declared, cutoff_hz)
@@ -136,7 +136,7 @@ def identify_payload(
 
 
 def _fit(rows: Rows, space: BodySpace) -> np.ndarray:
-    """Return the body z (10,) that minimizes the sum of squares of rows and prior."""
+    """Return the body z (10,) that minimizes the sum of squares of data rows and prior residuals."""
     slope, constant = rows.reduced
 
     def residual(z: np.ndarray) -> np.ndarray:
@@ -152,7 +152,7 @@ def _fit(rows: Rows, space: BodySpace) -> np.ndarray:
 
 
 def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEstimate:
-    """Return the payload estimate at a fit, with posterior draws."""
+    """Return the fitted payload with its posterior draws."""
     rng, (low, high) = np.random.default_rng(seed), fit.space.bounds
     u = fit.u
     if u[0] > 1 - EDGE:

@@ -1,4 +1,4 @@
-"""Write payload.yaml and payload_posterior.npz: an identified payload for arms, other stages and libfranka."""
+"""Write an identified payload to payload.yaml and payload_posterior.npz, for later stages and libfranka."""
 
 import json
 from collections.abc import Mapping

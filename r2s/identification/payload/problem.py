@@ -1,4 +1,4 @@
-"""Set up the torque residual of a loaded arm, linear in the payload's parameters and the arm's uncertainty."""
+"""Linearize the torque residual of a loaded arm in the payload's parameters and the arm's errors."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -29,7 +29,7 @@ class LoadedSpace(ParameterSpace):
     payload: Payload | None = None
 
     def dynamics(self, x: np.ndarray) -> Dynamics:
-        """Return the dynamics that x (..., P) describes, plus the payload."""
+        """Return the dynamics of an arm with parameters x (..., P) and with the payload."""
         return dynamics_with_payload(self.robot, super().dynamics(x), self.payload)
 
 
@@ -49,14 +49,14 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10) and constant (r,): for a payload phi, the best w is gain @ phi + constant."""
+        """Gain (r, 10) and constant (r,) of the arm errors gain @ phi + constant that best fit a payload phi."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10) and constant (K,): at best w, the cost is sum((slope @ phi + constant)^2) plus a number."""
+        """Slope (K, 10) and constant (K,): slope @ phi + constant is the residual after elimination of w."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -67,7 +67,7 @@ class Rows:
         return root / size, np.linalg.lstsq(root.T, size * b, rcond=None)[0]
 
     def best_arm(self, phi: np.ndarray) -> np.ndarray:
-        """Return the arm's errors w (r,) that best explain the residual with a payload phi (10,)."""
+        """Return the arm errors w (r,) that best fit a payload phi (10,)."""
         gain, constant = self._eliminated
         return gain @ phi + constant
 
@@ -76,7 +76,7 @@ class LoadedTorque:
     """The torque residual of an arm with an unknown payload.
 
     Args:
-        arm: the arm identified without payload. recording: loaded recording of the same kind of torque.
+        arm: the arm, identified without payload. recording: motion with payload, and the same kind of torque.
         declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque.
     """
@@ -97,7 +97,7 @@ class LoadedTorque:
         self._sign = m.filtered(sliding_sign(self.torque))
 
     def with_payload(self, payload: Payload | None, unexplained: np.ndarray | float = 0.0) -> TorqueResidual:
-        """Return the residual of the arm with a payload, with weights from this residual itself.
+        """Return the residual of the arm with a payload, each row divided by its estimated standard deviation.
 
         unexplained: (T, n) Nm, torque due to the arm's errors, which is subtracted from the residual.
         """
@@ -121,14 +121,14 @@ class LoadedTorque:
         return np.stack(moved, -1) @ np.linalg.inv(LinkInertia(np.ones(10), centre, tensor).standard()).T
 
     def load_friction(self, payload: Payload | None) -> np.ndarray:
-        """Return the change of friction (T, n) Nm due to a payload's weight, at 1 Nm of friction per Nm of load."""
+        """Return the change of friction (T, n) Nm by a payload's weight if 1 Nm of load adds 1 Nm of friction."""
         m = self.torque.motion
         carried = mass_and_moment(self.arm.robot, payload)
         loaded = self._weight + np.array([self._load(q, carried) for q in m.q])
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Return the rows linearized at `payload` with parameters phi (10,); arm errors w (r,) affect the weights."""
+        """Linearize the residual at `payload` with parameters phi (10,); weights exclude torque of arm errors w."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

@@ -19,7 +19,7 @@ def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff
     of the payload. Commands do not contain a declared payload's weight, because gravity compensation carries it.
 
     Args:
-        payload: see `payload_of`. cutoff_hz: cutoff of the identification; accelerations have a higher cutoff.
+        payload: the known payload. cutoff_hz: torque cutoff of the identification; acceleration has a higher cutoff.
     """
     grid = recording.resample(SIM_DT)
     smooth = grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 * recording.rate_hz))

@@ -1,9 +1,9 @@
-"""Average a recording, with weights, over short windows in which a joint slides in one direction.
+"""Compute weighted means of a recording over short windows in which a joint slides in one direction.
 
 When a joint rests or reverses, its friction is not a function of velocity, and a low-pass spreads this friction over
-a tenth of a second. So each row is a weighted mean over a window in which the joint neither rests nor reverses
-(modulating functions: Shinbrot, Trans. ASME 79, 1957). The same weights average rigid-body torque, friction and
-command. Windows between close reversals are short and make rows noisier; r2s computes the noise of a row.
+a tenth of a second. A row of the torque residual is therefore a weighted mean over a window in which the joint always
+slides (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command are averaged
+with the same weights. Short windows between close reversals make rows noisier; r2s computes the noise of each row.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,17 +34,17 @@ LAG_POINTS, LAG_WEIGHTS = np.polynomial.laguerre.laggauss(16)  # quadrature of a
 
 @dataclass(frozen=True)
 class SlidingMotion:
-    """A recording sampled at F instants, and windows centered at T moments.
+    """A recording sampled at F instants, with averaging windows around T moments.
 
     Attributes:
-        t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2. bristle: (F, n), the presliding state.
-        means: for each piece of the recording, n sparse matrices (moments, instants) of the piece: the window weights
-            of each joint; rows without a window are empty.
-        seen: (T, n) bool, whether a joint slides in one direction throughout a window about the moment.
+        t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2, motion. bristle: (F, n), presliding state.
+        means: for each piece of the recording, n sparse matrices (moments, instants) with the window weights of each
+            joint. A moment without a window has an empty row.
+        seen: (T, n) bool, whether there is a window around the moment in which the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of a window's mean acceleration for white encoder noise of 1 rad.
         encoder: (n,) rad, standard deviation of the encoder noise.
-        delayed: (T, L, n) Nm, window means of the command with L delays: -1 ms, 0, 1 ms, ...
-        instants: (F,) s. starts: (F,) bool, whether a trajectory starts at the instant.
+        delayed: (T, L, n) Nm, window means of the command after each of L delays: -1 ms, 0, 1 ms, ...
+        instants: (F,) s, times of the F samples. starts: (F,) bool, whether a trajectory starts at the sample.
     """
 
     t: np.ndarray
@@ -71,11 +71,11 @@ class SlidingMotion:
         """Find windows, centered every 1 / `rate_hz` s, in which a joint is faster than `slowest` rad/s.
 
         For a friction law with memory (`slid` > 0), bristles bend over `presliding_rad` (a number or (n,)) after a
-        reversal. So a window starts only after the joint has slid by `slid` rad since a reversal. The velocity must
-        also be steady over PRESLIDING, because bristle friction depends on earlier velocities.
+        reversal. A window therefore starts only when the joint has slid by `slid` rad after a reversal. Velocity must
+        be nearly constant over the distance PRESLIDING, because bristle friction depends on earlier velocities.
 
         Raises:
-            UserError: no trajectory is long enough.
+            UserError: no trajectory is longer than 2 EDGE_S.
         """
         grid = recording.resample(SIM_DT)
         smooth = grid.smooth(CUTOFF_HZ)
@@ -132,13 +132,13 @@ class SlidingMotion:
 
     @property
     def tau(self) -> np.ndarray:
-        """(T, n) Nm, window means of the command without delay."""
+        """(T, n) Nm, window means of the recorded command at its own time."""
         return self.delayed[:, 1]
 
     def filtered(self, x: np.ndarray | Callable[[slice], np.ndarray]) -> np.ndarray:
-        """Return the means (T, n, ...) of x over the windows of each joint.
+        """Return the weighted means (T, n, ...) of x over the windows of each joint.
 
-        x is (F, n, ...), or a function from a slice of the F rows to values, which is evaluated piece by piece.
+        x is an array (F, n, ...) or, to save memory, a function that returns the rows of a slice.
         """
         ends = np.cumsum([0, *(means[0].shape[1] for means in self.means)]).tolist()
         parts = [
@@ -150,9 +150,9 @@ class SlidingMotion:
     rows = filtered  # unlike in `SmoothMotion`, functions of q, dq, ddq are averaged, too
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return window means (T, n) Nm of the command that acts after the hold, `delay` and `lag`, both in s.
+        """Return window means (T, n) Nm of the command after the hold, the `delay` in s and the `lag` in s.
 
-        At t acts the mean of u(t - delay - hold - x), with hold uniform over a step and x exponential with mean lag.
+        Torque at t is the mean of u(t - delay - hold - x), with uniform random hold and exponential x of mean `lag`.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
@@ -186,16 +186,16 @@ def _weights(half: int) -> np.ndarray:
 def _noise(half: int) -> float:
     """Return the standard deviation of the mean acceleration, 1/s^2, for white angle noise of 1 rad.
 
-    Integration by parts moves both time derivatives to the weights. An instant represents 1 / (RATE_HZ SIM_DT) rows.
+    Integration by parts moves both time derivatives to the weights. One weight spans 1 / (RATE_HZ SIM_DT) time steps.
     """
     second = np.diff(np.pad(_weights(half), 2), 2) * RATE_HZ**2
     return float(np.linalg.norm(second) * np.sqrt(SIM_DT * RATE_HZ))
 
 
 def _windows(q: np.ndarray, way: np.ndarray, at: np.ndarray, slid: float) -> tuple[csr_array, np.ndarray]:
-    """Return the weights (T, F) of one joint's windows centered at instants `at` (T,), and half their widths (T,).
+    """Return weights (T, F) and half the widths (T,) of a joint's windows around the instants `at` (T,).
 
-    `way` (F,) is the sliding direction, or 0 if the joint may stick. The width is 0 at a moment without a window.
+    `way` (F,) is the sliding direction, or 0 if the joint may stick. A width of 0 means that there is no window.
     """
     first, last = np.zeros(len(q), dtype=int), np.full(len(q), -1)
     changes = np.flatnonzero(np.diff(way, prepend=np.nan) != 0)

@@ -1,4 +1,4 @@
-"""Represent a planned motion in place of a recording; it is exact and needs no filter."""
+"""Represent a planned motion, which is free of noise and needs no filter, in place of a recording."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ class PlannedMotion:
     """Concatenated samples of B planned motions, with the interface of `SmoothMotion`.
 
     Attributes:
-        t: (T,) s. q, dq, ddq, tau: (T, n); tau is the nominal arm's torque. change: (T, n) Nm/s, d tau/dt.
+        t: (T,) s, times. q, dq, ddq: (T, n), motion. tau: (T, n) Nm, nominal torque. change: (T, n) Nm/s, d tau/dt.
         torque: kind of torque in tau, as in `Recording`.
     """
 
@@ -47,15 +47,15 @@ class PlannedMotion:
 
     @property
     def bristle(self) -> np.ndarray:
-        """(T, n), presliding state of joints that all slide."""
+        """(T, n), presliding state if every joint slides."""
         return np.sign(self.dq)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
-        """Return x (T, n, ...) unchanged."""
+        """Return x (T, n, ...) unchanged, because a planned motion needs no filter."""
         return x
 
     rows = filtered
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the command (T, n) Nm that acts at the joints, to first order in delay and lag, s."""
+        """Return the command (T, n) Nm after a `delay` and a `lag`, both in s, by first-order extrapolation."""
         return self.tau - (delay + lag) * self.change

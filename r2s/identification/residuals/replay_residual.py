@@ -1,7 +1,7 @@
 """Replay residual (output error) of commanded motion: simulated minus recorded joint angles, eq. (8) of the paper.
 
 Every candidate starts each window at the measured state and receives the recorded commands. All windows of many
-candidates are simulated in one batch. Each row is divided by its standard deviation, see `reweighted`.
+candidates are simulated in one batch. Residuals are in standard deviations, see `reweighted`.
 """
 
 from copy import copy
@@ -16,7 +16,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-USUAL = 0.9  # noise is estimated from this share of the windows, without the worst
+USUAL = 0.9  # noise is estimated from this share of the windows: those with the least residual
 HUBER = 1.5  # ratio of a window's RMS residual to the median, above which the window is down-weighted
 Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite-difference steps
 TORQUE_SIGMA, MIN_TORQUE_SIGMA = 0.05, 1e-4  # Nm, first guess and lower limit of a window's unexplained torque
@@ -24,16 +24,16 @@ BAYES_ROUNDS = 30  # fixed-point iterations of `_random_effects`
 
 
 class ReplayResidual:
-    """Whitened replay residual of angles averaged over `stride` ms. Immutable: `reweighted` returns a copy.
+    """Immutable, whitened replay residual of angles averaged over `stride` ms.
 
-    A window's error is modeled as Z b + e. For each joint, b ~ N(0, diag(d)) contains the errors of start angle and
-    start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise. The
-    covariance of this model whitens the error. Z follows from finite differences. First values of d and s follow from
-    the recording, later values from the residual. `clusters` (R,) are blocks, before a fit one per window.
+    The error of a window is modeled as Z b + e. For each joint, b ~ N(0, diag(d)) contains the errors of start angle
+    and start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise.
+    The covariance of Z b + e whitens the error. Finite differences yield Z. The recording yields first values of d
+    and s, the residual later values. `clusters` (R,) is the block of each row; before a fit, a window is one block.
 
     Args:
-        space: the parameters. recording, windows: the data, see `cut_windows`.
-        stride: ms, see above. batch: candidates that are simulated at once. nthread: threads; 0 uses all cores.
+        space: the parameters. recording, windows: the data, see `cut_windows`. stride: ms, averaging time of angles.
+        batch: number of candidates that are simulated at once. nthread: number of threads; 0: all cores.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ReplayResidual:
         return self._simulate(d, delayed[kind.ravel()], w.q0, w.dq0)
 
     def _simulate(self, d: Dynamics, tau: np.ndarray, q0: np.ndarray, dq0: np.ndarray) -> np.ndarray:
-        """Return `errors` of C candidates for joint torques tau (C, W, S, n) and start states (C, W, n) or (W, n)."""
+        """Simulate C candidates from states (C, W, n) or (W, n) with torques tau (C, W, S, n); return `errors`."""
         count = len(tau)
         ids = np.arange(count * self.count)
         shape = (count, *self.windows.q0.shape)
@@ -96,7 +96,7 @@ class ReplayResidual:
         return parts.mean(-2)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "ReplayResidual":
-        """Return this residual with Z at x (P,). If x was `fitted`, d and s are estimated from the errors at x."""
+        """Return a copy with Z computed at x (P,) and, if x was `fitted`, with d and s estimated from the errors."""
         other = copy(self)
         other._reweigh(x, fitted)
         return other
@@ -141,30 +141,30 @@ class ReplayResidual:
         return np.sqrt((r**2).sum(1) / np.maximum(self._seen.reshape(self.count, -1).sum(1), 1))
 
     def _white(self, error: np.ndarray) -> np.ndarray:
-        """Return the whitened `error` (C, W, R') rad, in standard deviations."""
+        """Whiten an angle error (C, W, R') rad; the result is in standard deviations."""
         r = error / np.tile(self._noise, self._target.shape[1])
         part = (r[..., None, :] @ self._axes) * self._shrink[:, None] @ self._axes.transpose(0, 2, 1)
         return r - part[..., 0, :]
 
     def _whiten(self, z: np.ndarray) -> None:
-        """Set A and f = 1 - 1 / sqrt(1 + l^2) in (I + E E^T)^(-1/2) = I - A f A^T, for E = z sigma / s = A l V^T."""
+        """Set A and f = 1 - 1 / sqrt(1 + l^2) in (I + E E^T)^(-1/2) = I - A f A^T for E = z sigma / s = A l V^T."""
         effect = z * self._sigma / np.tile(self._noise, self._target.shape[1])[:, None]
         self._axes, size, _ = np.linalg.svd(effect, full_matrices=False)
         self._shrink = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
 
     def joint_error(self, x: np.ndarray) -> np.ndarray:
-        """Return the mean square error (C, n) mrad^2 of each joint for candidates x (C, P)."""
+        """Return the mean square angle error (C, n) mrad^2 of each joint for candidates x (C, P)."""
         return 1e6 * (self.errors(x).reshape(len(x), -1, self.space.n) ** 2).mean(1)
 
 
 def _random_effects(
     z: np.ndarray, error: np.ndarray, seen: np.ndarray, sigma: np.ndarray, noise: np.ndarray, min_sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e that maximize the evidence.
+    """Estimate the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e by maximum evidence.
 
-    MacKay's fixed-point iteration, Neural Computation 4(3), 1992, starts at `sigma` and `noise`: the variance of b is
-    sum(mean^2) / (number of well-determined b). It excludes the mean of b over all windows, due to a wrong parameter
-    (mostly an offset) that the next fit can correct. The standard deviation of b is at least `min_sigma` (K,).
+    MacKay's fixed-point iteration (Neural Computation 4(3), 1992) starts at `sigma` and `noise`. The variance of b is
+    sum(mean^2) / (number of well-determined b). The mean of b over all windows is excluded, because a wrong
+    parameter (mostly an offset) causes this mean. The standard deviation of b is at least `min_sigma` (K,).
     """
     _, rows, k = z.shape
     n = len(noise)

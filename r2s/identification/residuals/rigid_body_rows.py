@@ -1,4 +1,4 @@
-"""Compute rigid-body torque and its regressor for the links' inertial parameters, at a torque residual's moments."""
+"""Compute rigid-body torque and its regressor for inertial parameters at the sample times of a torque residual."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -14,12 +14,12 @@ from r2s.recordings.parts import joined_arrays
 
 @dataclass(frozen=True)
 class RigidBodyRows:
-    """Rigid-body torque at T moments.
+    """Rigid-body torque at the T sample times of a torque residual.
 
     Attributes:
-        q: (T, n) rad.
-        rest: (T, n) Nm, torque of damping and springs in the robot's file.
-        y: (T, n, 10 n), regressor of the torque.
+        q: (T, n) rad, joint angles.
+        rest: (T, n) Nm, torque of the damping and springs in the robot's file.
+        y: (T, n, 10 n), regressor of rigid-body torque for the links' standard parameters.
         compensation: (T, n, 10 n), regressor of gravity compensation's error; empty unless torque is commanded.
         load: (T, n) Nm, magnitude of the nominal gravity torque.
         rotors: (T, n) rad/s^2, rotor acceleration; 0 if recorded torque excludes the torque on the rotors.
@@ -36,7 +36,7 @@ class RigidBodyRows:
 
     @staticmethod
     def of(robot: Robot, m: SmoothMotion | SlidingMotion, torque: str) -> "RigidBodyRows":
-        """Return the rows for the motion m of a recording with the kind of torque `torque`."""
+        """Compute the rigid-body torque for a motion m, recorded with the kind of torque `torque`."""
         commanded, still, shape = torque == "commanded", np.zeros_like(m.q), (*m.q.shape, -1)
         rest, y = rigid_body(robot, m.q, m.dq, m.ddq, None if commanded else robot.gravity)
         rest = m.rows(rest - robot.armature * m.ddq)  # candidates add their own rotor torque

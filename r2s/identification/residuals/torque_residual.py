@@ -1,7 +1,7 @@
 """Torque residual (equation error): torque predicted at the measured motion minus recorded torque.
 
-Link-side and motor torque have no other residual, because only commands can be replayed. For commanded torque, a fit
-of the torque residual is a fast first step. Each row is divided by its standard deviation, see `reweighted`.
+For link-side and motor torque, r2s minimizes only the torque residual, because only commands can be replayed. For
+commanded torque, a fit of the torque residual is a fast first search. Residuals are in standard deviations.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, small against the residual's curvature
-MAX_CORRELATION = 40  # rows, longest correlation length: a slowly drifting residual is worth more than one row
+MAX_CORRELATION = 40  # rows, longest correlation length: a slowly drifting residual informs more than one row
 MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 30_000  # longer recordings (from 5 min at 100 Hz) get fewer rows per s; the cutoff needs 20 per s
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
@@ -36,17 +36,17 @@ FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
 
 
 class TorqueResidual:
-    """Torque residual of a zero-phase filtered recording, immutable: `on` and `reweighted` return copies.
+    """Immutable torque residual of a zero-phase filtered recording.
 
-    The regressor of the rigid-body torque is computed once. Friction is computed from velocities with a higher cutoff
-    and then filtered like the recorded torque, because this filter smooths the step of friction at a reversal.
+    The constructor computes the regressor of rigid-body torque once. Friction is computed from velocities with a
+    higher cutoff, then filtered like the recorded torque, in which the filter smooths friction steps at reversals.
 
     Args:
-        space: the parameters. recording: the data, or a planned motion, which is not filtered.
+        space: the parameters to estimate. recording: a recording or a planned motion, which is not filtered.
         cutoff_hz: cutoff of the zero-phase filter. rate_hz: rows per second.
-        presliding_rad: distance over which bristles bend, a number or (n,).
-        slowest: rad/s. If positive, rows are means over windows in which a joint is faster than `slowest` and does
-            not reverse (modulating_functions.py), and a row's weight includes the encoder noise in its window.
+        presliding_rad: rad, distance over which bristles bend, a number or (n,).
+        slowest: rad/s; if positive, rows are means over windows in which the joint is faster than `slowest` and does
+            not reverse (modulating_functions.py), and the weights of rows include encoder noise.
     """
 
     def __init__(
@@ -106,17 +106,17 @@ class TorqueResidual:
         return other
 
     def on(self, space: ParameterSpace) -> "TorqueResidual":
-        """Return this residual for another parameter space, reweighted at its start."""
+        """Return a copy for the parameter space `space`, reweighted at the start values of `space`."""
         return self._with(space=space).reweighted(space.start, fitted=False)
 
     def with_lead(self, lead_s: float) -> "TorqueResidual":
-        """Return this residual for implicit friction, `lead_s` seconds ahead (problem.py: `implicit_friction`)."""
+        """Return a copy for a simulator with implicit friction at the velocity `lead_s` s ahead of the motion."""
         return self._with(lead_s=lead_s)
 
     def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
-        """Return this residual, unfitted, for bristles that bend over `presliding_rad` (n,); `recording` is its data.
+        """Return a copy for bristles that bend over `presliding_rad` (n,) rad during the motion of `recording`.
 
-        Motion and regressors stay, so that a long recording has them in memory once.
+        The copy has weights as before a fit. To save memory, the copy shares motion and regressors with the original.
         """
         of = partial(self._of, presliding_rad=presliding_rad)
         bristle = np.concatenate([of(piece).bristle for piece in _pieces(recording, of)])
@@ -126,17 +126,17 @@ class TorqueResidual:
         return self._with(motion=m, _mean_sign=mean, block=block).on(self.space)
 
     def within(self, kept: np.ndarray) -> "TorqueResidual":
-        """Return this residual restricted to the moments at which `kept` (T,) is true."""
+        """Return a copy restricted to the sample times at which `kept` (T,) is true."""
         return self._with(seen=self.seen & kept[:, None])
 
     def with_external(self, tau: np.ndarray) -> "TorqueResidual":
-        """Return this residual for an arm on which the environment exerts joint torques tau (T, n) Nm."""
+        """Return a copy for an arm on which the environment exerts joint torques tau (T, n) Nm."""
         return self._with(_external=tau)
 
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: parts of a prediction for a similar arm; a part is reused if its parameters are equal.
+        known: parts of an earlier prediction, of which parts with equal parameters are reused.
         """
         d, own = dynamics, self._known(dynamics, known)
         # a link-side sensor's gain does not scale friction
@@ -149,7 +149,7 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None) -> "_Known":
-        """Return the slow parts of a prediction; a part of `like` is reused if its parameters are equal."""
+        """Return the parts of a prediction that are slow to compute, or parts of `like` with equal parameters."""
         m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
         if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
             torque, compensation = like.rigid, like.compensation
@@ -164,17 +164,17 @@ class TorqueResidual:
         return _Known(standard, d.armature, torque, compensation, d.phi, friction)
 
     def _sign(self, memory: bool, rows: slice) -> np.ndarray:
-        """Return the sign of friction in `rows` of the F instants; memory: whether the family has a memory."""
+        """Return the sign of friction at a slice of the F instants; memory: whether the family has a memory."""
         if memory:
             return self.motion.bristle[rows]
-        dq = self.motion.friction_dq[rows]  # in sliding windows friction is full at any speed
+        dq = self.motion.friction_dq[rows]  # in windows without stops, friction is fully developed
         return np.sign(dq) if self._sharp else np.tanh(dq / WIDTH_DQ)
 
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
-        """Return friction before filtering, Nm, in `rows` of the F instants.
+        """Return the unfiltered friction torque in Nm at a slice of the F instants.
 
-        A simulator with implicit friction evaluates friction at the velocity `lead_s` earlier (the previous step).
-        The simulator then corrects this friction if friction rises with speed.
+        A simulator with implicit friction evaluates friction at the velocity of the previous step, `lead_s` earlier,
+        and adds a correction if friction rises with speed.
         """
         dq, sign = self.motion.friction_dq[rows], self._sign(d.family.has_memory, rows)
         if not self.lead_s:
@@ -185,7 +185,7 @@ class TorqueResidual:
         return d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(ddq)
 
     def error(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
-        """Return predicted minus recorded torque (T, n) Nm; commands are first delayed by hold, delay and lag."""
+        """Return predicted minus recorded torque (T, n) Nm, for commands after hold, delay and lag."""
         m, free = self.motion, self.predict(dynamics, known) - self._external
         if self.commanded:
             return free - m.command(float(dynamics.delay), float(dynamics.lag))
@@ -193,7 +193,7 @@ class TorqueResidual:
         return free - (m.earlier(-late) if late and isinstance(m, SmoothMotion) else m.tau)
 
     def errors(self, x: np.ndarray) -> np.ndarray:
-        """Return the `error` (C, T, n) Nm of candidates x (C, P)."""
+        """Return the torque errors (C, T, n) Nm of candidates x (C, P)."""
         d = self.space.dynamics(x)
         out = np.empty((len(x), *self.seen.shape))
         for i in range(len(x)):
@@ -209,7 +209,7 @@ class TorqueResidual:
         return np.concatenate([j for _, j in self.linearize(u)])
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield residual (r,) and Jacobian (r, P) at u (P,) on the unit cube for one part of the rows at a time."""
+        """Yield residual (r,) and Jacobian (r, P) at u (P,) on the unit cube, in parts of r rows."""
         h = np.where(u > 0.5, -STEP, STEP)
         x, stepped = self.space.from_unit(u), self.space.from_unit(u + h)
         r, changes = self(x[None])[0], self._changes(x, stepped)
@@ -218,13 +218,13 @@ class TorqueResidual:
             yield r[first * self.space.n :][: PART * self.space.n], self._assembled(changes, rows, len(x)) / h
 
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
-        """Return the residual's change (R, P); for column k, only value k moves from x (P,) to `stepped` (P,)."""
+        """Return changes (R, P) of the residual; for column k, only value k changes from x (P,) to `stepped` (P,)."""
         return self._assembled(self._changes(x, stepped), slice(None), len(x))
 
     def _changes(self, x: np.ndarray, stepped: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return [(block, indices in x, change)], with changes of torque (T, n) or of L link values (n, 10 n, L).
+        """Return [(block, indices in x, change)]: changes (T, n) of torque, or (n, 10 n, L) of standard parameters.
 
-        One evaluation per block suffices: friction affects only its joint; torque is linear in standard parameters.
+        One evaluation per block suffices: friction acts on one joint, and torque is linear in standard parameters.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -247,7 +247,7 @@ class TorqueResidual:
         return out
 
     def _assembled(self, changes: list, rows: slice, count: int) -> np.ndarray:
-        """Return the change (rows n, P) of the residual in standard deviations, for the moments in `rows`."""
+        """Return changes (rows n, P) of the residual, in standard deviations, for the sample times `rows`."""
         n, weight = self.space.n, (self.seen[rows] / self.scale[rows])[..., None]
         reach = self._rigid.y[rows] + self._rigid.compensation[rows] if self.commanded else self._rigid.y[rows]
         out = np.zeros((len(reach), n, count))
@@ -262,11 +262,11 @@ class TorqueResidual:
         return (out * weight).reshape(-1, count)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
-        """Return this residual with rows divided by their standard deviation, estimated from the error at x (P,).
+        """Return a copy with rows divided by their standard deviation, estimated from the error at x (P,).
 
-        A joint's standard deviation is the RMS error if x was `fitted`, else half of it, times the root of the
-        correlation length. In sliding windows, the standard deviation combines a constant with encoder noise, which
-        is larger in short windows. If x was `fitted`, the error's correlation also sets the length of blocks.
+        The standard deviation of a joint is the RMS error, halved unless x was `fitted`, times the root of the
+        correlation length. For means over windows, the standard deviation also contains encoder noise, which is
+        larger in short windows. If x was `fitted`, the correlation of the error determines the length of blocks.
         """
         r = self._seen_errors(x)
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
@@ -278,7 +278,7 @@ class TorqueResidual:
         return y + weight if self.commanded else y
 
     def weighted_like(self, other: "TorqueResidual") -> "TorqueResidual":
-        """Return this residual with the standard deviations of another one."""
+        """Return a copy with the standard deviations of the residual `other`."""
         return self._with(_weights=other._weights)
 
     def _seen_errors(self, x: np.ndarray) -> np.ndarray:
@@ -291,13 +291,13 @@ class TorqueResidual:
 
     @property
     def scale(self) -> np.ndarray:
-        """(T, n) Nm, standard deviation of an independent row."""
+        """(T, n) Nm, standard deviation by which each row is divided."""
         factor, constant = self._weights
         return factor * np.sqrt(constant**2 + self._noise**2)
 
 
 class _Known(NamedTuple):
-    """Parts of a predicted torque: rigid, compensation and friction (T, n) Nm, and the parameters used for them."""
+    """Rigid-body, compensation and friction torque (T, n) Nm, and the parameters on which these torques depend."""
 
     standard: np.ndarray
     armature: np.ndarray
@@ -308,7 +308,7 @@ class _Known(NamedTuple):
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
-    """Apply `of` to a recording piece by piece; return the joined motion and its rigid-body torque."""
+    """Filter a recording piece by piece with `of`; return the joined motion and its rigid-body torque."""
     motions = [of(piece) for piece in _pieces(recording, of)]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     joined = type(motions[0]).joined(motions)
@@ -318,7 +318,7 @@ def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any
 
 
 def _pieces(recording: Recording, of: "partial[Any]") -> Iterator[Recording]:
-    """Yield the pieces of a recording, with the overlap that `of` cuts off at both ends."""
+    """Yield overlapping pieces of a recording; the filter `of` removes the overlap."""
     return pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])
 
 

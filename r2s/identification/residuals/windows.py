@@ -31,11 +31,11 @@ HISTORY = 40  # ms, length of the commands before a window; delay and lag shift 
 
 @dataclass(frozen=True)
 class Windows:
-    """W windows of a recording: start states, commands and the joint angles that followed.
+    """W windows of a recording, with start states, commands and recorded joint angles.
 
     Attributes:
         t: (W,) s, start time. q0, dq0: (W, n) rad, rad/s, start state. tau: (W, S, n) Nm, commands, one per ms.
-        before: (W, HISTORY, n) Nm, commands before the start. bristle: (W, n), presliding state at the start.
+        before: (W, HISTORY, n) Nm, commands before a window. bristle: (W, n), presliding state at a window's start.
         q: (W, S, n) rad, recorded angles after each step.
         length: (W,) number of steps per window; `tau` and `q` have padding after this number of rows.
     """
@@ -67,13 +67,13 @@ def cut_windows(
 
     Args:
         limit: largest number of windows; a longer recording yields `limit` evenly spaced windows.
-        slowest: rad/s, least speed of a joint in a window; a slower joint ends it. A tiny parameter change can shift
-            the breakaway of a resting joint by a step, which disturbs all joints. Joints that never move are ignored.
-        edges: (n, 2) Nm, each joint's lower and upper breakaway command, widened by their scatter. A slow joint ends
-            a window only while its command lies between its two breakaway commands.
+        slowest: rad/s. A joint slower than `slowest` ends a window, because a tiny parameter change can shift the
+            breakaway of a resting joint by a step and disturb all joints. Joints that never move are ignored.
+        edges: (n, 2) Nm, lower and upper breakaway command of each joint, widened by SCATTER. A slow joint ends a
+            window only if its command lies between its two breakaway commands.
 
     Raises:
-        UserError: no trajectory is as long as a window, or the joints hardly ever move all at the same time.
+        UserError: no trajectory is as long as a window, or in every window some joint is too slow.
     """
     grid = recording.resample(SIM_DT)
     steps = round(seconds / SIM_DT)
@@ -137,12 +137,12 @@ def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, 
 class StartState:
     """Estimate a replay's start state: fit a cubic to 31 ms of measured angles and velocities, weighted by noise.
 
-    Logged velocities lag behind the angles: by half a step in a simulator, by a filter's delay on an arm. The fit
-    estimates this lateness for each joint, from the derivative of the angles, and corrects it.
+    Logged velocities are late relative to angles: by half a step in a simulator, by a filter's delay on an arm. For
+    each joint, the fit compares velocities with the derivative of the angles, and corrects late velocities.
 
     Attributes:
-        noise: (n,) rad, robust estimate of angle noise. kernel: (n, 2, 2 STATE_SAMPLES), matrix from measured angles
-            and velocities to q and dq. sigma: (2, n) rad, rad/s, standard deviation of the start state.
+        noise: (n,) rad, robust estimate of angle noise. kernel: (n, 2, 2 STATE_SAMPLES), matrix that maps measured
+            angles and velocities to the start state. sigma: (2, n) rad, rad/s, standard deviation of the start state.
     """
 
     noise: np.ndarray
@@ -151,7 +151,7 @@ class StartState:
 
     @staticmethod
     def of(grid: Recording) -> "StartState":
-        """Return the estimator of start states for a recording `grid` that is sampled at 1 kHz."""
+        """Return the estimator of start states in a recording `grid` with 1 kHz."""
         n = grid.n_joints
         seen = [s for s in grid.stretches if s.stop - s.start > STATE_SAMPLES]
 

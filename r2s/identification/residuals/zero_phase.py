@@ -30,9 +30,9 @@ class SmoothMotion:
 
     Attributes:
         t: (T,) s, sample times. q, dq, ddq, tau: (T, n), filtered forward and backward.
-        friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), presliding state. At the
-            ends of each trajectory, friction_dq and bristle are padded by half a kernel of constant rows.
-        kernel: (K,), weights of the low-pass. spans: for each of the T samples, in batches, the kernel's first F row.
+        friction_dq: (F, n) rad/s, velocity at FRICTION_HZ, with a higher cutoff than dq. bristle: (F, n), presliding
+            state. friction_dq and bristle have half a kernel of constant rows before and after each trajectory.
+        kernel: (K,), weights of the low-pass. spans: for each of the T samples, the first of K rows in friction_dq.
         delayed: (T, L, n) Nm, tau at L time shifts in the range SHIFTS, `shift_s` s apart.
     """
 
@@ -58,10 +58,10 @@ class SmoothMotion:
     ) -> "SmoothMotion":
         """Resample to 1 kHz, filter forward and backward, differentiate, remove the ends, and sample at `rate_hz`.
 
-        rate_hz: at most FRICTION_HZ. late: lateness of the logged dq, to correct; None: no correction.
+        rate_hz: rows per second, at most FRICTION_HZ. late: lateness by which dq is corrected; None: no correction.
 
         Raises:
-            UserError: no trajectory is long enough.
+            UserError: no trajectory is longer than 2 EDGE_S.
         """
         grid = recording.resample(SIM_DT)
         smooth, quick = grid.smooth(cutoff_hz), grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 / SIM_DT))
@@ -109,7 +109,7 @@ class SmoothMotion:
     def filtered(self, x: "np.ndarray | Callable[[slice], np.ndarray]") -> np.ndarray:
         """Low-pass x (F, n), and return its values (T, n) at the sample times.
 
-        If x is a function that returns a slice of rows, filtering is faster, because not all rows are in memory.
+        To save memory and time, x can also be a function that returns the rows of a slice.
         """
         parts = []
         for s in self.spans:
@@ -123,11 +123,11 @@ class SmoothMotion:
         return x
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the commanded torque (T, n) Nm after a delay and a lag, which acts like a second delay."""
+        """Return the commanded torque (T, n) Nm after `delay` + `lag` s; a short lag acts like a delay."""
         return self.earlier(delay + lag + HOLD_STEPS * SIM_DT)
 
     def earlier(self, seconds: float) -> np.ndarray:
-        """Return tau (T, n) Nm from `seconds` before each sample time; from a later time if `seconds` is negative."""
+        """Return the torque (T, n) Nm at `seconds` before each sample time; `seconds` can be negative."""
         at = (seconds - SHIFTS[0]) / self.shift_s
         k = int(np.clip(at, 1, self.delayed.shape[1] - 3))
         weights = cubic(min(max(at - k, -1.0), 2.0))

@@ -1,1 +1,1 @@
-"""Searches, which minimize a `Problem` on the unit cube: genetic.py, and least_squares.py with its solver."""
+"""Searches that minimize a `Problem` on the unit cube: a genetic algorithm and least squares."""

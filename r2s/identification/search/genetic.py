@@ -1,7 +1,7 @@
-"""The paper's genetic algorithm (Alg. 1: select, mutate, update until convergence or G_max), with pymoo's GA.
+"""Run the paper's genetic algorithm (Alg. 1: select, mutate, update until convergence or G_max) with pymoo's GA.
 
-The population starts around the nominal model. A population that starts uniformly in the bounds, with pymoo's default
-operators, loses its diversity long before its friction curves are right.
+The first population surrounds the start of the search. With a first population uniform over the bounds and pymoo's
+default operators, the population would lose its diversity long before the friction curves are correct.
 """
 
 import time
@@ -24,7 +24,7 @@ class Genetic:
     Attributes:
         population: number of individuals, all simulated at once.
         generations: largest number of generations, G_max. minutes: time limit.
-        spread: standard deviation of the first population about the start, on the unit cube; at most the prior's.
+        spread: standard deviation of the first population about the start, on the unit cube; the prior limits it.
         patience, tolerance: the search ends if the best cost improves by less than the share `tolerance` over
             `patience` generations.
         seed: seed of all random draws.

@@ -15,8 +15,8 @@ class LeastSquares:
     """The least-squares search.
 
     Attributes:
-        max_evaluations: limit on Jacobians. ftol: the search ends at a lower relative gain. minutes: time limit.
-        level: "residual" fits the problem's data; "torque" fits the problem's torque residual within seconds.
+        max_evaluations: most Jacobians. ftol: relative decrease of the cost at which the search ends. minutes: limit.
+        level: what to minimize: "residual" for `Problem.data` or, within seconds, "torque" for the torque residual.
     """
 
     max_evaluations: int = 40

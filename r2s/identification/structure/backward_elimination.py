@@ -1,7 +1,7 @@
-"""Backward elimination: remove a term if the model predicts held-out torque equally well without it.
+"""Backward elimination: remove a term if the model predicts held-out torque equally well without this term.
 
-Fewer parameters generalize better, and gravity hardly distinguishes link masses from a payload. An arm with correct
-published link parameters needs no link terms; an arm without payload needs no payload term.
+Models with fewer parameters generalize better. Gravity hardly distinguishes link masses from a payload. An arm with
+correct published link parameters needs no link terms; an arm without payload needs no payload term.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from r2s.identification.terms import blocks_of
 
 
 def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequence[str]) -> dict[str, list[bool]]:
-    """Return {"needed": [whether prediction needs the term, for each of `terms`]}; only `prunable` terms are tested.
+    """Return {"needed": list of bool}: whether each of `terms` remains; only `prunable` terms can be removed.
 
     The term with the most parameters is tested first. A term is removed unless the model without this term predicts
     clearly worse than the best model so far.
@@ -23,7 +23,7 @@ def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequenc
     done = 0
 
     def score(some: Sequence[str]) -> np.ndarray:
-        """Return the mean square error (blocks, n) Nm^2 of held-out torque for a model with the terms `some`."""
+        """Return the mean square error (blocks, n) Nm^2 of held-out torque for a model with the terms in `some`."""
         nonlocal done
         space = cv.space(some)
         squares = np.concatenate([fold.score(space, cv.prior) for fold in folds])

@@ -1,4 +1,4 @@
-"""Cross-validate within a recording: hold out blocks of time or, if the motion repeats, of its phase."""
+"""Cross-validate within a recording: hold out blocks of time or, for a repeated motion, blocks of phase."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ GUARD_S = 0.1  # s, gap between fitted rows and a held-out block, as the low-pas
 
 
 def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
-    """Return (fitted part, held-out part) per fold; a fold holds out `blocks` blocks, between gaps of GUARD_S."""
+    """Return (fitted part, held-out part) per fold; a gap of GUARD_S separates each held-out block from the rest."""
     period = recording.period or np.inf
     clock = recording.t % period if recording.period else recording.t
     edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
@@ -39,13 +39,13 @@ def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Re
 
 
 class Fold(NamedTuple):
-    """A fold of the cross-validation: the torque residuals of fitted and of held-out motion."""
+    """Torque residuals of the fitted motion and of the held-out motion in one fold of the cross-validation."""
 
     fit: TorqueResidual
     test: TorqueResidual
 
     def score(self, space: ParameterSpace, prior: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Fit, and return the mean square error (blocks, n) Nm^2 of held-out torque in each half-second block."""
+        """Fit `space`; return the mean square error (blocks, n) Nm^2 of held-out torque per half-second block."""
         own, test = self.fit.on(space), self.test
         u, _ = fit_torque(Problem.of(own, own, prior))
         square = test.seen * test.error(space.dynamics(space.from_unit(u)[None]).one(0)) ** 2
@@ -59,12 +59,12 @@ class CrossValidation:
     """Data and settings of the cross-validation that selects the friction family and the terms.
 
     Attributes:
-        robot, nominal: the arm, and the dynamics at which every fit starts.
+        robot: the arm. nominal: dynamics at which every fit starts.
         recording: training motion.
-        bounds, prior: see `search_space` and `Problem.of`.
+        bounds, prior: bounds and prior of the parameters, see `search_space` and `Problem.of`.
         folds: number of folds.
         cutoff_hz: cutoff of the zero-phase filter.
-        report: function that receives progress rows. stated: the user's values, of which only fixed ones are used.
+        report: function that receives progress rows. stated: the user's statements; only fixed values are used.
     """
 
     robot: Robot
@@ -78,11 +78,11 @@ class CrossValidation:
     stated: Stated = field(default_factory=dict)
 
     def space(self, terms: Sequence[str], nominal: Dynamics | None = None) -> ParameterSpace:
-        """Return the parameter space of `terms` and of the friction family of `nominal` (None: of the arm)."""
+        """Return the parameter space of `terms` and of the friction family of `nominal` (default: self.nominal)."""
         return search_space(self.robot, nominal or self.nominal, self.bounds, terms, self.recording, self.stated)
 
     def split(self, space: ParameterSpace, *, blocks: int = 1, slowest: float = 0.0) -> Iterator[Fold]:
-        """Yield the folds; for `blocks`, see `held_out`, for `slowest`, see `TorqueResidual`."""
+        """Yield all folds; `held_out` explains `blocks`, and `TorqueResidual` explains `slowest`."""
         for pair in held_out(self.recording, self.folds, blocks):
             fit, test = (
                 TorqueResidual(space, part, cutoff_hz=self.cutoff_hz, rate_hz=RATE_HZ, slowest=slowest)
@@ -100,8 +100,8 @@ def per_joint(squares: np.ndarray) -> np.ndarray:
 
 
 def clearly_worse(more: np.ndarray) -> bool:
-    """Return whether the error increases clearly: whether the mean of `more` (blocks,) exceeds its standard error.
+    """Return whether the mean increase of the error, `more` (blocks,), exceeds the standard error of this mean.
 
-    This one-standard-error rule is from Breiman et al., Classification and Regression Trees, 1984.
+    The one-standard-error rule is from Breiman et al., Classification and Regression Trees, 1984.
     """
     return bool(more.mean() > more.std() / np.sqrt(len(more)))

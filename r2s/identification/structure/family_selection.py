@@ -18,10 +18,10 @@ CLOSE = 1.45
 def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float = 0.0) -> dict[str, Any]:
     """Return {"error": (F,) held-out torque error over the least error, "best": index} for the F friction families.
 
-    A family with more parameters is chosen only if it predicts clearly better. Slow sliding would show whether
-    friction falls with velocity, but the low-pass spreads stops and reversals over the slow rows. So if `slowest` > 0
-    (rad/s), r2s compares the families without memory again, on windows of sliding faster than `slowest`
-    (modulating_functions.py), and returns the new errors. Families with memory would need other sliding windows.
+    r2s selects a family with more parameters only if it predicts clearly better. Rows of slow sliding would show
+    whether friction falls with velocity, but the low-pass spreads stops into these rows. If `slowest` > 0
+    (rad/s), r2s therefore compares the families without memory again, over windows in which joints are faster than
+    `slowest` (modulating_functions.py), and returns the new errors. Families with memory need different windows.
 
     Raises:
         UserError: the recording is too short to hold out motion.
@@ -41,9 +41,9 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
 def _compare(
     cv: CrossValidation, families: Sequence[Family], terms: Sequence[str], slowest: float = 0.0, close: float = 1.0
 ) -> tuple[np.ndarray, int] | None:
-    """Return the families' errors (F,) over the least error, and the index of the selected family; None without data.
+    """Return each family's error over the least error, (F,), and the selected index; None without held-out data.
 
-    Select the first family whose relative error is at most `close` or which is not clearly worse than the best.
+    The selected family is the first with a relative error up to `close` or not clearly above that of the best family.
     """
     spaces = [cv.space(terms, with_family(cv.nominal, f.name)) for f in families]
     scores: list[list[np.ndarray]] = [[] for _ in spaces]

@@ -1,7 +1,7 @@
 """Forward selection: add terms that clearly improve the prediction of held-out torque.
 
-Terms are correlated (an offset with cable drag, a mass with a center of mass). So a term that the arm lacks distorts
-the fitted values of other terms. Forward selection therefore adds a term only if it improves the prediction.
+Terms are correlated, such as offset with cable drag, or mass with center of mass. A superfluous term therefore
+distorts the fitted values of correlated terms, so forward selection adds only terms that improve the prediction.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from r2s.identification.terms import blocks_of, scaled_bounds
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
-BLOCKS = 4  # held-out blocks per fold; with several, held-out motion is as fast and as slow as fitted motion
+BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted motion have similar speeds
 CLEARLY = 2.0  # least mean improvement in standard errors, about 95 % confidence
 
 
 def select_terms(
     cv: CrossValidation, terms: Sequence[str], candidates: Sequence[str], slowest: float
 ) -> dict[str, list[bool]]:
-    """Return {"entered": [whether each of the `candidates` is added to a model with `terms`]}.
+    """Return {"entered": list of bool}: whether forward selection adds each of the `candidates` to `terms`.
 
-    Each round adds the best candidate, until none lowers the mean error over half-second blocks by more than CLEARLY
-    standard errors. Torque is linear in most parameters, so each fold is fitted once without candidates, and one
-    Gauss-Newton step from this fit evaluates a set of candidates.
+    Each round adds the best candidate, until no candidate lowers the mean error over half-second blocks by more than
+    CLEARLY standard errors. Because torque is linear in most parameters, each fold is fitted once without candidates;
+    one Gauss-Newton step from this fit then evaluates a set of candidates.
     """
     space, folds = cv.space(terms), []
     for k, fold in enumerate(cv.split(space, blocks=BLOCKS, slowest=slowest)):
@@ -36,7 +36,7 @@ def select_terms(
     alike = per_joint(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
 
     def score(chosen: Sequence[str]) -> np.ndarray:
-        """Return each block's squared error (blocks,) with the `chosen` candidates; all joints have equal weight."""
+        """Return the squared error (blocks,) of a model with the `chosen` candidates; joints have equal weight."""
         return np.concatenate([f.squares(chosen) for f in folds]) @ alike
 
     chosen: list[str] = []
@@ -53,7 +53,7 @@ def select_terms(
 
 
 class _LinearizedFold:
-    """A fold's fit and held-out errors, linearized in the parameters of the model and of all candidate terms."""
+    """Fitted and held-out errors of one fold, linearized in the parameters of the model and of all candidates."""
 
     def __init__(self, cv: CrossValidation, fold: Fold, candidates: Sequence[str]):
         fit, test = fold

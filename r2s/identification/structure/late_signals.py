@@ -1,10 +1,10 @@
 """Decide whether an identification corrects the lateness of link-side torque and of the logged dq.
 
-A log alone determines the lateness of dq relative to q (r2s/recordings/lateness.py); the lateness of torque needs a
+The log alone determines the lateness of dq relative to q (r2s/recordings/lateness.py); the lateness of torque needs a
 fit. If an arm filters torque and dq alike, both are equally late and need no correction, because inertial torque and
-friction then refer to the same time. A correction of dq alone would then do harm. On a physical Panda, dq is 5.3 ms
-late and torque about 2 ± 0.5 ms. A correction of only the Panda's dq raised the error on held-out motion of the
-training part, although the training residual did not reveal it.
+friction refer to the same time; a correction of only dq would increase the error. On a physical Panda, dq is 5.3 ms
+late and torque about 2 ± 0.5 ms. Correcting only the Panda's dq raised the error on held-out motion of the training
+part, but the training residual did not reveal this error.
 """
 
 from collections.abc import Sequence
@@ -21,15 +21,15 @@ from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
 SURE = 4.0  # standard deviations: 3, plus a third, as 95 % intervals covered only 85 % under model error
-BLOCKS = 4  # held-out blocks per fold; with several, held-out motion is as fast and as slow as fitted motion
+BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted motion have similar speeds
 
 
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether torque is clearly late, "alike": whether to treat torque and dq as equally late}.
 
-    1. Correct dq and fit the delay of torque. If this delay is clearly not 0, correct torque and dq.
-    2. Otherwise correct only dq, if this improves the prediction of held-out torque by more than a standard error.
-    3. Otherwise treat torque and dq as equally late: use both as logged.
+    If a fit with corrected dq finds a signal delay of torque that is clearly not 0, torque and dq are corrected.
+    Without a clear signal delay, only dq is corrected, if this lowers the error of held-out torque by more than one
+    standard error. In all other cases, r2s uses torque and dq as logged and treats torque and dq as equally late.
     """
     if DELAY in terms and torque_is_late(cv, terms):
         return {"delayed": True, "alike": False}

@@ -1,7 +1,7 @@
-"""Compare adapters by transfers of one policy, in a row per adapter and a column per condition of the arm.
+"""Compare adapters by transfers of one policy, in tables of a row per adapter and a column per arm condition.
 
-Means are over arms and episodes. The bootstrap is paired: it draws arms, and then episodes of each drawn arm, the
-same for all rows of a condition.
+Means are over arms and episodes. The bootstrap is paired: all rows of a condition share the drawn arms and the drawn
+episodes of each arm.
 """
 
 import os
@@ -24,17 +24,17 @@ COUNTS = ["stopped", "asked", "episodes", "arms"]
 
 @dataclass(frozen=True)
 class AdapterComparison:
-    """Scores of adapters; a row is an adapter, or an adapter with a policy (see `rows_of`).
+    """Scores of adapters, in rows: a row is one adapter, or one adapter with one policy (see `rows_of`).
 
     Attributes:
-        measures: {key: Measure}, the compared measures. headline: the measure that summarizes a row.
-        scores: a line per measure, condition and row. `mean` has the 95 % interval `low` to `high`. `difference` is
-            `mean` minus the `mean` of row `reference`. `worse_low` to `worse_high` is the 95 % interval of the row's
-            loss against `reference`. `asked` is the number of requested episodes, `episodes` of averaged ones.
-        losses: a line per condition and row. `value` is the mean of the headline measure; `nominal` is its mean over
-            the same arms and episodes in the nominal condition.
-        costs: a line per row; `us` is the computing time of the adapter per cycle, microseconds.
-        runs: {row: its transfers}. key: lines that explain policy names. left_out: lines about omitted episodes.
+        measures: {key: compared measure}. headline: the measure that summarizes a row.
+        scores: table with a line per measure, condition and row. `low` and `high` limit the 95 % interval of `mean`.
+            `difference` is `mean` minus the `mean` of the row `reference`. `worse_low` and `worse_high` limit the
+            95 % interval of the loss against `reference`. Of `asked` requested episodes, `episodes` were averaged.
+        losses: table with a line per condition and row. `value` is the mean of the headline measure in the condition;
+            `nominal` is its mean over the same arms and episodes in the nominal condition.
+        costs: table with a line per row. `us` is the adapter's computing time per cycle, microseconds.
+        runs: {row: transfers of the row}. key: lines that explain policy names. left_out: lines on omitted episodes.
     """
 
     measures: Mapping[str, Measure]
@@ -96,7 +96,7 @@ def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return the table `AdapterComparison.losses`; `shared` is the output of `in_common` for all conditions."""
+    """Return the table `AdapterComparison.losses`; `shared` joins the outputs of `in_common` for all conditions."""
     key = ["row", "arm", "goal"]
     values = shared.rename(columns={measure: "value"})
     nominal = values.loc[values["condition"] == NOMINAL, [*key, "value"]].rename(columns={"value": "nominal"})
@@ -107,11 +107,11 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
     """Return the part of the table `AdapterComparison.scores` for one measure and one condition.
 
-    If an episode has no value in one row, it is omitted in all rows: a stopped episode has no RMSE, no gap and an
-    infinite distance. A row without any value omits no episode. A mean over a single episode has no interval.
+    An episode without a value in one row is omitted in all rows: a stopped episode has no RMSE, no gap and infinite
+    distance. A row without any values causes no omissions. The mean of a single episode has no interval.
 
     Args:
-        shared: output of `in_common`. measure: the compared measure. reference: {row: its reference row or None}.
+        shared: output of `in_common`. measure: the compared measure. reference: {row: reference row or None}.
         seed: seed of the bootstrap.
     """
     wide = shared.pivot(index=["arm", "goal"], columns="row", values=measure.key)[list(shared["row"].unique())]
@@ -143,10 +143,10 @@ def _interval(draws: np.ndarray, count: int) -> tuple[float, float]:
 
 
 def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]], list[str]]:
-    """Return {row name: transfers}, with the shortest distinct names, and lines that explain names of policies.
+    """Return {row name: transfers} with the shortest distinct names, and lines that explain the names of policies.
 
-    A row is an adapter or, if an arm ran several policies, an adapter with a policy. If each arm ran only one policy,
-    a row contains all policies of its adapter.
+    If any arm ran several policies, a row is an adapter with one policy. If each arm ran only one policy, a row is an
+    adapter with all policies.
     """
     of_arm: dict[str, set[str]] = {}
     for r in found:
@@ -172,7 +172,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return {path: short path}; a short path has as many last parts of its path as distinguish all paths."""
+    """Return {path: short path}, where short paths are the last path components, as few as distinguish all paths."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -189,7 +189,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Return a line about a row: its headline measure in the worst condition, and where the reference is better."""
+    """Return a line about a row: its headline measure in its worst condition, and where `reference` is better."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:
@@ -211,7 +211,7 @@ def verdict(found: AdapterComparison, row: str) -> str:
 
 
 def _place(found: AdapterComparison, worse: pd.DataFrame) -> str:
-    """Return "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)" for the rows of one condition."""
+    """Describe a condition in which a row is worse: "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)"."""
     parts = []
     for r in worse.to_dict("records"):
         m = found.measures[r["measure"]]

@@ -38,7 +38,7 @@ def tables(found: AdapterComparison) -> dict[str, pd.DataFrame]:
 
 
 def _cells(scores: pd.DataFrame, m: Measure) -> pd.DataFrame:
-    """Return a table of one measure; each cell shows a mean and, in a second line, the 95 % interval."""
+    """Return the table of a measure; a cell shows the mean and, on a second line, the 95 % interval."""
 
     def cell(mean: float, low: float, high: float) -> str:
         return m.cell(mean) + (f"\n[{m.cell(low)}, {m.cell(high)}]" if np.isfinite(low) else "")
@@ -48,14 +48,14 @@ def _cells(scores: pd.DataFrame, m: Measure) -> pd.DataFrame:
 
 
 def _square(scores: pd.DataFrame) -> pd.DataFrame:
-    """Rearrange the column `cell` into a table of rows over conditions, both in order of occurrence."""
+    """Arrange the column `cell` as a table with a line per adapter and a column per condition."""
     wide = scores.pivot(index="row", columns="condition", values="cell").fillna("-")
     wide = wide.loc[list(scores["row"].unique()), list(scores["condition"].unique())]
     return wide.rename_axis("adapter").rename_axis(None, axis=1)
 
 
 def lines(found: AdapterComparison) -> list[str]:
-    """Return lines about the tables: a verdict per row, the names of policies, and the episodes not in the means."""
+    """Return lines about the tables: a verdict per row, names of policies, and episodes that the means omit."""
     s = found.scores
     out = [verdict(found, row) for row in found.runs]
     if len(s) and not s["stopped"].any():
@@ -76,8 +76,8 @@ def write(
     """Write adapter_comparison.csv, costs.csv, report.md, a figure and recording.rrd; return the tables of strings.
 
     Args:
-        run: run folder to write to. robot: the arm. found: the comparison. apart: {run: why it is not comparable}.
-        others: {folder: why it is no finished transfer}.
+        run: run folder to write to. robot: the arm. found: the comparison. apart: {incomparable run: reason}.
+        others: {folder without a finished transfer: reason}.
     """
     shown = tables(found)
     found.scores.to_csv(run.folder / "adapter_comparison.csv", index=False)
@@ -95,7 +95,7 @@ def write(
 
 
 def heading(found: AdapterComparison) -> str:
-    """Return "Adapter comparison: 12 transfers to 2 arms, 50 episodes each"."""
+    """Return a heading such as "Adapter comparison: 12 transfers to 2 arms, 50 episodes each"."""
     members = [r for runs in found.runs.values() for r in runs]
     arms = sorted({r.arm for r in members})
     named = arms[0] if len(arms) == 1 else f"{len(arms)} arms"
@@ -104,7 +104,7 @@ def heading(found: AdapterComparison) -> str:
 
 
 def comparison_figure(path: Path, found: AdapterComparison) -> Path:
-    """Draw mean and 95 % interval per row and condition, one panel per measure."""
+    """Draw the mean and 95 % interval of each row and condition, in one panel per measure."""
     names, conditions = list(found.runs), list(found.scores["condition"].unique())
     colour = colours(names)
     with panels(path, len(found.measures), len(found.measures), "adapters: mean and 95 % interval", 3.0) as axes:

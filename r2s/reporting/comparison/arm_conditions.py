@@ -18,7 +18,7 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     """Return the settings of conf/arm that differ from their nominal values, such as {"payload": 1.0}.
 
     Args:
-        arm: config of the arm. typed: overridden keys; those of the arm, such as "arm.live", are settings, too.
+        arm: config of the arm. typed: overridden config keys; overridden arm keys ("arm.live") are settings, too.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
@@ -31,19 +31,19 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
 
 
 def in_words(settings: Mapping[str, Any]) -> str:
-    """Return the words for a `condition`, such as "1.0 kg, 0.005 s later"; NOMINAL for an empty condition."""
+    """Describe a `condition` in words, such as "1.0 kg, 0.005 s later", or NOMINAL for an empty condition."""
     return ", ".join(_words(k, v) for k, v in settings.items()) or NOMINAL
 
 
 def order(settings: Mapping[str, Any]) -> tuple:
-    """Return the sort key of a `condition`: number of settings (nominal: 0), then name and size of each setting."""
+    """Return a sort key for a `condition`: the number of settings (nominal: 0), then each setting's name and size."""
     keys = list(SETTINGS)
     each = [(keys.index(k) if k in keys else len(keys), k, _size(v), str(v)) for k, v in settings.items()]
     return len(each), each
 
 
 def _plain(value: Any) -> Any:
-    """Return a setting in its simplest form: 1.0 for 1 and for {"mass": 1}, which mean the same payload."""
+    """Return a setting in its simplest form; for example, the payloads 1 and {"mass": 1} both become 1.0."""
     if isinstance(value, Mapping) and set(value) == {"mass"}:
         value = value["mass"]
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value

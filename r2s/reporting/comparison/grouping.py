@@ -1,4 +1,4 @@
-"""Group trainings: all seeds with the same settings form a group, which is named by its overrides."""
+"""Group trainings that differ only in their seeds, and name the groups by their overrides."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ LONGEST = 40  # largest number of letters in a label; longer labels would take s
 
 @dataclass(frozen=True)
 class Groups:
-    """Runs by their settings.
+    """Runs grouped by their settings.
 
     Attributes:
         members: {label: runs, one per seed}; a label such as "tqc, dr=paper" has at most `LONGEST` letters.
-        key: {"tqc #1": "tqc, calibration=..., dr=identified"}, full names of the numbered labels.
+        key: {numbered label: full name}, such as {"tqc #1": "tqc, calibration=..., dr=identified"}.
     """
 
     members: dict[str, list[Trained]]
@@ -24,10 +24,10 @@ class Groups:
 
 
 def group(runs: Sequence[Trained]) -> Groups:
-    """Return the runs grouped by settings: the runs of a group differ only in their seeds.
+    """Group the runs by their settings, so that the runs of a group differ only in their seeds.
 
-    A group's label is the algorithm and the overrides of the settings that differ among groups; all other settings
-    are default. A label longer than LONGEST is replaced by a numbered one, such as "tqc #1"; see `Groups.key`.
+    A group's label is the algorithm and the overrides of settings that differ among groups. A setting that the label
+    omits is default or equal in all groups. Labels longer than LONGEST are numbered, as in "tqc #1" (`Groups.key`).
     """
     sets: dict[str, list[Trained]] = {}
     for run in runs:
@@ -45,7 +45,7 @@ def group(runs: Sequence[Trained]) -> Groups:
 
 
 def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
-    """Return a name for each set of runs that differ only in their seeds; `group` describes these names."""
+    """Return a name, as described in `group`, for each set of runs that differ only in their seeds."""
     varied = _varied(sets)
     typed = [{k: v for run in seeds for k, v in run.typed.items()} for seeds in sets]
     parts = []
@@ -70,7 +70,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: settings that differ}: settings of algo= among its runs, all others among all runs."""
+    """Return {algorithm: differing settings}; algo settings are compared within an algorithm, others in all runs."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}

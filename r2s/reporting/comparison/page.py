@@ -42,11 +42,11 @@ def comparison_page(
     """Write tables (CSV), figures, report.md and recording.rrd of a comparison of trainings.
 
     Args:
-        run: run folder to write to. robot: the arm. grouped: the groups. apart: {run: why it is not comparable}.
-        others: {folder: why it is no finished training}.
+        run: run folder to write to. robot: the arm. grouped: the groups. apart: {incomparable run: reason}.
+        others: {folder without a finished training: reason}.
 
     Returns:
-        {name: table} with the names scores, improvement and sensitivity; scores.py describes the tables.
+        The tables {"scores", "improvement", "sensitivity": table}, which scores.py describes.
     """
     groups, measures = grouped.members, measures_in(grouped.members)
     tables = {"scores": summary_table(groups), "improvement": improvement_table(groups)}
@@ -103,8 +103,8 @@ def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]
 def bands_figure(path: Path, groups: Groups) -> Path:
     """Draw learning curves over env steps, updates and minutes: interquartile mean and range of the seeds.
 
-    Each measure has a row of panels. If there are more groups than colors, only the groups with the best last
-    evaluation are drawn. A dotted line stands for a model-based controller.
+    Each row of panels shows one measure. If there are more groups than colors, only the groups with the best last
+    evaluation are drawn. A dotted line shows a model-based controller.
     """
     grouped, table = groups.members, measures_in(groups.members)
     by = table[table.selection[-1]]

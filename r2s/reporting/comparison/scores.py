@@ -14,7 +14,7 @@ Grouped = Mapping[str, Sequence[Trained]]
 
 
 def measures_in(grouped: Grouped) -> MeasureTable:
-    """Return the measures of the runs' task."""
+    """Return the measures of the task that all runs share."""
     return next(iter(grouped.values()))[0].measures
 
 
@@ -50,12 +50,12 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
-    """Return, per algorithm with two or more settings, how much a measure depends on the choice of the setting.
+    """Return how much a measure depends on an algorithm's settings, for each algorithm with two settings or more.
 
-    `best`, `median` and `worst` are over the settings' interquartile means. `best` is optimistic, because the same
-    seeds select and score the setting. For `held_out`, each seed scores the setting that is best at the other seeds;
-    the scores are averaged. `spread` (with 95 % interval over seeds) is `held_out` minus the score of the median
-    setting; nan for fewer than two common seeds. An algorithm with a small `spread` needs little tuning.
+    `best`, `median` and `worst` summarize the interquartile means of the settings. `best` is optimistic, because the
+    same seeds select and score the setting. `held_out` is a mean over seeds, in which each seed scores the setting
+    that is best at all other seeds. `spread`, with 95 % interval over seeds, is `held_out` minus the median setting's
+    score, or nan for fewer than two common seeds. An algorithm with a small `spread` needs little tuning.
 
     Args:
         grouped: groups of trainings. measure: key of the measure; None: the last of `MeasureTable.selection`.
@@ -79,11 +79,11 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return per held-out seed (S,) the score of the setting that is best at the other seeds, and the median score.
+    """Return scores (S,) at S held-out seeds: of the setting that is best at all other seeds, and the median score.
 
     Args:
-        settings: {seed: score} of each setting; larger is better. Only seeds that all settings have in common are
-            used; the result is None if there are fewer than two.
+        settings: {seed: score} of each setting; a larger score is better. Only seeds common to all settings are used;
+            the result is None for fewer than two common seeds.
     """
     seeds = sorted(set.intersection(*(set(s) for s in settings)))
     if len(seeds) < 2:
@@ -94,7 +94,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line per setting of algo= or reward= whose best value is the smallest or largest of three or more."""
+    """Return a line for each algo or reward setting whose best value is the smallest or largest of at least three."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -128,9 +128,9 @@ def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid of x (points,), and y (3, points): interquartile mean, minimum and maximum over seeds.
+    """Return a grid of x (points,), and the interquartile mean, minimum and maximum of y over seeds (3, points).
 
-    The seeds' curves are interpolated over the range of x that all curves cover.
+    The curves of all seeds are interpolated over their common range of x.
     """
     curves = [r.curve for r in group]
     grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)

@@ -14,7 +14,7 @@ DRAWS = 2000  # number of draws of a bootstrap, as in Agarwal et al.
 def interquartile_mean(x: np.ndarray) -> np.ndarray:
     """Return the mean over the last axis of x (..., S) without the lowest and the highest quarter.
 
-    A quarter is S / 4 rounded down, as in rliable: of fewer than four values, none is left out.
+    A quarter has S / 4 values, rounded down as in rliable; for S < 4, all values are averaged.
     """
     return np.asarray(trim_mean(x, 0.25, axis=-1))
 
@@ -25,8 +25,8 @@ def interval(
     """Return the 95 % interval of a statistic by a stratified bootstrap; nan if a stratum has only one score.
 
     Args:
-        strata: one array (S,) per stratum, the scores of S seeds. seed: random seed of the bootstrap.
-        statistic: function that computes D values (D,) from D draws of each stratum, a list of arrays (D, S).
+        strata: scores of S seeds in each stratum, as one array (S,) per stratum. seed: random seed of the bootstrap.
+        statistic: function that maps D bootstrap draws, one array (D, S) per stratum, to D values (D,).
     """
     if min(map(len, strata)) < 2:
         return np.nan, np.nan
@@ -44,7 +44,7 @@ def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     """Return bootstrap means (DRAWS, A) of A rows; a draw resamples arms and their episodes, the same for all rows.
 
     Args:
-        each: one array (E, A) per arm, the values of E episodes in A rows of a comparison. rng: random generator.
+        each: values (E, A) of E episodes in A rows of a comparison, one array per arm. rng: random generator.
     """
     draws = []
     for _ in range(DRAWS):

@@ -21,7 +21,7 @@ READ = (
     *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
 )
 ALIKE = ("robot", "task")  # config groups with equal values in comparable runs
-# origin -> why runs of another origin are not comparable: code affects what is learned, the machine how fast
+# key of `origin` -> why runs that differ in the key are not comparable: code affects results, the machine speed
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
@@ -35,13 +35,13 @@ class Trained:
 
     Attributes:
         folder, seed, algo: run folder, random seed, name of the algorithm.
-        settings: config values that the run read: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
-        alike: config values that are equal in comparable runs: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
-        origin: commit, machine, threads and device, None where meta.json has none; for a controller only the commit.
+        settings: config values that the training used, such as {"algo.lr": 5e-4, "dr.phi_relative": 0.1}.
+        alike: config values that comparable runs share, such as {"task.ctrl_hz": 50, "evaluation.episodes": 200}.
+        origin: commit, machine, threads and device from meta.json, or None; of a controller, only the commit.
         typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
-        toy: whether the run used +experiment=toy, which is too short to learn.
+        toy: whether the run used +experiment=toy, a training too short for the policy to learn.
         minutes: budget of the run in minutes; None if the budget is in env_steps.
-        measures: measures of the task. curve: table evaluations.csv, on the goals that select the best policy.
+        measures: measures of the task. curve: evaluations.csv, measured on the goals that select the best policy.
         last: measures of the last policy, from summary.json, on goals that were not used for selection.
     """
 
@@ -78,7 +78,7 @@ def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[s
 
 
 def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
-    """Return the output of `read_trainings`, with an empty list instead of an error."""
+    """Read trainings like `read_trainings`, but return an empty list if there is no finished training."""
     trained, others = [], {}
     for folder in map(Path, folders):
         if why := why_not(folder, "train", FILES):
@@ -92,7 +92,7 @@ def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[
 
 
 def why_not(folder: Path, stage: str, files: Iterable[str]) -> str:
-    """Return the reason why a folder is not a finished run of `stage` with all `files`, or "" if it is."""
+    """Return the reason why a folder is not a finished run of `stage` with all `files`, or "" for such a run."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
         seen, status = meta.get("stage", "train"), meta["status"]
@@ -162,9 +162,9 @@ def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, 
 
 
 def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, dict[str, float]]:
-    """Return evaluations.csv and the last policy's measures; a missing value becomes infinite if lower is better.
+    """Return evaluations.csv and the last policy's measures; a missing value becomes inf if lower values are better.
 
-    If the arm was stopped in all episodes, a measure has no value: null in summary.json.
+    A measure has no value (null in summary.json) if the arm was stopped in all episodes.
 
     Raises:
         ValueError: there is no evaluation, or a measure for which higher is better has no value.
@@ -185,11 +185,11 @@ def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, di
 
 
 def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
-    """Return the largest set of comparable runs, and {run: reason} for the runs left out.
+    """Return the largest set of comparable runs, and {run: reason} for all other runs.
 
     Runs are comparable if robot, task, evaluation, commit and machine agree and budgets differ by at most the factor
-    `MOST_BUDGETS`. Among sets of equal size, one without +experiment=toy has priority, then one with more env steps.
-    Of two runs with equal settings and seed, only the first is used, because the second adds no evidence.
+    `MOST_BUDGETS`. Of sets of equal size, sets without +experiment=toy have priority, then sets with more env steps.
+    A run that repeats the settings and seed of an earlier run is left out, because it adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -208,7 +208,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why a run is not comparable with `first`, the run of the set with the smallest budget; "" if it is."""
+    """Return why a run is not comparable with `first`, the smallest-budget run of a set; "" if it is comparable."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]
@@ -230,7 +230,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """Group names by reason, ["a, b (failed)", "c (unfinished)"], up to `most` names each, cut to `width` letters."""
+    """List names by reason, ["a, b (failed)", "c (unfinished)"]: at most `most` names, cut to `width` letters."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

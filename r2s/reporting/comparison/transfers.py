@@ -30,10 +30,10 @@ class Transferred:
     Attributes:
         folder: run folder. start: start time, from meta.json. policy: absolute path of the policy's run folder.
         adapter: name in conf/adapt. settings: the adapter's settings, such as {"filter_s": 0.087}.
-        arm: name such as "twin, rigid, seed 0". condition: output of `condition`. robot: robot config in training.
-        measures: measures of the task. length: episode length, policy rate: "4 s at 100 Hz". goals: number of goals.
+        arm: name such as "twin, rigid, seed 0". condition: result of `condition`. robot: robot config in training.
+        measures: measures of the task. length: duration and policy rate, as "4 s at 100 Hz". goals: number of goals.
         us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
-        episodes: a row per episode, indexed by goal: measures `MeasureTable.transfer`, gap and arm_stopped (0 or 1).
+        episodes: a row per episode, indexed by goal, with measures (`MeasureTable.transfer`), gap and arm_stopped.
     """
 
     folder: Path
@@ -52,7 +52,7 @@ class Transferred:
 
 
 def read_transfers(folders: Sequence[str | Path]) -> tuple[list[Transferred], dict[str, str]]:
-    """Read the finished transfers to an arm in run folders; return them, and {folder: reason} for other folders."""
+    """Read the finished transfers to an arm; return the transfers, and {folder: reason} for all other folders."""
     found, others = [], {}
     for folder in map(Path, folders):
         why = why_not(folder, "transfer", FILES)
@@ -103,7 +103,7 @@ def _cost(path: Path) -> float:
 
 
 def _names(goals: np.ndarray) -> Iterator[str]:
-    """Yield a name for each goal, the same in all transfers; a number distinguishes goals at the same place.
+    """Yield names of goals that are the same in all transfers; numbers distinguish goals at the same position.
 
     Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometers.
     """
@@ -115,10 +115,10 @@ def _names(goals: np.ndarray) -> Iterator[str]:
 
 
 def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[str, str]]:
-    """Return the largest set of comparable transfers, and {run: reason} for the transfers left out.
+    """Return the largest set of comparable transfers, and {run: reason} for all other transfers.
 
-    Transfers are comparable if robot and task agree and they share goals. Of several runs with equal policy, adapter,
-    arm and condition, only the last is used.
+    Transfers are comparable if they agree in robot and task and share goals. Of several runs with the same policy,
+    adapter, arm and condition, only the latest run is used.
     """
     first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
     apart = {r.folder.name: why for r in found if (why := _difference(r, first))}

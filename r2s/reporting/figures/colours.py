@@ -1,4 +1,4 @@
-"""Assign each label a color, the same in figures and in the viewer."""
+"""Assign colors to labels, the same in figures and in the viewer."""
 
 from collections.abc import Iterable
 
@@ -13,8 +13,8 @@ OTHERS = (
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
-    The first label that contains the word "measured", "nominal" or "identified" has that word's color in KNOWN. The
-    other labels have the twelve colors of OTHERS in order, repeated after the twelfth.
+    The first label that contains the word "measured" has the color of this word in KNOWN; likewise for "nominal" and
+    "identified". All further labels cycle through the twelve colors in OTHERS.
     """
     found: dict[str, str] = {}
     others = 0

@@ -7,7 +7,7 @@ PAUSE = 0.1  # s, drawn length of a pause of any length
 
 
 def thin(count: int, most: int = MOST_POINTS) -> slice:
-    """Return a slice that selects at most `most` of `count` rows, evenly spaced."""
+    """Return a slice that selects evenly spaced rows, at most `most` out of `count` rows."""
     return slice(None, None, max(1, -(-count // most)))
 
 

@@ -23,9 +23,9 @@ TITLE, AGAIN = 0.9, 0.2  # inches added to the heights of the rows: once, and fo
 def panels(
     path: Path, count: int, columns: int, title: str, height: float = 2.3, key: str | None = None
 ) -> Iterator[list[Axes]]:
-    """Yield `count` axes in a grid, then save the figure to `path`, with one legend; `key` is its title.
+    """Yield `count` axes in a grid, then save the figure to `path` with one legend; `key` is the legend's title.
 
-    `height` is the height of a row of panels in inches.
+    Each row of panels is `height` inches high.
     """
     rows = -(-count // columns)
     figure = Figure(dpi=DPI)
@@ -55,12 +55,12 @@ def panels(
 
 
 def joint_panels(path: Path, n: int, title: str) -> AbstractContextManager[list[Axes]]:
-    """Return `panels` with one panel per joint."""
+    """Return the context manager `panels` for one panel per joint."""
     return panels(path, n, 2 if n > 3 else 1, title)
 
 
 def label_axis(axis: Axes, m: Measure) -> None:
-    """Set the title of a measure's panel; for a percentage, the y axis covers 0 to 100 %."""
+    """Set the title of a measure's panel, and the range 0 to 100 % of the y axis if the measure is a percentage."""
     axis.set_title(m.heading, loc="left")
     if m.unit == "%":
         axis.set_ylim(-3, 103)

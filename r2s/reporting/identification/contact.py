@@ -38,7 +38,7 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def press_table(found: ContactEstimate) -> pd.DataFrame:
-    """Return the RMS error of the modeled normal force, relative to joint torques, in fitted and held-out presses."""
+    """Tabulate the RMS error of the modeled normal force against joint torques, in fitted and held-out contact."""
     parts = {"fitted presses": found.training, "held-out press": found.validation}
     cells = {
         name: [f"{part.summary()['seconds']:.1f}", *(number(part.rmse(side), "{:.2f}") for side in (0.0, 1.0, -1.0))]
@@ -50,7 +50,7 @@ def press_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def contact_figure(path: Path, found: ContactEstimate) -> Path:
-    """Draw the normal force over penetration depth with its 95 % band, and over time for the held-out press."""
+    """Draw the normal force over penetration depth with a 95 % band, and over time in the held-out contact."""
     colour = colours(["measured", "identified"]) | {"measured": "#30363d"}
     validation = found.validation
     with panels(path, 1 + (validation is not None), 2, "normal force of the surface", height=3.6) as axes:
@@ -77,7 +77,7 @@ def contact_figure(path: Path, found: ContactEstimate) -> Path:
 
 
 def _curves(found: ContactEstimate, depth: np.ndarray) -> np.ndarray:
-    """Return the normal force (S, D) N of S posterior surfaces, at depths (D,) m below the estimated plane."""
+    """Return the normal force (S, D) N of S posterior draws, at depths (D,) m below the estimated plane."""
     draws = found.draws
     shift = (draws["point"] - found.surface.point) @ found.surface.normal
     inside = 1e3 * np.maximum(depth + shift[:, None], 0.0)  # mm, the unit of the stiffness

@@ -15,7 +15,7 @@ from r2s.reporting.figures.log_rows import thin, without_pauses
 from r2s.reporting.figures.panels import joint_panels, log_axis, panels
 
 LONGEST = 30.0  # s of torque in a figure; more would look like a solid band
-SCANS = {  # searches in the history without comparable costs -> title and colour of the shaded area
+SCANS = {  # searches in the history without comparable costs -> title and color of the shaded area
     "family": ("comparison of friction families", "#9aa0a6"),
     "terms": ("choice of terms", "#57ab5a"),
     "breakaway": ("search for breakaway", "#c9a227"),
@@ -29,7 +29,7 @@ def torque_figure(
 ) -> Path:
     """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s (figure 4 of the paper).
 
-    The figure shows the first `LONGEST` seconds, with shortened pauses. The RMSE in the titles is that of all rows.
+    The figure shows the first `LONGEST` seconds, with shortened pauses. The RMSE in the titles covers all rows.
     """
     colour, (clock, pauses) = colours(["measured", *predicted]), without_pauses(t)
     rows = np.flatnonzero(clock <= LONGEST)
@@ -90,7 +90,7 @@ def friction_figure(
     """Draw friction over speed up to dq_max (n,) rad/s, and breakaway torques as bars at zero speed.
 
     Args:
-        path: path of the PNG. dynamics: {label: model}. dq_max: range of the speed axis.
+        path: file of the figure (PNG). dynamics: {label: model}. dq_max: (n,) rad/s, largest speeds on the axes.
         data: speed (T, n) rad/s and friction torque (T, n) Nm of a recording.
         draws: (S, n, K) posterior draws of the friction parameters of the last model, for the 95 % band.
     """
@@ -136,9 +136,9 @@ def _band(
 
 
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw the cost of each search over seconds, relative to its start; steps without a cost are shaded.
+    """Draw the cost of each search over time, relative to the cost at the search's start; shade steps without cost.
 
-    Costs are comparable only within one search, because the next search weights the residuals anew.
+    Costs are comparable only within one search, because each search uses new weights of the residuals.
     """
     history = history.assign(seconds=_running(history["seconds"].to_numpy(float)))
     name = history["search"].astype(str)
@@ -171,6 +171,6 @@ def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
 
 
 def _running(seconds: np.ndarray) -> np.ndarray:
-    """Return seconds (K,) that always increase; the input restarts at zero where a run was resumed."""
+    """Convert `seconds` (K,), which restart at 0 when a run is resumed, to one increasing clock (K,) s."""
     steps = np.diff(seconds, prepend=0.0)
     return np.cumsum(np.where(steps < 0, seconds, steps))

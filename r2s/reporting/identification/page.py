@@ -1,6 +1,6 @@
 """Write the page of an identification: Tables I to IV of the paper for this arm, identifiability, and figures.
 
-"Old" is the nominal model, "new" the identified one. Intervals are 95 %, from the joint posterior.
+In tables, "old" is the nominal and "new" the identified model. Intervals contain 95 % of the posterior.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,12 +52,12 @@ FIGURE_WINDOW_S = 0.5  # s, shortest open-loop window in the position figure, un
 
 
 class Evidence(NamedTuple):
-    """Figures and tables of an identification's page, besides those of `IdentificationResult`.
+    """Content of an identification's page that `IdentificationResult` does not contain.
 
     Attributes:
-        pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, highest speeds of the validation motion.
-        whiteness: `whiteness_table` of the torque residual in the validation motion. base: output of `base_table`.
-        window_s: length of a replay, s. cutoff_hz: cutoff of the torque fit's low-pass.
+        pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, highest joint speeds in the validation motion.
+        whiteness: result of `whiteness_table` for the validation motion. base: result of `base_table`.
+        window_s: length of a replay, s. cutoff_hz: cutoff of the torque fit's low-pass, Hz.
     """
 
     pictures: Mapping[str, Path]
@@ -82,9 +82,9 @@ def identification_page(
     """Write the report (Markdown, HTML), figures, base_parameters.csv, torque.npz and recording.rrd.
 
     Args:
-        run: run of the identification. nominal: nominal model. found: result. validation: held-out motion.
-        summary: content of summary.json. window_s: replay length, s. cutoff_hz: cutoff of the torque fit's low-pass.
-        more: further sections {heading: items}, placed after the prediction errors.
+        run: run of the identification. nominal: nominal model. found: identified model. validation: held-out motion.
+        summary: content of summary.json. window_s: length of a replay, s. cutoff_hz: low-pass of the torque fit, Hz.
+        more: further sections of the page, {heading: items}, which follow the prediction errors.
     """
     robot, shown = found.space.robot, spread(validation, SCORED_S, SCORED_EACH_S)
     torque = TorqueResidual(found.space, shown, cutoff_hz=cutoff_hz)
@@ -179,7 +179,7 @@ def identification_sections(
 
 
 def _headlines(robot: Robot, found: IdentificationResult, validation: Recording, summary: Mapping) -> list[str]:
-    """Return the bullets at the top of the page."""
+    """Return the bullets at the top of the page: recording, friction family and errors on validation motion."""
     parts = [f"Recording {validation.name or 'without a name'}: {TORQUE[validation.torque]}"]
     for side in ("train", "validation"):
         if "seconds" in summary.get(side, {}):

@@ -27,7 +27,7 @@ BREAKAWAY = "Torque (command plus offset, Nm) at which a resting joint starts to
 
 
 def _listed(rows: Sequence[Value]) -> dict[str, list[str]]:
-    """Return a table's columns "old" (nominal), "new" (identified) and "95 % interval"."""
+    """Return the table columns "old" (nominal), "new" (identified) and "95 % interval" for the values `rows`."""
     return {
         "old": [number(v.old) for v in rows],
         "new": [number(v.old) if v.kept else v.found for v in rows],
@@ -36,7 +36,7 @@ def _listed(rows: Sequence[Value]) -> dict[str, list[str]]:
 
 
 def offset_table(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return Table I: torque offsets."""
+    """Return Table I of the paper for this arm: torque offsets."""
     if "offset" not in found.space.blocks:
         return ["Offsets were not identified; they keep their nominal values."]
     rows = values(found.space, found.found, "offset", found.unseen)
@@ -76,7 +76,7 @@ def breakaway_table(robot: Robot, nominal: Dynamics, found: IdentificationResult
 
 
 def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.ndarray], np.ndarray]) -> list[Item]:
-    """Return Table II for a presliding family: the largest torque at which its bristles hold a joint at rest."""
+    """Return Table II for a presliding friction family: the largest torque at which bristles hold a resting joint."""
     space = found.space
     low, high = np.quantile(held(space.dynamics(found.found.samples).phi), [0.025, 0.975], axis=0)
     old, new = held(space.dynamics(space.start).phi), held(found.dynamics.phi)
@@ -89,7 +89,7 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
 
 
 def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
-    """Return a table of base parameters: rows are links; the column states the combination's first parameter."""
+    """Return a table of base parameters: a row per link, and a column per first parameter of the combinations."""
     columns: dict[str, list[str]] = {}
     rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
     for first, row in zip(base["parameter"], rows.tolist(), strict=True):
@@ -103,7 +103,7 @@ def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
 
 
 def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return Table III: link tensors and, with the full parametrization, mass and center of mass."""
+    """Return Table III: inertia tensors of links; with the full parametrization, also masses and centers of mass."""
     space, d = found.space, found.dynamics
     full = bool(set(LINK) & set(space.blocks))
     if not full and "inertia_scale" not in space.blocks:
@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return the cell of `get` for each link; a value is identifiable if all its parameters in `blocks` are."""
+        """Return a cell per link for the value that `get` computes from the link's parameters in `blocks`."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]
@@ -149,7 +149,7 @@ def _centre(axis: int, d: Dynamics) -> np.ndarray:
 
 
 def _consistency(d: Dynamics) -> str:
-    """Return a sentence about physical consistency (Wensing, Kim and Slotine, RA-L 3(1), 2018)."""
+    """State whether all links are physically consistent (Wensing, Kim and Slotine, RA-L 3(1), 2018)."""
     second = 0.5 * np.trace(d.inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - d.inertia
     wrong = np.flatnonzero((np.linalg.eigvalsh(second).min(-1) < 0) | (d.mass <= 0)) + 1
     if not len(wrong):
@@ -181,7 +181,7 @@ def friction_table(robot: Robot, nominal: Dynamics, found: IdentificationResult,
 
 
 def other_terms(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return a table of the parameters of the whole arm, and one of armature, load, drag and gain per joint."""
+    """Return a table of whole-arm parameters, and a table of armature, load, drag and gain per joint."""
     space = found.space
     items: list[Item] = []
     if arm := of_whole_arm(space, found.found, found.unseen):

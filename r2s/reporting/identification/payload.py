@@ -28,7 +28,7 @@ def payload_table(found: PayloadEstimate) -> pd.DataFrame:
 
 
 def load_error_table(found: PayloadEstimate) -> pd.DataFrame:
-    """Return the torque RMSE per joint on the recording of the loaded arm, without and with the payload."""
+    """Return the loaded arm's torque RMSE per joint, of predictions without and with the identified payload."""
     rows = {"without": found.rmse(found.without), "with": found.rmse(found.predicted)}
     cells = {f"{name} payload": [number(x) for x in values] for name, values in rows.items()}
     joints = [f"joint {j + 1}" for j in range(found.measured.shape[1])]

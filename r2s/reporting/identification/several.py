@@ -17,7 +17,7 @@ NARROWER = 1.02  # a recording narrows an interval if the ratio of the widths wi
 
 
 def contribution_table(parts: Sequence[Contribution], names: Sequence[str]) -> pd.DataFrame:
-    """Return a row per recording: use, torque, seconds, RMSE, RMSE if left out, and how much it narrows intervals."""
+    """Return a row per recording: use, torque, seconds, RMSE, RMSE if left out of the fit, effect on intervals."""
     rows = {}
     for p in parts:
         cells = {"": p.use, "torque": p.torque, "s": number(p.seconds), "RMSE, Nm": number(np.nanmean(p.rmse))}
@@ -36,7 +36,7 @@ def _narrower(p: Contribution, names: Sequence[str]) -> str:
 
 
 def contribution_entry(parts: Sequence[Contribution], names: Sequence[str]) -> dict[str, Any]:
-    """Return the part of summary.json that describes what each recording contributes."""
+    """Return the part of summary.json that describes each recording's contribution to the fit."""
     out = {}
     for p in parts:
         own: dict[str, Any] = {
@@ -57,7 +57,7 @@ def _listed(x: np.ndarray) -> list[float | None]:
 
 
 def drift_items(table: pd.DataFrame, run: str) -> tuple[str, pd.DataFrame]:
-    """Return a sentence that explains a `drift_table`, and this table as strings."""
+    """Return sentences that explain a `drift_table`, and the table as strings."""
     changed = table[table["changed"]]
     words = (
         f"Values of {run}, values now, and their difference with its 95 % interval, which counts the errors of both "

@@ -43,7 +43,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
 def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
     """Return a parameter's row heading and a cell per joint: value, ± half the interval's width, and nominal value.
 
-    If all joints have the same nominal value, it is in the heading instead of the cells.
+    A nominal value that all joints share is in the heading instead of the cells.
     """
     unit = units()[block]
     if unit == "rad":
@@ -66,7 +66,7 @@ def _breakaway(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
 
 
 def _links(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
-    """Return a row per link: mass, shift of the center of mass, trace of the inertia relative to nominal."""
+    """Return a row per link: mass, shift of the center of mass, and inertia trace divided by its nominal value."""
     space = identified.space
     before, after, draws = (space.dynamics(x) for x in (space.start, identified.x, identified.found.samples))
 
@@ -109,13 +109,13 @@ def error_tables(robot: Robot, summary: Mapping) -> dict[str, pd.DataFrame]:
 
 
 def _pair(errors: Mapping, key: str) -> tuple[list[float], ...]:
-    """Return the errors of the nominal model and of the identified model; append the mean to each list."""
+    """Return two lists of errors with the mean appended: of the nominal model, and of the identified model."""
     before, after = errors.get(f"nominal_{key}", [np.nan] * len(errors[key])), errors[key]
     return [*before, float(np.mean(before))], [*after, float(np.mean(after))]
 
 
 def _before_after(columns: Mapping[str, Sequence[Sequence[float]]], index: pd.Index) -> pd.DataFrame:
-    """Return a table with the columns nominal, identified and ratio, for training and for validation motion."""
+    """Return a table with columns nominal, identified and ratio for training motion and for validation motion."""
     table = {}
     for side, (before, after) in columns.items():
         ratios = [a / b if b else np.nan for b, a in zip(before, after, strict=True)]

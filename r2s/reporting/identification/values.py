@@ -19,7 +19,7 @@ SHORT = f"±: half of the 95 % interval; {WIDE}; kept: nominal, as the data hard
 
 
 class Value(NamedTuple):
-    """Nominal and identified value of a parameter, its 95 % interval, and whether it is `kept` nominal or `fixed`."""
+    """Nominal and identified value of a parameter, 95 % interval, and flags: identifiable, kept nominal, fixed."""
 
     old: float
     new: float
@@ -30,7 +30,7 @@ class Value(NamedTuple):
     fixed: bool = False
 
     def times(self, factor: float) -> "Value":
-        """Return the value in another unit: all numbers are multiplied by `factor`."""
+        """Return the value in another unit, with all numbers multiplied by `factor`."""
         old, new, low, high = (factor * x for x in self[:4])
         return Value(old, new, low, high, self.identifiable, self.kept, self.fixed)
 
@@ -43,7 +43,7 @@ class Value(NamedTuple):
 
     @property
     def found(self) -> str:
-        """The identified value, followed by "?" if the parameter is not identifiable."""
+        """Text of the identified value, followed by "?" if the parameter is not identifiable."""
         return number(self.new) + ("" if self.identifiable or self.fixed else " ?")
 
     @property
@@ -57,12 +57,12 @@ class Value(NamedTuple):
 
     @property
     def interval(self) -> str:
-        """Cell "[low, high]"."""
+        """Table cell with the 95 % interval: "[low, high]"."""
         return KEPT if self.kept else FIXED if self.fixed else f"[{number(self.low)}, {number(self.high)}]"
 
 
 def values(space: ParameterSpace, found: ParameterEstimate, block: str, kept: Sequence[str] = ()) -> list[Value]:
-    """Return the values of a parameter `block`, one per joint, per link or per arm; `kept`: nominal parameters."""
+    """Return the values of a parameter `block`, one per joint, link or arm; `kept`: parameters kept nominal."""
     marks = (np.isin(space.names, list(names)) for names in (kept, space.fixed))
     parts = (space.start, found.x, found.low, found.high, found.identifiable, *marks)
     return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]
@@ -79,11 +79,11 @@ def of_whole_arm(space: ParameterSpace, found: ParameterEstimate, kept: Sequence
 
 
 def named(block: str) -> str:
-    """Return a block's column heading, with its unit."""
+    """Return the column heading of a parameter block, with the unit."""
     unit = units()[block]
     return block if unit == "1" else f"{block}\n{unit}"
 
 
 def per_joint(robot: Robot, columns: Mapping[str, Sequence[str]], index: str = "joint") -> pd.DataFrame:
-    """Return `columns` as a table with a row per joint or link, numbered from 1."""
+    """Return `columns` as a table whose rows are joints or links, numbered from 1."""
     return pd.DataFrame(dict(columns), index=pd.Index([str(j + 1) for j in range(robot.n)], name=index))

@@ -1,4 +1,4 @@
-"""Build tables of the verdict on a recording before the fit: checks, and expected widths of the intervals."""
+"""Build tables that judge a recording before the fit: checks, and expected widths of the parameters' intervals."""
 
 from typing import Protocol
 
@@ -17,7 +17,7 @@ LEGEND = f"?: wider than {2 / SHARPER:g} standard deviations of the prior; prior
 
 
 class Widths(Protocol):
-    """Interface for expected interval widths of P parameters; see `ExpectedWidths` and `PlannedWidths`."""
+    """Interface for expected interval widths of P parameters, as in `ExpectedWidths` and `PlannedWidths`."""
 
     @property
     def space(self) -> ParameterSpace: ...  # noqa: D102
@@ -30,7 +30,7 @@ class Widths(Protocol):
 
 
 def verdict_table(verdict: Verdict) -> pd.DataFrame:
-    """Return a row per check: verdict, finding, advice."""
+    """Return a table with a row per check, and the columns verdict, finding and advice."""
     rows = {x.check: {"": x.verdict, "found": x.found, "advice": x.advice} for x in verdict.lines}
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("check")
 

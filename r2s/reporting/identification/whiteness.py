@@ -24,7 +24,7 @@ def whiteness_figure(
     """Draw the autocorrelation of torque residuals {label: (T, n) Nm} over t (T,) s.
 
     Args:
-        path: path of the PNG. cutoff_hz: cutoff of the zero-phase low-pass. block_s: length of a bootstrap block, s.
+        path: figure file (PNG). cutoff_hz: cutoff of the zero-phase low-pass. block_s: length of bootstrap blocks, s.
     """
     colour = colours(error)
     lags, white, band = _filtered_white(t, cutoff_hz)
@@ -58,7 +58,7 @@ def whiteness_table(t: np.ndarray, error: np.ndarray, cutoff_hz: float) -> pd.Da
 
 
 def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
-    """Return the autocorrelation (count, n) of x (T, n) at lags of 0, 1, ... rows, without pairs across a pause."""
+    """Return the autocorrelation (count, n) of x (T, n) at lags of 0, 1, ... rows; no pair of rows spans a pause."""
     x = x - x.mean(0)
     edges = [0, *without_pauses(t)[1], len(t)]
     total, pairs = np.zeros((count, x.shape[1])), np.zeros(count)
@@ -72,9 +72,9 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lags (L,) s, the autocorrelation of filtered white noise (L,), and the half width of its 95 % band (L,).
+    """Return lags (L,) s, and the autocorrelation (L,) of filtered white noise with its 95 % band's half width (L,).
 
-    The filter is `Recording.smooth`. The band is Bartlett's for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
+    The filter is `Recording.smooth`. The band follows Bartlett (JRSS Supplement 8(1), 1946) for large lags.
     """
     step = float(np.median(np.diff(t)))
     edges = np.array([0, *without_pauses(t)[1], len(t)])

@@ -1,1 +1,1 @@
-"""Show a running stage in other tools: async_tracker.py calls one tracker per tool."""
+"""Show runs in experiment-tracking tools: async_tracker.py calls one tracker per tool."""

@@ -1,7 +1,7 @@
 """Implement tracker=mlflow: write to an SQLite store next to the run folders, or to a server.
 
-`mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows the store. This command needs the package mlflow; the
-extra r2s[trackers] installs only mlflow-skinny, which can write the store.
+The command `mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows the SQLite store. The command needs the
+package mlflow; r2s[trackers] installs only mlflow-skinny, which writes the store but cannot show it.
 """
 
 import logging
@@ -23,7 +23,7 @@ BATCH = 100  # parameters per call: MLflow's limit
 
 
 class Logger(MLFlowLogger):
-    """TorchRL's logger, changed to continue a run: it passes the arguments `start` to mlflow.start_run."""
+    """TorchRL's MLflow logger, which can continue a run because mlflow.start_run receives the arguments `start`."""
 
     def __init__(self, *args: Any, start: dict[str, Any], **kwargs: Any):
         self._start = start
@@ -38,7 +38,7 @@ class Logger(MLFlowLogger):
 
 
 class Mlflow(LoggerTracker):
-    """A run of an MLflow experiment.
+    """Tracker that logs a run of an MLflow experiment.
 
     Args:
         uri: address of the store, sqlite:///FILE or http://HOST:PORT. experiment: name of the experiment.

@@ -10,7 +10,7 @@ from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Tensorboard(LoggerTracker):
-    """A run in event files: scalars, settings, figures, and a list of other files, which event files cannot store."""
+    """Tracker that writes event files: scalars, settings, figures, and paths of files that they cannot contain."""
 
     def __init__(self) -> None:
         optional_import("tensorboard", "tracker=tensorboard", "trackers")
@@ -48,7 +48,7 @@ class Tensorboard(LoggerTracker):
         self._logger.shutdown()
 
     def _settings(self) -> None:
-        """Log the settings, and the measure that compares runs, without add_hparams, which would begin a new run."""
+        """Log the settings and the measure that compares runs, without add_hparams, because that begins a new run."""
         from torch.utils.tensorboard.summary import hparams
 
         metric = {f"summary/best/{self._run.measures.selection[0]}": 0}

@@ -1,4 +1,4 @@
-"""Define the tracker interface. To add a tracker, write a class with this interface and a file in conf/tracker."""
+"""Define the interface of trackers; a new tracker needs a class with this interface and a file in conf/tracker."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,7 @@ from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
 FILE = "trackers.json"  # file in the run folder with the trackers' run ids, which a resumed run continues
-WRITING = Lock()  # each tracker runs in its thread, and all of them write FILE
+WRITING = Lock()  # every tracker has its own thread, and all threads write FILE
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class Tracked:
     """Information about a run for its trackers.
 
     Attributes:
-        folder: runs/<stage>/<name>. stage: the run's stage. group: the run's sweep, or None.
-        config: composed config as dicts. meta: content of meta.json: git commit, versions, machine.
-        resumed: whether the run continues a stopped one.
+        folder: runs/<stage>/<name>. stage: the run's stage. group: the run's sweep; None: no sweep.
+        config: composed config as nested dicts. meta: content of meta.json (git commit, versions, machine).
+        resumed: whether the run continues a stopped run.
     """
 
     folder: Path
@@ -34,7 +34,7 @@ class Tracked:
 
     @property
     def name(self) -> str:
-        """<stage>/<name>, unique below the folder of all runs."""
+        """Name <stage>/<name> of the run, unique below the folder of all runs."""
         return f"{self.stage}/{self.folder.name}"
 
     @property
@@ -55,14 +55,14 @@ class Tracked:
         return json.loads(path.read_text()).get(key) if path.is_file() else None
 
     def keep(self, key: str, value: str | None) -> None:
-        """Store `value` for `key` in the run folder; a resumed run reads it with `kept`."""
+        """Store `value` for `key` in the run folder, where `kept` finds the value when the run is resumed."""
         path = self.folder / FILE
         with WRITING:
             write_json(path, (json.loads(path.read_text()) if path.is_file() else {}) | {key: value})
 
 
 class Tracker(Protocol):
-    """Interface to a tool that shows runs. Hydra creates a tracker before the run folder; one thread makes all calls.
+    """Interface to a tool that shows runs; a single thread calls a tracker, which is created before the run folder.
 
     After an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
     """
@@ -71,7 +71,7 @@ class Tracker(Protocol):
         """Begin to log the run, or continue to log a stopped run if `run.resumed`."""
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
-        """Log a row of <table>.csv; `step` is the row's env_steps, or else the row's number."""
+        """Log a row of <table>.csv; `step` is the row's env_steps, or the row number in tables without env_steps."""
 
     def summary(self, numbers: Mapping[str, float]) -> None:
         """Log the numbers in summary.json as {"best/success_1cm": 0.93, ...}."""
@@ -95,7 +95,7 @@ class LoggerTracker:
 
 
 def flat(node: Any, prefix: str = "", between: str = ".") -> Iterator[tuple[str, Any]]:
-    """Yield ("a.b", value) for each value in nested dicts, with `between` instead of the dot."""
+    """Yield ("a.b", value) for each value in nested dicts; `between` replaces the dot."""
     for key, value in node.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{key}{between}", between)

@@ -1,4 +1,4 @@
-"""Implement tracker=trackio, SQLite files by the run folders; `TRACKIO_DIR=runs/trackio trackio show` shows them."""
+"""Implement tracker=trackio: write SQLite files, which `TRACKIO_DIR=runs/trackio trackio show` displays."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -11,10 +11,10 @@ from r2s.reporting.trackers.tracker import Tracked
 
 
 class Trackio:
-    """A run in a Trackio project.
+    """Tracker that logs a run of a Trackio project.
 
     Args:
-        folder: folder of the databases, one per project; the environment variable TRACKIO_DIR overrides it.
+        folder: folder of the databases, one per project; the environment variable TRACKIO_DIR overrides `folder`.
         project: name of the project.
     """
 
@@ -29,7 +29,7 @@ class Trackio:
         import trackio
 
         for module in (trackio, trackio.run, trackio.utils):
-            vars(module)["print"] = lambda *args, **kwargs: None  # keep its messages out of the output
+            vars(module)["print"] = lambda *args, **kwargs: None  # keep trackio's messages out of the output
         resume = "must" if run.resumed and run.kept("trackio") else "never"
         config = run.settings | {"folder": str(run.folder.absolute())}
         quiet = {"auto_log_gpu": False, "auto_log_cpu": False}

@@ -12,7 +12,7 @@ from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Wandb(LoggerTracker):
-    """A run in a W&B project.
+    """Tracker that logs a run of a W&B project.
 
     Args:
         project, entity: names in W&B; entity None: your account. offline: store the run on this computer only.
@@ -60,4 +60,4 @@ class Wandb(LoggerTracker):
             run.save(str(path), base_path=str(self._folder), policy="now")
         run.summary["status"] = status
         run.finish(exit_code=0 if status == "done" else 1)
-        wandb.teardown()  # its service process would outlive the run
+        wandb.teardown()  # otherwise the service process of wandb would outlive the run

@@ -38,7 +38,7 @@ class _Arm(NamedTuple):
         return [start + e.t[f] - e.t[0] for start, e, f in parts]
 
     def send(self, name: str, style: rr.AsComponents, columns: Any, per_episode: bool) -> None:
-        """Log `columns`, which have a value per logged row or, if `per_episode`, a value per episode."""
+        """Log `columns` with one value per logged row or, if `per_episode`, one value per episode."""
         times = self.starts[: len(self.episodes)] if per_episode else np.concatenate(self.clocks())
         path = f"{self.base}/{name}"
         self.stream.log(path, style, static=True)
@@ -113,7 +113,7 @@ def _goals(arm: _Arm) -> None:
 
 
 def _boxes(arm: _Arm, up: np.ndarray) -> None:
-    """Log the box that the arm pushes on a level table; up: (3,), of any length."""
+    """Log the box that the arm pushes on a level table; `up` (3,) is the upward direction, of any length."""
     rows = np.concatenate([e.box[f] for e, f in zip(arm.episodes, arm.frames, strict=True) if e.box is not None])
     first, up = rows[:, 3:6], up / np.linalg.norm(up)
     axes = np.stack([first, np.cross(up, first), np.broadcast_to(up, first.shape)], axis=-1)
@@ -123,7 +123,7 @@ def _boxes(arm: _Arm, up: np.ndarray) -> None:
 
 
 def _paths(arm: _Arm) -> None:
-    """Log each episode's path, the current goal on the path, and the end effector's trail, colored by the error."""
+    """Log each episode's path, the current goal on the path, and the end effector's trail in the error's color."""
     pairs = list(zip(arm.episodes, arm.frames, strict=True))
     grey = rr.LineStrips3D.from_fields(colors=[150, 150, 150], radii=0.0015)
     arm.send("path", grey, rr.LineStrips3D.columns(strips=[e.goal for e in arm.episodes]), per_episode=True)
@@ -154,7 +154,7 @@ def _shades(error: np.ndarray) -> np.ndarray:
 
 
 def _shown_geoms(model: mujoco.MjModel) -> np.ndarray:
-    """Return the geoms that MuJoCo's viewer shows (groups 0-2), without planes; if there are none, all geoms."""
+    """Return the geoms in groups 0-2, which MuJoCo's viewer shows, except planes; if none exist, return all geoms."""
     shown = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
     return shown if len(shown) else np.arange(model.ngeom)
 
@@ -168,7 +168,7 @@ def _link(base: str, model: mujoco.MjModel, body: int) -> str:
 
 
 def _height(model: mujoco.MjModel) -> float:
-    """Return a height above the base, m, at which the label does not cover the arm."""
+    """Return a height, m, above the base at which an arm's label does not hide the arm."""
     return 0.85 * float(np.linalg.norm(model.body_pos[1:], axis=1).sum())
 
 

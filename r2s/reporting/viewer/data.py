@@ -22,8 +22,8 @@ class Episode:
     """One episode of one arm; positions are in the arm's base frame.
 
     Attributes:
-        t: (T,) s. q: (T, n) rad. ee: end effector (T, 3) m. goal: (3,) or path (T, 3), m. tau: (T, n) Nm, commanded.
-        box: (T, 11), the box that the arm pushes, see `Task.boxes`; None: no box.
+        t: (T,) s, time. q: (T, n) rad, joint angles. ee: (T, 3) m, end effector. tau: (T, n) Nm, commanded torque.
+        goal: (3,) m, or (T, 3) m on a path. box: (T, 11), the pushed box, see `Task.boxes`; None: no box.
     """
 
     t: np.ndarray
@@ -35,7 +35,7 @@ class Episode:
 
     @property
     def moves(self) -> bool:
-        """Whether the goal is a path."""
+        """Whether the goal moves along a path."""
         return self.goal.ndim == 2
 
     @property
@@ -45,7 +45,7 @@ class Episode:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first row to the last."""
+        """Time, s, from the first row to the last row of the episode."""
         return float(self.t[-1] - self.t[0])
 
 
@@ -69,11 +69,11 @@ class Content:
     """Content of a rerun recording; the viewer shows a tab only for content that is not empty.
 
     Attributes:
-        measures: the task's measures, needed for `episodes` and `curves`.
+        measures: the task's measures, required with `episodes` and `curves`.
         episodes: {label: episodes}, one arm per label; the k-th episodes of all arms start at the same time.
-        overlays: {label: Overlay}; each overlay has its own tab of torque plots.
+        overlays: {label: Overlay}; the viewer shows each overlay as a tab of torque plots.
         curves: {run: evaluations.csv}; all curves share one tab.
-        figures: {name: PNG}; each figure has its own tab, but the figure "learning" shares that of the curves.
+        figures: {name: PNG}; each figure has its own tab, except "learning", which is in the tab of the curves.
         torque: (n,) Nm, limits that the plots of commanded torque show.
     """
 
@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """The task's measures for learning curves and comparisons, as far as `curves` contain them."""
+        """The task's measures for learning curves and comparisons that occur in `curves`."""
         table = self.measures
         if table is None:
             return []
@@ -95,7 +95,7 @@ class Content:
 
 
 def external_overlay(r: Recording) -> dict[str, Overlay]:
-    """Return an overlay of external torque and reported contact (0 or 1), or {} without external torque."""
+    """Return {label: overlay of external torque and reported contact (0 or 1)}; {} without external torque."""
     torque = r.signals.get("tau_ext_hat_filtered")
     if torque is None or not torque.any():
         return {}
@@ -110,7 +110,7 @@ def first(e: "Episodes") -> list[Episode]:
 
 
 def saved_episodes(run: Path) -> dict[str, list[Episode]]:
-    """Return {simulator or arm: its first episodes} from a run of stage=transfer; {} for other runs."""
+    """Return {simulator or arm: first episodes} from a run of stage=transfer; {} for a run of any other stage."""
     from r2s.tasks.rollout import Episodes
 
     out = {}

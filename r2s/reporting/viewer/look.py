@@ -1,4 +1,4 @@
-"""Show runs in the rerun viewer for `r2s look`: recording.rrd of a run, or several runs in one rerun recording."""
+"""Show one run, or several runs in one rerun recording, in the rerun viewer: the command `r2s look`."""
 
 import os
 import re
@@ -28,13 +28,13 @@ LOOPBACK = "127.0.0.1"
 def side_by_side(folder: Path, robot: Robot, runs: Mapping[str, Path]) -> list[Path]:
     """Write the episodes, torques and learning curves of {label: run folder} into one recording.rrd in `folder`.
 
-    All runs are shown with the measures of the first run that has learning curves or episodes.
+    For all runs, the figures show the measures of the first run that has learning curves or episodes.
 
     Returns:
         Paths of figures (PNG) of the same episodes, torques and learning curves.
 
     Raises:
-        UserError: no run has anything to show.
+        UserError: no run has episodes, torques or evaluations.
     """
     episodes = {f"{k}, {where}": e for k, run in runs.items() for where, e in saved_episodes(run).items()}
     overlays = {k: Overlay.load(run) for k, run in runs.items() if (run / "torque.npz").is_file()}
@@ -64,7 +64,7 @@ def has_screen() -> bool:
 
 
 def open_native(recordings: Sequence[Path]) -> None:
-    """Open the viewer on recordings and wait until it is closed."""
+    """Open rerun recordings in the viewer, and wait until the viewer is closed."""
     with _viewer(map(str, recordings)):
         pass
 
@@ -97,13 +97,13 @@ def _is_open(port: int) -> bool:
 
 @contextmanager
 def _viewer(words: Iterable[str]) -> Iterator[subprocess.Popen]:
-    """Start the viewer and wait until it ends; an interrupt or SIGTERM of this process also ends the viewer.
+    """Start the viewer and wait until the viewer ends; SIGINT or SIGTERM to this process also ends the viewer.
 
     Raises:
         UserError: the viewer failed.
     """
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    # in a new session: a signal to `python -m rerun` alone would not reach the child process that it starts
+    # new process group: a signal to `python -m rerun` alone would not reach the child process of rerun
     process = subprocess.Popen([sys.executable, "-m", "rerun", *words], start_new_session=True)
     try:
         yield process

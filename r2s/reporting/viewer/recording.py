@@ -1,7 +1,7 @@
 """Write the rerun recording (.rrd): arms side by side, torques, learning curves and figures.
 
-All content is in one file, because two rerun recordings have no common timeline. Episodes and torque overlays use the
-timeline `time`, learning curves `env_steps` and `wall_clock`. `rerun FILE` opens the file and plays the episodes.
+One file contains everything, because two rerun recordings cannot share a timeline. Episodes and torque overlays use
+the timeline `time`, learning curves `env_steps` and `wall_clock`. The command `rerun FILE` plays the episodes.
 """
 
 import os
@@ -22,7 +22,7 @@ from r2s.reporting.viewer.data import Content, Overlay
 from r2s.reporting.viewer.layout import LEARNING, blueprint, entity, log_series, starts_of
 from r2s.tasks.measures import Measure
 
-OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times the low-pass of the torque
+OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times the cut-off of the torque's low-pass
 
 
 def write_recording(path: str | os.PathLike, robot: Robot, content: Content) -> Path:
@@ -57,7 +57,7 @@ def _limits(stream: rr.RecordingStream, torque: np.ndarray, seconds: float) -> N
 
 
 def _overlay(stream: rr.RecordingStream, label: str, overlay: Overlay) -> None:
-    """Log one plot per joint. The broad measured line has the first path, because lines are drawn in path order."""
+    """Log one torque plot per joint; the entity paths put the broad measured line below the predicted lines."""
     clock, _ = without_pauses(overlay.t)
     rows = at_rate(clock, OVERLAY_HZ)
     index = [rr.TimeColumn("time", duration=clock[rows])]
