@@ -30,7 +30,6 @@ REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"
 TOGETHER = {
     "runs": ("trained", "identified", "stopped"),
     "identified": ("found", "directly", "linked"),
-    "own_law": ("own_law",),
     "own_family": ("own_family",),
     **{name: (name,) for name in ("sides", "servers", "hard", "installed", "results")},
 }

@@ -39,13 +39,11 @@ def joint_spring(stiffness=60.0, damping=6.0):
     return Controller("spring", spring, np.full(N, 0.3), PANDA.q_home, "joint angle", "rad", gains, memory_size=1)
 
 
-@pytest.fixture(scope="module")
-def own_law():
-    """Return `joint_spring`; tests that ask for it share a worker, because a law is compiled once in each process."""
-    return joint_spring
-
-
-BUILT_IN = {"torque": lambda: torque(PANDA, TRACK), "computed_torque": lambda: TRACK.control(PANDA)}
+MAKES = {
+    "torque": lambda: torque(PANDA, TRACK),
+    "computed_torque": lambda: TRACK.control(PANDA),
+    "a user's law": joint_spring,
+}
 
 
 def motion(task, arms, controller, plans, steps=20):
@@ -64,14 +62,14 @@ def plans():
     return TRACK.goals(PANDA, np.random.default_rng(0), 1)
 
 
-@pytest.mark.parametrize("name", [*BUILT_IN, "own_law"])
-def test_the_physics_step_and_the_driver_run_the_same_law(name, plans, request):
+@pytest.mark.parametrize("make", MAKES.values(), ids=MAKES)
+def test_the_physics_step_and_the_driver_run_the_same_law(make, plans):
     """One arm in MuJoCo's callback, and the same arm behind the driver: the same motion.
 
     The two solve the safety filter with inertias that agree to round-off (1e-12 of 0.1 kg m^2); in 0.2 s errors grow
     by less than 1e4.
     """
-    controller = request.getfixturevalue(name)() if name == "own_law" else BUILT_IN[name]()
+    controller = make()
     task = TRACK.controlled_by(controller)
     quiet = SimulatedArm(PANDA, NEW, position_noise=0.0, velocity_noise=0.0)
     inside = motion(task, VectorArms(PANDA, task, NEW, 1, 1), controller, plans)
@@ -115,9 +113,9 @@ def test_feedback_runs_at_its_own_rate(plans):
         assert np.array_equal(out[0], out[1]) == same
 
 
-def test_a_law_that_is_not_finite_stops_the_arm(own_law):
+def test_a_law_that_is_not_finite_stops_the_arm():
     """The driver brings the arm to rest and says so, as it does for a silent policy."""
-    controller = own_law(stiffness=np.nan)
+    controller = joint_spring(stiffness=np.nan)
     driver = Driver(PANDA, REACH.torque_limit(PANDA), NEW.level, control=controller)
     state = ArmState(0.0, PANDA.q_home, np.zeros(N), np.zeros(N), np.zeros(N))
     for _ in range(3):
@@ -127,9 +125,9 @@ def test_a_law_that_is_not_finite_stops_the_arm(own_law):
     np.testing.assert_array_equal(sent, 0.0)
 
 
-def test_no_law_runs_before_the_first_command(own_law):
+def test_no_law_runs_before_the_first_command():
     """A command of zeros would be a joint angle of zero: without a command there is no torque."""
-    driver = Driver(PANDA, REACH.torque_limit(PANDA), NEW.level, control=own_law())
+    driver = Driver(PANDA, REACH.torque_limit(PANDA), NEW.level, control=joint_spring())
     state = ArmState(0.0, PANDA.q_home, np.zeros(N), np.zeros(N), np.zeros(N))
     assert not driver(state, None).any()
     assert driver(state, PANDA.q_home + 0.2).any()

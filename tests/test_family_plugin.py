@@ -83,7 +83,7 @@ PHI = np.array([[1.6, 0.08], [0.7, 0.03]])  # Nm, rad/s
 
 @pytest.fixture(scope="module")
 def own_family(tmp_path_factory):
-    """The dotted path of a family in a file; its tests share a worker, because each process compiles the law."""
+    """The dotted path of a family in a file; its tests share a worker, because they share an identification."""
     folder = tmp_path_factory.mktemp("mine")
     (folder / "my_friction.py").write_text(MINE)
     sys.path.insert(0, str(folder))
