@@ -539,7 +539,7 @@ def test_the_committed_settings_are_the_constructors(kind):
     """conf/algo/<name>.yaml and its base hold every setting of the class, and no other than those of the loop."""
     settings = conf(f"algo/{kind.__name__.lower()}")
     assert settings.pop("name") == kind.__name__.lower()
-    settings.pop("n_envs"), settings.pop("demonstrations")
+    settings.pop("n_envs"), settings.pop("demonstrations"), settings.pop("residual_l2")
     loop = {f.name for f in fields(Loop)}
     own = {k: v for k, v in settings.items() if k not in loop}
     positional = {"self", "scale", "action_scale", "critics"}

@@ -8,14 +8,17 @@ import torch
 from conftest import conf
 from test_checkpoint import make_algo, make_env
 from test_cli import r2s, succeed
+from test_faults import composed
 from test_press import PANDA, TRUE
 from test_push import make_task as pushing
 
 from r2s.learning.demonstrations import make_demonstrator
-from r2s.learning.model_based import Oracle
+from r2s.learning.model_based import Oracle, hybrid_force
 from r2s.learning.train import Loop, Training
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
+from r2s.stages.build import make_dynamics
+from r2s.stages.train import make_parts
 from r2s.tasks.track import TrackTask
 
 LEARNING_STARTS = 400  # env steps; of 4 arms, 2 s each
@@ -73,6 +76,19 @@ def test_which_tasks_demonstrate(panda, dynamics):
     assert make_demonstrator(PANDA, pushing(), TRUE) is not None
     track = TrackTask(**values("task/track")).with_model(panda, dynamics)
     assert make_demonstrator(panda, track, dynamics) is None
+
+
+@pytest.mark.parametrize("name", ["ddpg", "sac", "td3", "tqc"])
+def test_a_policy_of_a_surface_task_begins_as_the_hybrid_controller(name):
+    """Its untrained actions are zero, so an evaluation equals that of `algo=hybrid_force`."""
+    cfg = composed("task=press", f"algo={name}", "task.episode_s=4.5", "threads=1", "evaluation.episodes=2")
+    parts = make_parts(cfg)
+    assert parts.demonstrator.at_zero
+    assert parts.algo.action_l2 == cfg.algo.residual_l2
+    reference = hybrid_force(parts.robot, parts.task, make_dynamics(cfg, parts.robot))
+    mine, its = (parts.evaluate(policy) for policy in (parts.algo.policy, reference))
+    np.testing.assert_array_equal(mine.force, its.force)
+    assert make_parts(composed("task=press", f"algo={name}", "algo.demonstrations=0")).demonstrator is None
 
 
 def test_demonstrations_that_fill_the_budget_are_one_line(tmp_path):

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from r2s.learning.model_based import Oracle
+from r2s.learning.model_based import Oracle, ZeroAction, hybrid_force
 from r2s.learning.pusher import Pusher
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -24,12 +24,16 @@ KEPT = 0.9  # correlation of the noise between steps; white noise hardly moves a
 class Demonstrator:
     """A model-based controller plus noise with a standard deviation from 0 (first arm) to NOISE (last arm).
 
+    Attributes:
+        at_zero: whether the controller's actions are zero, so that a policy can start as the controller.
+
     Args:
         reference: the controller, with the interface of `r2s.learning.networks.Policy`.
     """
 
-    def __init__(self, reference: Oracle | Pusher):
+    def __init__(self, reference: Oracle | Pusher | ZeroAction):
         self._reference, self._noise = reference, torch.zeros(())
+        self.at_zero = isinstance(reference, ZeroAction)
 
     def action(self, observation: Tensor) -> Tensor:
         """Return actions (B, a) in [-1, 1] for observations (B, d) in SI units."""
@@ -39,7 +43,7 @@ class Demonstrator:
 
 
 def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstrator | None:
-    """Return the demonstrator for the task; None if neither the reaching nor the pushing baseline supports it.
+    """Return the demonstrator for the task; None if no baseline of reaching, pushing or hybrid control supports it.
 
     Args:
         robot, task: the arm and its task. dynamics: model of one arm, the center of the training's randomization.
@@ -49,4 +53,6 @@ def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstra
         return Demonstrator(Oracle(robot, task, dynamics))
     if isinstance(task, PushTask) and control.name == "cartesian_impedance" and control.action_dim == 3:
         return Demonstrator(Pusher(robot, task, dynamics))
+    if control.name == "hybrid" and hasattr(task, "contact"):
+        return Demonstrator(hybrid_force(robot, task, dynamics))
     return None

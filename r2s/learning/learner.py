@@ -77,6 +77,13 @@ class Learner(nn.Module, ABC):
         # One optimizer suffices: Adam skips parameters without a gradient, such as the actor's in a delayed update.
         self.optimizer = torch.optim.Adam([*self.actor.parameters(), *self.critics.parameters()], lr=lr, fused=True)
 
+    def begin_at_zero(self) -> None:
+        """Set the actor's last layer so that the policy returns zero actions (residual RL, Johannink et al. 2019)."""
+        actions = len(self.action_scale)
+        with torch.no_grad():
+            for parameter in self.actor.body[-1].parameters():
+                parameter[:actions] = 0.0
+
     @abstractmethod
     def explore(self, observation: Tensor) -> Tensor:
         """Return exploratory actions (B, a) in [-1, 1] for observations (B, d) in SI units."""

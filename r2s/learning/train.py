@@ -197,6 +197,8 @@ class Training:
         self._env, self._algo, self._evaluate, self._loop = env, algo, evaluate, loop
         self._demonstrator = demonstrator
         self.env_steps, self.updates, self.next_eval = 0, 0, loop.eval_env_steps
+        if demonstrator and demonstrator.at_zero:
+            self.next_eval = 0  # the first policy, nearly the demonstrator, takes part in the selection
         self.factor = env.reward.factor
         self.evaluation: dict[str, Any] = {}
         self._terms: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics

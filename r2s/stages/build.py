@@ -284,7 +284,7 @@ def training_keys():
     """Return the keys of conf/algo that trainings use, and that controllers without training ignore."""
     from r2s.learning.train import Loop
 
-    return ("n_envs", "demonstrations", "hidden", *(f.name for f in fields(Loop)))
+    return ("n_envs", "demonstrations", "residual_l2", "hidden", *(f.name for f in fields(Loop)))
 
 
 def make_controller(cfg, robot, task, dynamics):

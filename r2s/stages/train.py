@@ -87,7 +87,7 @@ def make_parts(cfg):
     episodes, learns = cfg.evaluation.episodes, is_learner(cfg)
     check_number("evaluation.episodes", episodes, "[1, inf)", whole=True)
     if learns:
-        n_envs, demonstrations, loop, settings = split_algo(cfg)
+        n_envs, demonstrations, residual_l2, loop, settings = split_algo(cfg)
         budget = called(Budget, "budget", plain(cfg.budget))
     robot, model = make_robot(cfg), with_own_calibration(cfg)
     center = make_dynamics(model, robot)
@@ -102,10 +102,13 @@ def make_parts(cfg):
     env = TaskEnv(robot, task, draw, n_envs, nthread=stepping, seed=cfg.seed, stagger=True, reward=reward)
     evaluate = make_evaluation(robot, task, draw, episodes=episodes, nthread=cfg.threads, seed=SELECTION)
     action_scale = torch.from_numpy(task.control(robot).action_scale)
-    algo = called(target(cfg.algo, "algo"), "algo", settings, normalization(robot, task), action_scale)
     demonstrator = make_demonstrator(robot, task, center) if demonstrations else None
-    if demonstrator:
-        loop = replace(loop, learning_starts=demonstrations)
+    loop = replace(loop, learning_starts=demonstrations) if demonstrator else loop
+    residual = demonstrator is not None and demonstrator.at_zero
+    settings |= {"action_l2": residual_l2} if residual and residual_l2 is not None else {}
+    algo = called(target(cfg.algo, "algo"), "algo", settings, normalization(robot, task), action_scale)
+    if residual:
+        algo.begin_at_zero()
     check_length(budget, loop, n_envs, "demonstrations" if demonstrator else "learning_starts")
     return Parts(robot, task, draw, episodes, algo.to(device(cfg)), env, evaluate, loop, budget, demonstrator)
 
@@ -207,10 +210,13 @@ def split_algo(cfg):
     check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
     demonstrations = settings.pop("demonstrations", 0)
     check_number("algo.demonstrations", demonstrations, "[0, inf)", whole=True)
+    residual_l2 = settings.pop("residual_l2", None)  # configs of earlier r2s have none
+    if residual_l2 is not None:
+        check_number("algo.residual_l2", residual_l2, "[0, inf)")
     loop = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
     loop |= {"eval_env_steps": cfg.evaluation.env_steps, "compile": cfg.compile, "matmul": cfg.matmul}
     loop |= {"concurrent": all_threads(cfg) > 1}
-    return n_envs, demonstrations, Loop(**loop), settings
+    return n_envs, demonstrations, residual_l2, Loop(**loop), settings
 
 
 def with_own_calibration(cfg):

@@ -6,6 +6,7 @@ observation nor controller uses the true force.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -25,7 +26,9 @@ from r2s.tasks.tip_task import TipTask
 
 POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8, 9  # columns of a goal
 LAG_M = 0.01  # m, lag of the tip behind its target, from damping at approach_speed and a friction error of 2 N
-RESIDUAL_M = 5e-3  # m, shift of the default controller's target by an action of 1: 5 N on the Panda
+# Force that an action of 1 adds under the default controller, divided by the largest force. On the model of elastic
+# twin 0, policies with half the force wipe as well, and policies with a quarter more than twice the force wipe worse
+RESIDUAL = 0.1
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
 # 1/rad, see `cartesian_impedance`; low, because a null-space torque reaches the tip if joints stick. On models of
 # twins 0 and 1 the reference's force errors are similar from 0.02 to 0.05, and up to twice as large at 0.2
@@ -115,9 +118,9 @@ class SurfaceTask(TipTask):
         """
         Tip(robot)
         task = replace(self, model=InverseDynamics(robot, dynamics), speed_noise=self.noise_for(dynamics))
-        settings: dict[str, Any] = {"torque_fraction": self.torque_fraction, "displacement": RESIDUAL_M}
-        settings |= {"null_stiffness": NULL_STIFFNESS} | self.own_settings
-        own = cartesian_impedance(robot, task, dynamics, hybrid=True, **settings)
+        settings: dict[str, Any] = {"torque_fraction": self.torque_fraction, "null_stiffness": NULL_STIFFNESS}
+        make = partial(cartesian_impedance, robot, task, dynamics, hybrid=True, **settings | self.own_settings)
+        own = make(displacement=RESIDUAL * self.force[1] / make().parameters[K_DEFAULT])
         task._check_force(own)
         return replace(task, own=own, parameters=own.parameters)
 
