@@ -44,6 +44,7 @@ REASONS = {
     "r2s.physics.dynamics.nominal_dynamics": YAML,
     "r2s.physics.robot.load_robot": YAML,
     "r2s.recordings.readers.read": "its arguments are the keys of conf/data/recording.yaml; files need few of them",
+    "r2s.physics.user_laws.control_address.function": "a C function has pointers and sizes for the arrays of a law",
     "r2s.arm.driver.DriverBatch.__init__": "settings of a driver that callers combine freely, all but three named",
 }
 

@@ -1,1 +1,1 @@
-"""Estimate payload, friction, offsets and external wrench while an arm works, and correct its torque."""
+"""Estimate payload, friction, offsets and external wrench while an arm works, and correct the arm's torque."""

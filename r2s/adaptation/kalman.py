@@ -93,7 +93,7 @@ def update(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def predict(filter, noise, residual):
-    """Predict the state's mean and covariance, and its response to payload jumps (`signature`), over one span."""
+    """Predict, over one span, the state's mean, covariance and response to payload jumps (`signature`)."""
     P, counts, n, moving = filter.P, filter.counts, len(residual.y), False
     for j in range(n):
         moving |= residual.sliding[j] > 0.0

@@ -1,6 +1,6 @@
 """Correct the identified model by a fit to recordings without a payload.
 
-An identification omits model terms that hardly improve its fit. A payload estimate needs these terms, because a
+An identification omits model terms that hardly improve the fit. A payload estimate needs these terms, because a
 torque error of 0.1 Nm at a lever arm of 0.5 m looks like a mass of 20 g. The correction therefore fits all terms of a
 joint (`TERMS`), mass and first moments of every link, and the compliance of every gear. Each parameter has a prior
 with mean zero and a typical standard deviation, so the fit is a ridge regression (Bishop 2006, 3.3). The fit uses

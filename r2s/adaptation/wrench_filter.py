@@ -5,10 +5,10 @@ for each of n joints, the error b of the friction f = f_model + b, Nm; and the g
 every cycle measures (momentum.py). Momentum obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
 and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 
-The uncertainty of a joint's friction depends on whether the joint slides (wrench_friction.py).
-- A sliding joint provides a precise measurement of the wrench, because its friction error b is small and has a short
+The uncertainty of a joint's friction depends on whether the joint moves (wrench_friction.py).
+- A joint in motion measures the wrench precisely, because the joint's friction error b is small and has a short
   correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain.
-- A resting joint only bounds the wrench. The friction of this joint balances all other torques, and may be any torque
+- A joint at rest only bounds the wrench. The friction of this joint balances all other torques, and may be any torque
   between the negative and the positive breakaway torque (edges). The variance of this friction is at most that of a
   uniform distribution between the edges.
 The filter assumes that the wrench changes as the tip moves, as in a stiff environment. If all joints rest, only a
@@ -134,7 +134,7 @@ def _predict(noise, state):
     decay = np.exp(-SIM_DT / tuning.FRICTION_NOISE_S)
     for j in range(n):
         m = w + n + j
-        if joints[REST, j] == 1.0:  # sliding joints determine a resting joint's momentum
+        if joints[REST, j] == 1.0:  # joints in motion determine the momentum of a joint at rest
             x[m] = state.terms.p[j]
             P[m] = 0.0
             P[:, m] = 0.0
@@ -198,7 +198,7 @@ def _wrench_variance(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _measure(state):
-    """Correct the state by the measured momenta of sliding joints, one after the other."""
+    """Correct the state by the measured momenta of the joints in motion, one after the other."""
     n, N = state.joints.shape[1], len(state.x)
     square, count = 0.0, 0
     gain = np.zeros(N)
@@ -220,7 +220,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Limit the friction of resting joints to the breakaway torques (edges), and its variance to `_hidden`."""
+    """Limit the friction of joints at rest to the breakaway torques (edges), and its variance to `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)

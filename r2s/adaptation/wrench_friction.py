@@ -1,7 +1,7 @@
 """Friction in the wrench filter: determine which joints rest, and the direction (side) of sliding; compiled.
 
-The friction of a resting joint balances all other torques. The mass matrix M couples resting joints (r) to sliding
-joints (s). With A = M_rs M_ss^-1, the momentum of the resting joints changes by dp_r/dt = A (dp_s/dt - M'_ss dq_s) +
+The friction of a joint at rest balances all other torques. The mass matrix M couples joints at rest (r) to joints in
+motion (s). With A = M_rs M_ss^-1, the momentum of the joints at rest changes by dp_r/dt = A (dp_s/dt - M'_ss dq_s) +
 M'_rs dq_s, and their friction is f_r = u_r + J_r^T wrench - dp_r/dt.
 """
 
@@ -52,7 +52,7 @@ def masses(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def couple(state):
-    """Compute the coupling M_rs M_ss^-1 of resting joints (r) to sliding joints (s); M is the mass matrix."""
+    """Compute the coupling M_rs M_ss^-1 of joints at rest (r) to joints in motion (s); M is the mass matrix."""
     rest, mass = state.joints[REST], state.mass
     state.coupling[:] = 0.0
     sliding, resting = np.flatnonzero(rest == 0.0), np.flatnonzero(rest == 1.0)
@@ -72,7 +72,7 @@ def couple(state):
 
 @njit(cache=True, error_model="numpy")
 def known_torque(arm, noise, state, q):
-    """Detect which joints rest; compute each joint's modeled friction and the sum of its known torques."""
+    """Detect which joints rest; compute, for each joint, the modeled friction and the sum of known torques."""
     joints, terms, x, P = state.joints, state.terms, state.x, state.P
     n = len(q)
     b = len(x) - 2 * n
@@ -111,7 +111,7 @@ def known_torque(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
-    """Detect whether joint j rests; a resting joint that creeps is treated as sliding for one cycle."""
+    """Detect whether joint j rests; a joint at rest that creeps counts as in motion for one cycle."""
     joints[CREEP, j] = 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])

@@ -90,7 +90,7 @@ class FusedWrench(WrenchObserver):
 
     @property
     def wrench(self) -> np.ndarray:
-        """Fused force on the arm at the tip, (3,) N, base axes."""
+        """Force (3,) N on the arm's tip in base axes, fused from joint torques and the surface's law."""
         return self._fused
 
     @property

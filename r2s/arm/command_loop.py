@@ -215,7 +215,7 @@ class CommandLoop:
             raise
 
     def _raise(self, reason: str, hold: np.ndarray) -> None:
-        """Stop the arm; raise ArmStopped or StopRequested with `reason`, even if the arm reports a different one."""
+        """Stop the arm; raise ArmStopped or StopRequested with `reason`, even if the arm reports another reason."""
         kind = StopRequested if self._requested else ArmStopped
         self._block(reason)
         self._stop_arm(hold)

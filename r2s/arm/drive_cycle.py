@@ -30,7 +30,7 @@ STILL = 0.02  # rad/s, a slower joint is treated as at rest
 # rad/s, natural frequency of the spring that `resist` adds to a joint that keeps sliding during a stop. Our choice:
 # half of RATE of the safety filter, because the filter damps this spring.
 SPRING = 15.0
-RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while it drives a sliding joint; our choice
+RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while it drives a moving joint; our choice
 ADDED = 0.3  # share of tau_max that an adapter may add; enough for friction and 1.5 kg anywhere in a Panda's reach
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
 TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` would come too near

@@ -47,7 +47,7 @@ DQ_INSIDE = 0.95  # share of the velocity limits above which the driver stops th
 
 
 def spring(robot: Robot) -> np.ndarray:
-    """Return the stiffness (n,) Nm/rad that `resist` needs, computed from the nominal inertia at home."""
+    """Return the stiffness (n,) Nm/rad that `resist` needs, from the nominal inertia in the home posture."""
     return SPRING**2 / np.diag(InverseInertia(robot)(robot.q_home[None])[0])
 
 

@@ -55,7 +55,7 @@ def episode_driver(
     rotors: np.ndarray | None = None,
     speed_share: float = 1.0,
 ) -> Driver:
-    """Return the driver for an episode of `task`; for friction (n,) Nm, rotors, speed_share see `DriverBatch`."""
+    """Return the driver for an episode of `task`; `DriverBatch` explains `friction`, `rotors`, `speed_share`."""
     period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
     own = {"soft_start_s": soft_start_s, "rotors": rotors, "control": task.control(robot)}
     fence = CollisionCheck(robot, table=None, may_touch=task.may_touch)

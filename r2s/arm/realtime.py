@@ -87,7 +87,7 @@ class Timing:
     Attributes:
         policy: time from a state to the policy's command, once per control step. driver: time of one driver cycle.
         adapter: time of one update of the adapter; empty without an adapter. period: time between two commands.
-        robot: time between two states by the arm's clock; above 1 ms if cycles were lost.
+        robot: time from one state of the arm to the next by the arm's clock; more than 1 ms means lost cycles.
         success: control_command_success_rate of each cycle, without the first 100 cycles of a motion.
     """
 

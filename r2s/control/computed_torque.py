@@ -74,8 +74,8 @@ def computed_torque(
     Args:
         robot, task: the arm and its task. dynamics: the identified arm.
         residual: share of the task's torque limit that an action of 1 adds.
-        bandwidth: w, rad/s, natural frequency of the critically damped feedback; the loop's bandwidth is 2 w. None:
-            BANDWIDTH_LATENCY / (2 latency), with latency = control period + low-pass time constant + LATENCY.
+        bandwidth: natural frequency w of the critically damped feedback, rad/s; the loop has the bandwidth 2 w. None:
+            w = BANDWIDTH_LATENCY / (2 latency), with latency = control period + low-pass time constant + LATENCY.
         feedback_hz: Hz, update rate of the feedback, at most 1000; None: the policy's rate.
 
     Raises:

@@ -75,7 +75,7 @@ class Controller:
         return False
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s) of m episodes with the goals `goals`, each at its own time in t (m,) s."""
+        """Return the setpoints (m, s) of m episodes with `goals`; t (m,) s contains one time for each episode."""
         return np.empty((len(t), 0))
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from r2s.physics.newton_euler import COM, LINK, MASS, links_of
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 
 ACTIONS = ("target", "stiffness", "both")
-# the springs' share of the force that the torque limit allows at home; damping and feedforward use the rest
+# the springs' share of the force that the torque limit allows in the home posture; the rest: damping, feedforward
 CLIP = 0.7
 CLIP_M = 0.05  # m, error at which the default spring saturates
 
@@ -169,7 +169,7 @@ def cartesian_impedance(
         stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less so as not to exceed `fastest_spring`.
         rotational_stiffness: Nm/rad, largest rotational stiffness; 0: the orientation is free.
         force_clip: N, largest spring force at the largest stiffness, at most the force F that the torque limit allows
-            in every direction at home; None: CLIP * F. moment_clip: Nm, largest spring moment, limited likewise.
+            in all directions in the home posture; None: CLIP F. moment_clip: Nm, largest spring moment, likewise.
         null_stiffness: 1/rad, each joint's null-space stiffness towards home as a multiple of its torque limit.
         hybrid: whether a force acts along a surface normal, and the impedance only across this normal. An action
             that displaces the target against the normal adds a force stiffness * displacement. If `task.approaches`,
@@ -263,7 +263,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Return `value`, checked, or by default CLIP times the largest force or moment that `limit` allows at home."""
+    """Return `value`, checked; None: CLIP times the most that `limit` allows in the home posture."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most
@@ -279,7 +279,7 @@ def fastest_spring(task: ControlledTask) -> float:
 
 
 def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Jacobian (6, n) of the tip and the inverse mass matrix (n, n) at home."""
+    """Return the Jacobian (6, n) of the tip and the inverse mass matrix (n, n) in the home posture."""
     n = robot.n
     frames, jacobian, mass = np.empty((n, POSE)), np.empty((6, n)), np.empty((n, n))
     law.arm_pose(robot.q_home, parameters, frames, jacobian, np.empty(3))

@@ -59,7 +59,7 @@ def designed(
         report: function that receives the completed share of the work.
 
     Raises:
-        UserError: an argument is out of range, no random series is safe, or no path between two segments is safe.
+        UserError: an argument is out of range, or r2s finds no safe series or no safe path between two segments.
     """
     check_number("seconds", seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
     check_number("effort", effort, "[0, inf)", whole=True)

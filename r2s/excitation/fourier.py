@@ -211,7 +211,7 @@ class Candidates:
         return self.score(self.t, self.center + offset, dq, ddq)
 
     def _basis(self, rows: slice) -> Samples:
-        """Return matrices (T, 2 H) that map x to position, velocity and acceleration at the motion's rows `rows`."""
+        """Return matrices (T, 2 H) that map x to position, velocity and acceleration at `rows` of the motion."""
         _, s, pace, slope = (c[rows, None] for c in self.clock)
         order = np.arange(1, self.harmonics + 1)
         omega = 2 * np.pi / self.period * order

@@ -218,7 +218,7 @@ class Space:
             )
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # so that an arm can return to a low home posture
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
-        # at most half of the distance at home is required, so that an arm may return to a low home posture
+        # at most half of the distance in the home posture is required, so that an arm may return to a low one
         self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:

@@ -120,7 +120,7 @@ class Runtime:
 
         Raises:
             BundleError: the plan is missing, has a wrong shape, is not finite, exceeds the arm's limits or is outside
-                the region of the training's plans; or the program passed a plan for a policy whose goals are points.
+                the region of the training's plans; or `plan` is not None although the policy's goals are points.
         """
         if self._follower is not None:
             self._follower.take(plan)
@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Raise BundleError if start or first goal is outside the training's region; a later goal stops the arm."""
+        """Raise BundleError if start or first goal is outside the training's region; at a later one, stop the arm."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)

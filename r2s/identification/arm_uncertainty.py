@@ -60,7 +60,7 @@ def sliding_sign(torque: TorqueResidual) -> np.ndarray:
 def arm_directions(
     torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
 ) -> np.ndarray:
-    """Return the residual's change (T, n, r) Nm if one of r independent arm errors grows by a standard deviation.
+    """Return the residual's change (T, n, r) Nm per standard deviation of each of r independent model errors.
 
     Args:
         torque: residual of the joint torque. x: (P,) parameters of the arm.

@@ -105,12 +105,12 @@ def _torque(space: ParameterSpace, recording: Recording, cutoff_hz: float) -> To
 
 
 def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
-    """Return the sum of squares of the residuals `parts` at the unit-cube parameters u (P,)."""
+    """Return the sum of squares of the residuals in `parts` at the unit-cube parameters u (P,)."""
     return sum(float((p(p.space.from_unit(u)[None]) ** 2).sum()) for p in parts)
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the fit (P,) to the residuals `parts`, starting at u (P,). prior: residual (B,) at u and Jacobian."""
+    """Return the fit (P,) to the residuals in `parts` from start u (P,). prior: residual (B,) at u and Jacobian."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:

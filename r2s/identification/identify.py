@@ -49,7 +49,7 @@ from r2s.recordings.recording import Recording
 STANDSTILL = 0.02  # rad/s; for commanded torque, friction below this speed is not a function of velocity
 CLEAR = 1.5  # a replayed joint slower than this multiple of dq_min may stick
 MAX_BATCH = 64  # candidates replayed at once
-SELECTED_S = 240.0  # s; the selection of family and terms uses at most this much of a recording
+SELECTED_S = 240.0  # s; the selection of friction family and terms uses at most this much of a recording
 REWEIGHTS = 2  # further fits of a local search, each with weights from the residual of the previous fit
 ALIKE = 0.2  # relative uncertainty of the number of independent rows, and so of a sum of squares
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
@@ -83,11 +83,11 @@ class State:
     Attributes:
         robot, nominal, recording, searches, settings, ramps: see `identify`. `select_family` sets nominal.family.
         prior: {parameter: prior standard deviation in SI units}. terms: model terms to estimate besides friction.
-        families: {family: prediction error of held-out torque}; empty if the user chose the friction family.
+        families: {friction family: prediction error of held-out torque}; empty if the user chose the family.
         space: the parameter space; `fit_breakaway` adds breakaway commands, and `fit_stiction` a stiction model.
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
         edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
-            sliding, only for Stribeck families.
+            sliding, only for friction families with a Stribeck effect.
         refused: whether `fit` discarded the replay fit. dynamics: the fitted arm with its breakaway torques.
     """
 
@@ -198,7 +198,7 @@ def settle_lateness(s: State) -> State:
 
 def add_candidate_terms(s: State) -> State:
     """Add the candidate terms that improve the prediction of held-out torque."""
-    absent = {*optional_friction()} - {*s.nominal.family.optional}  # friction terms that the family lacks
+    absent = {*optional_friction()} - {*s.nominal.family.optional}  # friction terms that the friction family lacks
     candidates = [name for name in s.settings.candidate_terms if name not in absent]
     if not candidates:
         return s

@@ -67,11 +67,11 @@ def add_point_mass(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mass (..., n) kg, com (..., n, 3) m, tensor (..., n, 3, 3) with a point mass added to the last link.
 
-    A point mass suffices, because a gripper's tensor about its own center is small compared with m r^2.
+    A point mass suffices, because the tensor of a gripper about the gripper's center is small compared with m r^2.
 
     Args:
-        mass, com, inertia: properties of the links without the point mass.
-        payload: (...) kg, the point mass, at least 0. place: (..., 3) m, its position in the last link's frame.
+        mass, com, inertia: mass, center of mass and inertia tensor of each link without the point mass.
+        payload: (...) kg, the point mass, at least 0. place: (..., 3) m, its place in the last link's frame.
     """
     lead = np.broadcast_shapes(mass.shape[:-1], np.shape(payload))
     out = [np.broadcast_to(a, (*lead, *a.shape[k:])).copy() for a, k in ((mass, -1), (com, -2), (inertia, -3))]

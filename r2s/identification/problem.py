@@ -108,7 +108,7 @@ class Problem:
         return replace(self, sigma=sigma)
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with a flat prior for the values `names`, because an extra residual is their prior."""
+        """Return the problem with flat priors of the values in `names`, whose prior is an extra residual."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
@@ -171,7 +171,7 @@ class Search(Protocol):
     """A search, which minimizes the sum of squares of `Problem.residual` from `start` (P,).
 
     After every step or generation, a search calls `report` with a dict of search, evaluations, cost, done and total.
-    A local search (local = True) improves its start, so it can refine the result of an earlier search.
+    A local search (local = True) improves `start`, so a local search can refine the result of an earlier search.
     """
 
     local: bool

@@ -29,7 +29,7 @@ class IdentificationResult:
     Attributes:
         space: the parameter space. found: estimated values and intervals of the parameters.
         history: one row for each step or generation of a search.
-        families: {"sigmoid": error of held-out torque relative to the best, ...}; empty if the user chose the family.
+        families: {friction family: error of held-out torque relative to the best family's}; {} if the user chose one.
         null_directions: parameter combinations that the prior determines more than the data do, each as a pair
             (ratio of posterior to prior sigma, {name: component}), largest ratio first.
         unseen: names of the parameters that r2s left at nominal values, because the data hardly determine them.

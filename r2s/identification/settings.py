@@ -37,7 +37,7 @@ class Settings:
         nthread: threads of the physics; 0 uses all cores.
 
     Raises:
-        UserError: a family, term or parameter is unknown, or a number is outside its range.
+        UserError: a friction family, term or parameter is unknown, or a number is outside its range.
     """
 
     bounds: Mapping[str, Sequence[ArrayLike]]

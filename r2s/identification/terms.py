@@ -32,7 +32,7 @@ NOTHING: Stated = {}
 
 
 def optional_friction() -> list[str]:
-    """Return the optional friction parameters of all families; r2s estimates them only if `terms` contains them."""
+    """Return the optional parameters of all friction families; r2s estimates only those that `terms` contains."""
     return list(dict.fromkeys(name for f in known_families() for name in f.optional))
 
 
@@ -72,7 +72,7 @@ def search_space(
 ) -> ParameterSpace:
     """Return the parameter space of the friction family and of the terms that affect the recorded kind of torque.
 
-    bounds: see `scaled_bounds`; friction parameters without an entry have the bounds of their family, in SI units.
+    bounds: see `scaled_bounds`; friction parameters without an entry have their friction law's bounds, in SI units.
     stated: the user's statements (stated.py), of which only fixed values are used here.
 
     Raises:
@@ -116,8 +116,8 @@ def scaled_prior(
 ) -> dict[str, ArrayLike]:
     """Convert the standard deviations in `prior` to SI units, and omit flat priors (None).
 
-    In `prior`, values of torque-like parameters are relative to the largest torque; logarithmic parameters have no
-    unit. The viscous coefficient in the arm's file is a guess, so its standard deviation is at least its value.
+    In `prior`, values for torque-like parameters are relative to the largest torque; values for logarithmic ones have
+    no unit. The arm's file only guesses viscous friction, so its standard deviation is at least the guess.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():

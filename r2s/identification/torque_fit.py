@@ -50,7 +50,7 @@ class Unexplained:
         return nominal_torque(self.robot, self.m.q, self.m.dq, self.m.ddq, gravity)
 
     def fit(self, parts: np.ndarray) -> np.ndarray:
-        """Fit tau - `need` by a weighted sum of the torques `parts` (K, T, n) Nm; return the weights (K,)."""
+        """Fit tau - `need` by a weighted sum of the K torques in `parts` (K, T, n) Nm; return the weights (K,)."""
         rows = np.concatenate(self._apart([*parts, self.m.tau - self.need]))
         return np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0]
 

@@ -22,9 +22,9 @@ class BoxRandomization(UniformRandomization):
     the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's normal.
 
     Attributes:
-        size: (3,) m, edges of the box. mass (kg), table, friction (coefficients at table and tip), stiffness (N/m),
-            damping (s/m), bristle (m): ranges [least, most], see `Surface`. spread: m, range of the box's position.
-        yaw: degrees, range of the box's rotation. point, normal: (3,) m and (3,), table plane, see `table_frame`.
+        table, friction: friction coefficients at the work table and at the tip. mass (kg), stiffness (N/m), damping
+            (s/m), bristle (m): see `Surface`. All six are ranges [least, most]. size: (3,) m, edges of the box.
+        spread, yaw: m, degrees, range of the box's pose. point (3,) m, normal (3,): table plane, see `table_frame`.
 
     Raises:
         UserError: a range is malformed, the box would tilt, or the robot has no tool.
@@ -56,7 +56,7 @@ class BoxRandomization(UniformRandomization):
         check_number("dr.yaw", self.yaw, "[0, 180]")
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return m random dynamics, each of an arm with a box."""
+        """Return random dynamics of m arms, each arm with a random box."""
 
         def drawn(low: float, high: float) -> np.ndarray:
             return rng.uniform(low, high, m)

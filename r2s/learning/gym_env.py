@@ -43,7 +43,7 @@ class SeparateArms(VectorArms):
 
 
 class SeparateEnv(TaskEnv):
-    """`TaskEnv` whose arm i draws the seeds of its episodes from `rngs[i]`."""
+    """`TaskEnv` that draws the seeds of arm i's episodes from `rngs[i]`."""
 
     arms_type = SeparateArms
     arms: SeparateArms

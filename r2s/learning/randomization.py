@@ -154,7 +154,7 @@ class ContactRandomization(UniformRandomization):
     are uniform. U(-place, place) displaces the plane along its normal, and U(0, tilt) tilts it about a random axis.
 
     Attributes:
-        point, normal: (3,) m and (3,), of the nominal plane; None: a table below the tip at home.
+        point, normal: (3,) m and (3,), of the nominal plane; None: a work table below the home posture's tip.
         stiffness (N/m), exponent, damping (s/m), friction, bristle (m): ranges [least, most], see `Surface`.
         place: m, largest displacement of the plane along its normal. tilt: degrees, largest tilt of the plane.
         surface: run folder of an identified surface, whose posterior replaces the ranges; None: use the ranges.

@@ -46,6 +46,6 @@ class Replay:
         return {name: rows.index_select(0, pick) for name, rows in self._rows.items()}
 
     def transitions(self, begin: int, end: int) -> dict[str, Tensor]:
-        """Return the transitions with numbers `begin` to `end` - 1; the buffer must contain all of them."""
+        """Return the transitions with the numbers from `begin` to `end` - 1; the buffer must contain all of them."""
         pick = torch.arange(begin, end, device=self.device) % self.size
         return {name: rows[pick] for name, rows in self._rows.items()}

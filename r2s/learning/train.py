@@ -218,7 +218,7 @@ class Training:
 
     @contextmanager
     def step(self, spent: float) -> Iterator[None]:
-        """Step all arms while the `with` block runs, then store the transitions; spent: used share of the budget."""
+        """Step all arms while the `with` block runs, then store the transitions. spent: used share of the budget."""
         env, state = self._env, self._state
         state["action"] = self._action(state["observation"])
         with self._dated_errors():

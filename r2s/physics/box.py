@@ -13,7 +13,7 @@ from r2s.physics.tip import default_plane, nominal_plane
 SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; the tip pushes below the hand
 PUSHED_AT = 0.4  # height at which the tip pushes, as a share of the box's height
 SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal pose, to either side
-FORWARD = 0.25  # distance of the nominal box ahead of the tip at home, as a share of the tip's distance from the base
+FORWARD = 0.25  # the nominal box is ahead of the home posture's tip by this share of the tip's distance to the base
 # Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
 # from a carton on a smooth table to a block of wood on a dry table
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)
@@ -61,7 +61,7 @@ class TableFrame:
 
 
 def table_frame(robot: Robot, point: Any = None, normal: Any = None) -> TableFrame:
-    """Return a table's frame from a point (3,) m and a normal (3,); None: below and ahead of the tip at home."""
+    """Return a work table's frame from point (3,) m and normal (3,); None: below, ahead of the home posture's tip."""
     place, up = nominal_plane(robot, point, normal)
     across = place - (place @ up) * up
     size = float(np.linalg.norm(across))
@@ -86,7 +86,7 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
 
 
 def check_size(name: str, size: Any, table: float) -> np.ndarray:
-    """Return a box's edges (3,) m; raise UserError if a push at PUSHED_AT times its height would tilt the box.
+    """Return a box's edges (3,) m; raise UserError if a push at PUSHED_AT times the box's height would tilt it.
 
     A push must overcome the table friction mu m g, so a push at height h tilts a box with half edge a if mu h > a.
     """

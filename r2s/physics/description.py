@@ -31,8 +31,8 @@ class Link:
         origin: (4, 4) pose of the joint in the parent link's frame, at angle zero.
         axis: (3,) joint axis, in the joint's frame.
         mass: kg, of the link. com: (3,) m, center of mass, link frame. inertia: (3, 3) kg m^2 about `com`, link axes.
-        damping: (3,) damping coefficients, first in Nm s/rad. friction: Nm, Coulomb. armature: kg m^2, rotor inertia.
-        stiffness: (3,) spring coefficients, first in Nm/rad. springref: rad, joint angle without spring torque.
+        damping, stiffness: (3,) polynomial coefficients, the linear one first, in Nm s/rad and Nm/rad. friction: Nm,
+            Coulomb friction. armature: kg m^2, rotor inertia. springref: rad, joint angle without spring torque.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Joint friction laws, called families; r2s contains four families, and users can add families.
 
-A family contains its law in NumPy and, for the physics step (mujoco_callback.py), in a compiled version.
-`friction.family=` selects a family by name, or a user's family by a dotted path such as my_module.MY_FAMILY.
+A friction family contains a law in NumPy and, for the physics step (mujoco_callback.py), a compiled version.
+`friction.family=` selects a built-in family by name, or a user's family by a dotted path such as my_module.MY_FAMILY.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,14 +25,14 @@ class Family:
     """Friction law of a joint with K parameters; the torque is 0 at rest and positive for positive velocity.
 
     Attributes:
-        name: name of the family in tables.
+        name: name of the friction family in tables.
         names, units: names and units of the K parameters.
         logarithmic: names of positive parameters that span decades; their search space is logarithmic.
         bounds: search ranges (low, high) of the parameters; `identify.bounds` overrides these ranges.
         optional: last entries of `names`, parameters that are 0 and not estimated unless `identify.terms` lists them.
         formula: text of the law in one line.
         law: function (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n).
-            `sign` is tanh(dq / 0.01), or the bristle deflection of a family with a memory, in [-1, 1].
+            `sign` is tanh(dq / 0.01), or the bristle deflection of a law with a memory, in [-1, 1].
         native: law of a joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
             torque and its derivative at v. `memory` is the state of the joint's friction, 0 after a reset.
         sharp: version of `native` whose torque is discontinuous at v = 0, for stiction_model="net"; None: the law is
@@ -283,15 +283,15 @@ _imported: dict[str, Family] = {}  # by dotted path
 
 
 def known_families() -> tuple[Family, ...]:
-    """Return the built-in families and all families that the function `family` has imported."""
+    """Return the built-in friction families and all those that the function `family` has imported."""
     return (*FAMILIES, *_imported.values())
 
 
 def family(name: str) -> Family:
-    """Return a built-in family by its name, or import one by its dotted path.
+    """Return a built-in friction family by name, or import a family by dotted path.
 
     Raises:
-        UserError: the family is unknown, or a known family has a parameter of the same name in another unit or scale.
+        UserError: the family is unknown, or another family uses a parameter's name with another unit or scale.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:
@@ -323,7 +323,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if a file names a family, `name`, whose module is neither imported nor in `trust`."""
+    """Raise UserError if the module of the friction family `name` is neither imported nor in `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(

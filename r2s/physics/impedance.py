@@ -34,7 +34,7 @@ from r2s.physics.newton_euler import (
 HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
 DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
 K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
-TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip m in the last link, axes of this link at home, gravity m/s^2
+TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip m in the last link, axes of this link in the home posture, gravity m/s^2
 APPROACH, HEAD = 43, 44
 SLIDES = 2  # a value of APPROACH
 # Behind HEAD, one row per joint: row of `links_of`, rotor inertia, errors of mass and first moment, offset, drag,

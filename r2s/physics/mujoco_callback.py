@@ -68,7 +68,7 @@ BRISTLES, PRESLIDING = FAMILIES.index(BRISTLE_FAMILY), BRISTLE_FAMILY.names.inde
 
 
 def number(family: Family, hold: str) -> int:
-    """Return the number of a family's law in `jnt_user`; a user's law is compiled first, once per process."""
+    """Return the number of a friction law in `jnt_user`; a user's law is compiled first, once per process."""
     law = family.native if hold == "command" or family.sharp is None else family.sharp
     return BUILT_IN.index(law) if law in BUILT_IN else friction_address(law)
 
@@ -312,7 +312,7 @@ def _hold(forces, dq, user, joint, work, touch, touches):
     Args:
         forces: MuJoCo's M, damping, bias, applied, passive. dq: (n,) rad/s, joint velocities. user: (n, WIDTH), from
             `jnt_user`. joint: (ROWS, n), results of `_friction`. work: (2 n + 6, n), scratch array.
-        touch: arrays `contact` and `jacobian` that `near` wrote. touches: whether the tip may touch, from `near`.
+        touch: arrays `contact` and `jacobian` that `near` wrote. touches: whether the tip may touch (from `near`).
     """
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]

@@ -120,7 +120,7 @@ def push_limit(
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
         force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None bounds the force on 1e5 N/m by 2 force_max.
-        plane: point and normal; None: a table below the tip at home. asked: N, largest force that the task requests.
+        plane: point and normal; None: a work table below the home posture's tip. asked: N, largest force of a task.
         stop: a key of STOPS (contact_stop.py); None: "release".
 
     Raises:
@@ -190,7 +190,7 @@ def tip_motion(limit, kinematics, dq, row):
 
 @njit(cache=True, error_model="numpy")
 def push_bound(limit, arm, kinematics, last, friction, work):
-    """Return the upper bound, m/s^2, on the tip's inward acceleration J M^-1 tau; inf far from the surface.
+    """Return the largest allowed acceleration J M^-1 tau, m/s^2, of the tip into a surface; inf far from it.
 
     Args:
         limit: (COLUMNS,) from `PushLimit.columns`; this function updates the estimate R and the last speed.

@@ -72,7 +72,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     of a coupled joint passes at rest. DELAY_PHASE bounds the added inertia, which makes a loop faster than RATE.
 
     Args:
-        robot: the arm, for its position, velocity, torque and rate limits and its mass matrix at home.
+        robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
         torque: (n,) Nm, largest target torque.
     """
     out = np.empty((robot.n, COLUMNS))

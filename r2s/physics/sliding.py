@@ -134,7 +134,7 @@ def start_box(contact, guess):
 
 @njit(cache=True, error_model="numpy")
 def yielding(contact, force, h, guess):
-    """Write the contact with a movable box into `guess`: columns FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m.
+    """Write FORCE_BEGIN (3,) N and RESISTANCE (3, 3) N s/m of the contact with a movable box into `guess`.
 
     force: (3,) N, force on the tip if the tip's velocity relative to the box does not change.
     """

@@ -6,7 +6,7 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.robot import Robot
 
-BELOW = 0.15  # gap between tip and nominal surface at home, relative to the end effector's distance from the base
+BELOW = 0.15  # gap from nominal surface to tip in home posture, relative to the end effector's distance from the base
 POSTURE = 1e-3  # m^2, damping in the least-squares steps of inverse kinematics
 MARGIN = 0.1  # rad, distance of inverse kinematics from the position limits
 CLOSE = 1e-4  # m, position error at which inverse kinematics ends
@@ -59,7 +59,7 @@ def tilted(normal: np.ndarray, about: np.ndarray | float, tilt: np.ndarray | flo
 
 
 def default_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return point (3,) m and normal (3,) of a table below the tip at home."""
+    """Return point (3,) m and normal (3,) of a work table below the tip in the home posture."""
     down = robot.gravity / np.linalg.norm(robot.gravity) if robot.gravity.any() else np.array([0.0, 0.0, -1.0])
     tip = Tip(robot)
     place, _ = tip(robot.q_home)

@@ -29,7 +29,7 @@ class Bodies:
         self.local = [make_pose(position, rotation(quat)) for position, quat in poses]
 
     def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
-        """Return `body` or its nearest ancestor with a joint (0: the world), and the pose of `body` in its frame."""
+        """Return b (`body` or its nearest ancestor with a joint; 0: world) and the pose of `body` in b's frame."""
         pose = np.eye(4)
         while body and self.model.body_dofnum[body] == 0:
             pose = self.local[body] @ pose

@@ -1,4 +1,4 @@
-"""Estimate and correct lateness: the delay of a recording's logged dq relative to its q."""
+"""Estimate and correct lateness: the delay of logged dq relative to logged q in a recording."""
 
 from dataclasses import dataclass, replace
 

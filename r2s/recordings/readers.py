@@ -70,7 +70,7 @@ def read(
             `{j}` (from 1) or `{i}` (from 0) stands for the joint number. Instead of a name, a list may contain one
             column name per joint. In HDF5 a column name is the path of a dataset, such as robot/q.
         n_joints: expected number of joints.
-        max_gap_s: s, longest time step within a trajectory; None: see `longest_step`; inf: gaps do not split.
+        max_gap_s: s, longest time step within a trajectory; None: see `longest_step`; inf: gaps end no trajectory.
         period: period of the motion, s, see `Recording`.
         name: name of the recording; None: the file name without its suffix.
         topic: ROS topic to read from a bag, see `bag_table`.

@@ -193,7 +193,7 @@ class Recording:
         return replace(self, signals=signals, **{f: np.concatenate(parts) for f, parts in columns.items()})  # type: ignore[arg-type]
 
     def _held(self, s: slice, grid: np.ndarray, dt: float) -> np.ndarray:
-        """Return the mean commands (G, n) Nm of the rows `s` in the G intervals from `grid` to `grid + dt`.
+        """Return the mean command (G, n) Nm in each of the G intervals from `grid` to `grid + dt`; s: slice of rows.
 
         A command acts until the next command. Commands that were sent between two logged rows are interpolated.
         """
@@ -283,7 +283,7 @@ class Recording:
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
-        """Return (training, validation) without common motion; `validation_fraction` of the rows are for validation.
+        """Return (training, validation) without common motion. validation_fraction: share of rows for validation.
 
         1. If the motion has a period (argument or attribute), validation is the end of each period: the rows with the
            largest phase, `t` modulo period. A chronological split could put the same motion in both parts; for

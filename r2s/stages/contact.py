@@ -103,7 +103,7 @@ def pressed_surface(cfg, run, arm, plan):
 
 
 def calibrated_arm(cfg, robot):
-    """Return the identified arm of `calibration=` and its posterior as an `Arm`."""
+    """Return an `Arm`: the identified arm that `calibration=` names, with the posterior of the identification."""
     from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.stages.run_config import modules

@@ -26,7 +26,7 @@ class ArmData:
         excitation: file of the training motion; None: r2s optimizes this motion.
         ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
         presses: how often the tool presses on a surface and slides, in place of the motions above; 0: never.
-        press_point, press_normal: (3,) m and (3,), rough plane of that surface; None: a table below the tip at home.
+        press_point, press_normal: (3,) m and (3,), rough plane; None: a work table below the tip in the home posture.
 
     Raises:
         UserError: a value is outside its range.

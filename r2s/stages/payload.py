@@ -51,7 +51,7 @@ def loaded_data(cfg, robot, file, torque=None):
 
 
 def torque_of_calibration(cfg, given):
-    """Return the kind of torque from which `calibration=` was identified; loaded recordings need the same kind.
+    """Return the torque kind of the calibration; a recording of an arm with a payload needs the same kind.
 
     given: value of data.torque, or None if unset.
 

@@ -58,7 +58,7 @@ def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
 
 
 def run_step(words: dict[str, list[str]]) -> None:
-    """Run the commands {label: words} in parallel; print each command's progress, and its tables at the end.
+    """Run the commands {label: words} in parallel; print the progress of each and, at the end, all tables.
 
     Raises:
         UserError: a command failed; the remaining commands are terminated.

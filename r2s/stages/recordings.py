@@ -1,4 +1,4 @@
-"""Find and read the recordings of stage=identify and `r2s check`: one or several files, each with a kind of torque.
+"""Find and read the recordings for stage=identify and `r2s check`; each of the files has one kind of torque.
 
 `data.path` and `data.validation` each name a file, a pattern such as "logs/*.csv", a dict such as
 {path: FILE, torque: motor}, or a list of these. The keys of such a dict override the settings in `data`.
@@ -72,7 +72,7 @@ def _matching(where: str, path: str) -> Iterator[str]:
 
 
 def of_one_reader(files):
-    """Return the files; if the first is a bag, unset `topic` and `joints` of all files that are no bags."""
+    """Return the files; if the first file is a bag, unset `topic` and `joints` of all files that are no bags."""
     from r2s.recordings.readers import is_bag
 
     if not is_bag(Path(files[0].path)):

@@ -78,8 +78,8 @@ def results(cfg, overrides):
 def cloned(clone, paths):
     """Clone this commit unless the clone exists; return {page: committed text, or ""} and the hash of the commit.
 
-    In the clone's pages, all tables lose their rows, so that a table that no command writes stays empty. The clone
-    has a temporary name until it is complete.
+    In the pages of the clone, all tables lose their rows; a table that no command fills then stays empty. The clone
+    has a temporary name until the clone is complete.
     """
     from r2s.reporting.page_comparison import without_rows
 

@@ -41,7 +41,7 @@ def reads(cfg):
 
 
 def trained_config(cfg, option="policy"):
-    """Return the run folder `policy=` and its config; error messages begin with `option`.
+    """Return the run folder that `policy=` names, and the run's config; error messages begin with `option`.
 
     The config names the copies of calibration and surface in this run folder, so that no other folder is needed.
 

@@ -174,7 +174,7 @@ class TrialRun:
         self._reported = len(trial.study.trials[trial.number].intermediate_values)
 
     def start(self) -> None:
-        """Start the training, or resume it if its run folder exists."""
+        """Start the training, or resume the training if the run folder exists."""
         self.starts += 1
         self.log.parent.mkdir(exist_ok=True)
         with open(self.log, "a") as log:

@@ -81,7 +81,7 @@ class MeasureTable:
 
     Attributes:
         measures: the task's own measures, to which r2s adds the measures COMMON.
-        selection: measures that compare trainings; every row must contain the first, and the last ranks trainings.
+        selection: measures that compare trainings. Rows must contain the first measure; the last one ranks trainings.
         rows: columns of the table that has a row for each simulator and arm; by default all `measures`.
         comparison: columns of the table of trainings. curves: panels of the figure of learning curves.
         scores: panels of the figure that compares the scores of trainings.
@@ -91,7 +91,7 @@ class MeasureTable:
         error: name, unit and scale of `Episodes.distance`. error_levels: reference values in the figure of the error.
         reward: name of `Episodes.reward`.
 
-    By default, `comparison`, `curves`, `scores` and `transfer` contain the measures `selection`.
+    By default, `comparison`, `curves`, `scores` and `transfer` contain the measures that `selection` lists.
     """
 
     measures: tuple[Measure, ...]

@@ -39,7 +39,7 @@ PRESS = MeasureTable(
 
 
 def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, float]:
-    """Return the measures of task press, one row of evaluations.csv.
+    """Return the measures of the task press, which form one row of evaluations.csv.
 
     force_rmse_first_N, force_rmse_last_N: RMS force error in the second before the force step, and the last second.
     overshoot_N: largest excess over the new force in the direction of the force step. overshoot_share: overshoot_N
@@ -80,7 +80,7 @@ def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> 
 
 
 def impact_of(force: np.ndarray, ctrl_hz: int) -> tuple[float, float]:
-    """Return the peak force N within IMPACT_S of the first touch, and the share of contact after the first touch."""
+    """Return the peak force, N, within IMPACT_S of the first touch, and the share of time in contact since then."""
     touched = np.flatnonzero(force > TOUCH_N)
     if not len(touched):
         return 0.0, 0.0

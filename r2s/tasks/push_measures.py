@@ -37,7 +37,7 @@ PUSH = MeasureTable(
 
 
 def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
-    """Return the measures of task push, one row of evaluations.csv.
+    """Return the measures of the task push, which form one row of evaluations.csv.
 
     within_3cm, within_10deg: share of episodes with the box within 3 cm, or 10 degrees, of its goal throughout the
     last 0.5 s. success: share of episodes within both limits, without a stop, and with the tip above the table.

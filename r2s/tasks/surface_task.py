@@ -51,7 +51,7 @@ class SurfaceTask(TipTask):
         approach_speed: m/s, speed of the target along the nominal normal, thus the highest closing speed at contact.
         clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
             from `point`. place, tilt: m and degrees, largest offset and tilt of the true plane from the nominal.
-        point, normal: the nominal plane in the base frame, m; None: a table below the tip at home.
+        point, normal: the nominal plane in the base frame, m; None: a work table below the tip in home posture.
         tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of different goals in a training.
@@ -213,15 +213,15 @@ class SurfaceTask(TipTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return the part of a goal after the start posture, computed from `path` (k, 3) m; by default empty."""
+        """Return the numbers of a goal after the start posture, computed from `path` (k, 3) m; by default none."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 3) m, the point of the nominal plane below the target at t (m,) s."""
+        """Return the point (m, 3) m of the nominal plane below the tip's target at the times t (m,) s."""
         return goals[:, POINT]
 
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, the depth of the tip's target below the nominal plane at t (m,) s.
+        """Return the depth (m,) m of the tip's target below the nominal plane at the times t (m,) s.
 
         The target moves at `approach_speed` until it is below any allowed surface. Then force rises at `force_rate`.
         """

@@ -61,7 +61,7 @@ class State:
 
     @staticmethod
     def at_home(robot: Robot) -> "State":
-        """Return the state of an arm at rest at home, with zero ee and Jacobian, for the compilation of functions."""
+        """Return the state of an arm at rest in the home posture, with zero ee and Jacobian, for compilation."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
         none = np.zeros(1, dtype=bool), np.zeros(1)
         return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
@@ -305,7 +305,7 @@ class BaseTask:
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with a `push_limit` (r2s/physics/push_limit.py) for a table below the tip at home."""
+        """Return the task with a push limit (r2s/physics/push_limit.py) for a work table below the home posture."""
         return self._with("push_limit", push_limit(robot, friction, force_max, speed_near))
 
     def _with(self, name: str, value: Any) -> Self:

@@ -36,7 +36,7 @@ class WipeTask(SurfaceTask):
 
     Attributes:
         speed: (low, high) m/s, range of random peak speeds. size: (low, high) m, range of random path radii. kinds:
-            subset of KINDS, equally probable. ramp_s: s, duration of a path's acceleration, and of its deceleration.
+            subset of KINDS, equally probable. ramp_s: s, duration of acceleration and of deceleration on a path.
         friction: expected friction coefficient of the surface. Other attributes: see `SurfaceTask`.
         inertia: (3, 3) kg, effective mass of the tip at the nominal plane.
     """

@@ -64,7 +64,7 @@ class Fault:
 
 
 class Control:
-    """Runs torque motions on an arm of 7 joints and maintains its RobotState.
+    """Runs torque motions on an arm of 7 joints and maintains the arm's RobotState.
 
     Attributes:
         state: RobotState in the format of `version`; the server sets message_id.

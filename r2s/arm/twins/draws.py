@@ -40,14 +40,14 @@ def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, 
 
     Args:
         robot: the arm. rng: random number generator. hold: (n,) Nm, lower bound of each joint's stiction.
-        unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
+        unbalanced: (n,) Nm, gravity compensation minus gravity torque in the home posture.
     """
     _, offset_range, drag_max, noise_max = magnitudes(robot)
     n = robot.n
     offset = rng.uniform(offset_range[:, 0], offset_range[:, 1]) * rng.choice([-1, 1], n)
     return np.array(
         [
-            # the paper's Table I lists gravity error plus offset; this sum must not move an arm at home
+            # the paper's Table I lists gravity error plus offset; this sum must not move an arm in the home posture
             np.clip(offset, -hold - unbalanced, hold - unbalanced),
             drag_max * rng.uniform(0.15, 0.7, n),  # Nm
             drag_max * rng.uniform(0.0, 0.3, n),  # Nm, of a cable along two joints

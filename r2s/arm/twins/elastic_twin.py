@@ -24,7 +24,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 MIN_STEPS = 20  # per cycle; finer steps change an open-loop motion of 1 s by less than 1e-5 rad
 MAX_STEPS = 200
-PHASE_STEP = 0.1  # rad, largest phase change of the fastest oscillation (at home) in one step
+PHASE_STEP = 0.1  # rad, largest phase change of the home posture's fastest oscillation in one step
 SLOTS = 8  # number of stored commands, one per cycle
 WARM_SPEED = 0.25  # share of dq_max, speed at which heat settles at 1
 STATIC_ROUNDS = 50  # fixed-point iterations that find the posture in which the gears balance gravity
@@ -132,8 +132,8 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
     Args:
         robot: the arm. rng: random number generator.
-        inertia: (n, n) kg m^2, mass matrix of the true links at home.
-        unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
+        inertia: (n, n) kg m^2, mass matrix of the true links in the home posture.
+        unbalanced: (n,) Nm, gravity compensation minus gravity torque in the home posture.
 
     """
     n, model = robot.n, robot.model(gravity=False)

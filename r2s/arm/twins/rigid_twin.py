@@ -109,8 +109,8 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
     Args:
         robot: the arm. rng: random number generator.
-        inertia: (n,) kg m^2, inertia of each joint at home with the other joints free.
-        unbalanced: (n,) Nm, gravity compensation minus gravity torque at home.
+        inertia: (n,) kg m^2, inertia of each joint in the home posture with the other joints free.
+        unbalanced: (n,) Nm, gravity compensation minus gravity torque in the home posture.
 
     """
     n = robot.n

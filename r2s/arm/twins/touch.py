@@ -120,12 +120,12 @@ class Touch:
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
     """Draw a twin's surface near the nominal pose that the setting `surface` describes.
 
-    False: no surface. True: a table below the tip at home. {point: m, normal}: a plane through this point. box: a box
-    with edges `r2s.physics.box.SIZE` on a table in front of the tip at home. {box: [3 edges, m]}: a box with these
-    edges; if point and normal are also given, the box stands at that point.
+    False: no surface. True: a work table below the tip of the home posture. {point: m, normal}: a plane through the
+    point. box: a box with edges `r2s.physics.box.SIZE` on a work table ahead of the tip. {box: [3 edges, m]}: a box
+    of these edges; if point and normal are also given, the box stands at that point.
 
     Raises:
-        UserError: `surface` is invalid, the robot has no tool, or the tip at home would be inside the surface.
+        UserError: `surface` is invalid, the robot has no tool, or the surface contains the home posture's tip.
     """
     if surface is False or surface is None:
         return None

@@ -43,9 +43,9 @@ class TwinBase:
         noise: stream number of the sensor noise; two recordings of one robot need different numbers.
         friction_scale: factor on the drawn friction, except on its load-dependent part; below 1 for a warm arm.
         extra_delay_s: s, delay of commands in addition to the twin's own delay; whole milliseconds.
-        surface: surface that the tool may touch, drawn from the seed. False: no surface. True: a table below the tip
-            at home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of this plane in the base frame.
-            box: a box on a table. See `draw_surface`.
+        surface: a surface for the tool, drawn from the seed. False: none. True: a work table below the tip in the
+            home posture. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of this plane (base frame).
+            box: a box on a work table. See `draw_surface`.
 
     Raises:
         UserError: an argument is out of its range.

@@ -18,7 +18,7 @@ from r2s.recordings.recording import Recording
 SLOWEST = 0.01  # rad/s, slowest sliding; slower joints may stick and slip, which increases the residual
 DRIFT = 0.02  # standard deviation of friction drift and offset drift, relative to a joint's friction
 EXACT = 1e-4  # lower limit of a row's sigma, relative to the joint's friction, even in a noise-free simulation
-SEEN = 0.03  # standard deviations; arm errors with a smaller effect on all rows together are dropped
+SEEN = 0.03  # standard deviations; errors of the arm's model with a smaller effect on all rows are dropped
 FTOL = 1e-6  # a search ends when a step reduces the cost by less than this share
 STEP = 1e-5  # finite-difference step on the unit cube
 REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
@@ -71,7 +71,7 @@ class ContactProblem:
         return self.motion.filtered(self.tip.contact_of(*self.space.plane(u), self.space.law(u))[0])
 
     def data(self, u: np.ndarray) -> np.ndarray:
-        """Return the residual (R,), divided by its standard deviation, for a surface u (8,) and arm errors w = 0."""
+        """Return the residual (R,), in standard deviations, for a surface u (8,) and model errors w = 0."""
         return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
 
     def slope(self, u: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return the arm errors w (r,) that minimize the cost of a given surface u (8,)."""
+        """Return the errors w (r,) of the arm's model that minimize the cost of a given surface u (8,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:

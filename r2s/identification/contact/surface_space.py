@@ -38,7 +38,7 @@ class SurfaceSpace:
 
     @property
     def axes(self) -> np.ndarray:
-        """Two unit vectors (2, 3) in the plane; u[0] tilts the normal towards the first, u[1] towards the second."""
+        """Two unit vectors (2, 3) in the plane; u[0] and u[1] tilt the normal towards the first and second vector."""
         first = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
         first /= np.linalg.norm(first)
         return np.stack([first, np.cross(self.normal, first)])

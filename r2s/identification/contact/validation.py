@@ -56,7 +56,7 @@ def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]
     """Return the forces that a surface u (8,) predicts and the forces from joint torques, in the masks `parts`.
 
     Assume that the measured force has the direction of the predicted force. A weighted least-squares fit to the
-    torques of sliding joints then determines the ratio of the measured to the predicted force.
+    torques of joints in motion then determines the ratio of the measured to the predicted force.
     """
     motion = problem.motion
     tau, force, depth, rate = problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))

@@ -60,14 +60,14 @@ class PayloadEstimate:
         return Payload(np.array(self.mass), self.centre, self.tensor)
 
     def rmse(self, predicted: np.ndarray) -> np.ndarray:
-        """Return the RMSE (n,) Nm of a predicted torque (T, n) against the recorded one; nan for a resting joint."""
+        """Return the RMSE (n,) Nm between predicted (T, n) and recorded torque; nan for a joint that only rests."""
         square = np.where(self.seen, (predicted - self.measured) ** 2, 0.0).sum(0)
         return np.sqrt(square / np.where(self.seen.any(0), self.seen.sum(0), np.nan))
 
 
 @dataclass(frozen=True, eq=False)
 class _Linearized:
-    """Payload problem, linearized for `posterior` at the fitted body z and arm errors w."""
+    """Payload problem, linearized for `posterior` at the fitted body z and the errors w of the arm's model."""
 
     rows: Rows
     space: BodySpace
@@ -105,10 +105,10 @@ def identify_payload(
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> PayloadEstimate:
-    """Estimate the payload of an arm from a loaded recording.
+    """Estimate the payload of an arm from a recording of the arm with the payload.
 
     Args:
-        arm: the arm, identified without payload from the same kind of torque; errors of the arm widen the intervals.
+        arm: the arm, identified without payload from the same kind of torque; model errors widen the intervals.
         recording: motion of the arm with the payload.
         declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: seed of the random posterior draws.

@@ -1,4 +1,4 @@
-"""Linearize the torque residual of a loaded arm in the payload's parameters and the arm's errors."""
+"""Linearize the torque residual of an arm with a payload in the payload's parameters and the model's errors."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -35,11 +35,11 @@ class LoadedSpace(ParameterSpace):
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Residual of a loaded recording, in standard deviations: error + body @ phi + arm @ w.
+    """Residual of a recording with a payload, in standard deviations: error + body @ phi + arm @ w.
 
     Attributes:
         error: (R,), residual without payload. body: (R, 10), slope for the payload's standard parameters phi about
-            the end effector. arm: (R, r), slope for the arm's errors w ~ N(0, I). clusters: (R,), block of each row.
+            the end effector. arm: (R, r), slope for model errors w ~ N(0, I). clusters: (R,), block of each row.
     """
 
     error: np.ndarray
@@ -49,7 +49,7 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10) and constant (r,) of the arm errors gain @ phi + constant that best fit a payload phi."""
+        """Gain (r, 10) and constant (r,) of the model errors gain @ phi + constant that best fit a payload phi."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
@@ -67,7 +67,7 @@ class Rows:
         return root / size, np.linalg.lstsq(root.T, size * b, rcond=None)[0]
 
     def best_arm(self, phi: np.ndarray) -> np.ndarray:
-        """Return the arm errors w (r,) that best fit a payload phi (10,)."""
+        """Return the errors w (r,) of the arm's model that best fit a payload phi (10,)."""
         gain, constant = self._eliminated
         return gain @ phi + constant
 
@@ -128,7 +128,7 @@ class LoadedTorque:
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Linearize the residual at `payload` with parameters phi (10,); weights exclude torque of arm errors w."""
+        """Linearize the residual at `payload`, parameters phi (10,); weights exclude the torque of model errors w."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

@@ -132,7 +132,7 @@ class SlidingMotion:
 
     @property
     def tau(self) -> np.ndarray:
-        """(T, n) Nm, window means of the recorded command at its own time."""
+        """(T, n) Nm, window means of the recorded command without delay."""
         return self.delayed[:, 1]
 
     def filtered(self, x: np.ndarray | Callable[[slice], np.ndarray]) -> np.ndarray:
@@ -164,7 +164,7 @@ class SlidingMotion:
 
 
 def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
-    """Return a derivative (T, n) of the angles from polynomials of at most fourth order over at most `most` rows."""
+    """Fit polynomials of order 4 or less to the angles, over at most `most` rows each; return a derivative (T, n)."""
     out = np.zeros_like(recording.q)
     for s in recording.stretches:
         rows = min(most, s.stop - s.start - (s.stop - s.start + 1) % 2)

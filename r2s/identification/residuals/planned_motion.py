@@ -57,5 +57,5 @@ class PlannedMotion:
     rows = filtered
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the command (T, n) Nm after a `delay` and a `lag`, both in s, by first-order extrapolation."""
+        """Return the command (T, n) Nm with a `delay` and a `lag`, s, each approximated to first order in time."""
         return self.tau - (delay + lag) * self.change

@@ -90,7 +90,7 @@ class ReplayResidual:
         return np.nan_to_num(error.reshape(count, self.count, -1), nan=1e3, posinf=1e3, neginf=-1e3)
 
     def _means(self, q: np.ndarray) -> np.ndarray:
-        """Return the means (..., S', n) of each `stride` successive rows of q (..., S, n)."""
+        """Return the means (..., S', n) of q (..., S, n) over groups of `stride` successive rows."""
         whole = q.shape[-2] // self._stride
         parts = q[..., : whole * self._stride, :].reshape(*q.shape[:-2], whole, self._stride, q.shape[-1])
         return parts.mean(-2)

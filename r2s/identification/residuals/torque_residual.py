@@ -164,7 +164,7 @@ class TorqueResidual:
         return _Known(standard, d.armature, torque, compensation, d.phi, friction)
 
     def _sign(self, memory: bool, rows: slice) -> np.ndarray:
-        """Return the sign of friction at a slice of the F instants; memory: whether the family has a memory."""
+        """Return the sign of friction at a slice of the F instants; memory: whether the friction law has a memory."""
         if memory:
             return self.motion.bristle[rows]
         dq = self.motion.friction_dq[rows]  # in windows without stops, friction is fully developed

@@ -176,7 +176,7 @@ class StartState:
         return StartState(noise, kernel, np.sqrt(((kernel * size[:, None]) ** 2).sum(-1)).T)
 
     def __call__(self, grid: Recording, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return q, dq (W, n) rad, rad/s at the rows `at` (W,), each at least HALF rows inside its trajectory."""
+        """Return q, dq (W, n) rad, rad/s at the row indices `at` (W,), each HALF rows or more inside a trajectory."""
         rows = at[:, None] + np.arange(STATE_SAMPLES) - HALF
         seen = np.concatenate([grid.q[rows], grid.dq[rows]], 1)
         q, dq = np.einsum("nks,wsn->kwn", self.kernel, seen)

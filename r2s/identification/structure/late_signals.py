@@ -27,7 +27,7 @@ BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether torque is clearly late, "alike": whether to treat torque and dq as equally late}.
 
-    If a fit with corrected dq finds a signal delay of torque that is clearly not 0, torque and dq are corrected.
+    r2s first fits torque with corrected dq. If torque then clearly has a delay, r2s corrects torque and dq.
     Without a clear signal delay, only dq is corrected, if this lowers the error of held-out torque by more than one
     standard error. In all other cases, r2s uses torque and dq as logged and treats torque and dq as equally late.
     """

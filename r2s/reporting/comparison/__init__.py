@@ -1,1 +1,1 @@
-"""Compare trainings over seeds, and adapters over transfers."""
+"""Compare trainings with several seeds, and adapters in several transfers."""

@@ -58,7 +58,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
     score, or nan for fewer than two common seeds. An algorithm with a small `spread` needs little tuning.
 
     Args:
-        grouped: groups of trainings. measure: key of the measure; None: the last of `MeasureTable.selection`.
+        grouped: groups of trainings. measure: key of the measure; None: the last measure of `MeasureTable.selection`.
     """
     table = measures_in(grouped)
     rows, measure = [], measure or table.selection[-1]
@@ -118,7 +118,7 @@ def is_number(value: object) -> bool:
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return one measure of an `improvement_table` as strings: the probability that a row is better than a column."""
+    """Return a square table for one measure of an `improvement_table`: probability that a row beats a column."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}

@@ -37,7 +37,7 @@ class Trained:
         folder, seed, algo: run folder, random seed, name of the algorithm.
         settings: config values that the training used, such as {"algo.lr": 5e-4, "dr.phi_relative": 0.1}.
         alike: config values that comparable runs share, such as {"task.ctrl_hz": 50, "evaluation.episodes": 200}.
-        origin: commit, machine, threads and device from meta.json, or None; of a controller, only the commit.
+        origin: commit, machine, threads and device from meta.json, or None; a controller only has a commit.
         typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether the run used +experiment=toy, a training too short for the policy to learn.
         minutes: budget of the run in minutes; None if the budget is in env_steps.
@@ -144,7 +144,7 @@ def _read(folder: Path) -> Trained:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    """Return commit, machine, threads and device of a run; for a resumed run, the values of all its parts."""
+    """Return commit, machine, threads and device of a run; a resumed run lists the values of all parts."""
     found: dict[str, set[str]] = {key: set() for key in ORIGIN}
     for part in parts_of(json.loads((folder / "meta.json").read_text())):
         git, machine = part["git"] or {}, part["machine"] or {}

@@ -1,4 +1,4 @@
-"""Read finished transfers to an arm from their run folders, and select comparable ones."""
+"""Read the run folders of finished transfers to an arm, and select transfers that are comparable."""
 
 import json
 import os
@@ -52,7 +52,7 @@ class Transferred:
 
 
 def read_transfers(folders: Sequence[str | Path]) -> tuple[list[Transferred], dict[str, str]]:
-    """Read the finished transfers to an arm; return the transfers, and {folder: reason} for all other folders."""
+    """Return the finished transfers to an arm in `folders`, and {folder: reason} for the other folders."""
     found, others = [], {}
     for folder in map(Path, folders):
         why = why_not(folder, "transfer", FILES)

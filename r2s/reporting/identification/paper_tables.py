@@ -27,7 +27,7 @@ BREAKAWAY = "Torque (command plus offset, Nm) at which a resting joint starts to
 
 
 def _listed(rows: Sequence[Value]) -> dict[str, list[str]]:
-    """Return the table columns "old" (nominal), "new" (identified) and "95 % interval" for the values `rows`."""
+    """Return the table columns "old" (nominal), "new" (identified) and "95 % interval" of the values in `rows`."""
     return {
         "old": [number(v.old) for v in rows],
         "new": [number(v.old) if v.kept else v.found for v in rows],

@@ -33,7 +33,7 @@ class _Arm(NamedTuple):
     colour: str
 
     def clocks(self) -> list[np.ndarray]:
-        """Return, for each episode, the times of its logged rows on the timeline, s."""
+        """Return the times of each episode's logged rows on the timeline, s."""
         parts = zip(self.starts, self.episodes, self.frames, strict=False)
         return [start + e.t[f] - e.t[0] for start, e, f in parts]
 
