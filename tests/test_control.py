@@ -16,6 +16,7 @@ from r2s.errors import UserError
 from r2s.learning.vector_arms import VectorArms
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
+from r2s.physics.user_laws import control_address, friction_address
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.track import TrackTask
 
@@ -139,3 +140,19 @@ def test_computed_torque_needs_a_trajectory():
     for settings in ({"residual": 0.0}, {"bandwidth": -1.0}, {"feedback_hz": 2000}):
         with pytest.raises(UserError, match=next(iter(settings))):
             computed_torque(PANDA, TRACK, NEW, **settings)
+
+
+def test_a_law_that_numba_cannot_compile_is_one_line():
+    """The error names the law and numba's cause; a friction law also returns its slope."""
+
+    def opens(q, dq, command, parameters, memory, out):
+        open("file")  # noqa: SIM115
+
+    def flat(p, v, h, memory):
+        return p[0]
+
+    for address, law, cause in ((control_address, opens, "global name 'open'"), (friction_address, flat, "unpack")):
+        with pytest.raises(
+            UserError, match=rf"^test_control\.{law.__name__}: numba cannot compile this law: .*{cause}"
+        ):
+            address(law)

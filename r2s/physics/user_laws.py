@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import carray, types
+from numba.core.errors import NumbaError
 from numba.extending import intrinsic, is_jitted
 
 from r2s.compiled import cfunc, njit
+from r2s.errors import UserError
 
 LEAST_ADDRESS = 4096  # no function is in the first page of memory
 DOUBLES, COUNT = types.CPointer(types.float64), types.int64
@@ -80,28 +82,43 @@ def call_friction(address, p, v, h, memory):
 
 
 def control_address(law: Callable) -> int:
-    """Compile a user's control law, once per process, and return its address for `call_control`."""
-    if law not in _compiled:
-        inner = law if is_jitted(law) else njit(law)
+    """Compile a user's control law, once per process, and return its address for `call_control`.
 
-        @cfunc(CONTROL, error_model="numpy")
-        def function(q, dq, n, command, c, parameters, p, memory, k, out):
-            first, rest = (carray(q, (n,)), carray(dq, (n,))), (carray(memory, (k,)), carray(out, (n,)))
-            inner(first[0], first[1], carray(command, (c,)), carray(parameters, (p,)), rest[0], rest[1])
+    Raises:
+        UserError: numba cannot compile the law.
+    """
+    inner = law if is_jitted(law) else njit(law)
 
-        _compiled[law] = function
-    return _compiled[law].address
+    def function(q, dq, n, command, c, parameters, p, memory, k, out):
+        first, rest = (carray(q, (n,)), carray(dq, (n,))), (carray(memory, (k,)), carray(out, (n,)))
+        inner(first[0], first[1], carray(command, (c,)), carray(parameters, (p,)), rest[0], rest[1])
+
+    return _address(law, CONTROL, function)
 
 
 def friction_address(law: Callable) -> int:
-    """Compile a user's friction law, once per process, and return its address for `call_friction`."""
+    """Compile a user's friction law, once per process, and return its address for `call_friction`.
+
+    Raises:
+        UserError: numba cannot compile the law.
+    """
+    inner = law if is_jitted(law) else njit(law)
+
+    def function(p, n, v, h, memory, out):
+        values = carray(out, (2,))
+        values[0], values[1] = inner(carray(p, (n,)), v, h, carray(memory, (1,)))
+
+    return _address(law, FRICTION, function)
+
+
+def _address(law: Callable, signature: Any, function: Callable) -> int:
+    """Return the address of the C function with this signature that calls `law`."""
     if law not in _compiled:
-        inner = law if is_jitted(law) else njit(law)
-
-        @cfunc(FRICTION, error_model="numpy")
-        def function(p, n, v, h, memory, out):
-            values = carray(out, (2,))
-            values[0], values[1] = inner(carray(p, (n,)), v, h, carray(memory, (1,)))
-
-        _compiled[law] = function
+        try:
+            _compiled[law] = cfunc(signature, error_model="numpy")(function)
+        except NumbaError as error:
+            lines = (line.strip(" -") for line in str(error).splitlines())
+            why = next((line for line in lines if line and not line.startswith("Failed in nopython mode")), "")
+            name = f"{law.__module__}.{getattr(law, '__name__', 'law')}"
+            raise UserError(f"{name}: numba cannot compile this law: {why[:200]}") from None
     return _compiled[law].address
