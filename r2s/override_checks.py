@@ -45,7 +45,7 @@ SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweep
 
 
 def extended(words: Sequence[str]) -> list[str]:
-    """Add ++ to overrides of a prior (`identify.prior.*`), because no file in conf/ contains the keys of priors."""
+    """Add ++ to overrides `identify.prior.PARAMETER`, because no file in conf/ contains these keys."""
     return [f"++{w}" if STATED.match(w) else w for w in words]
 
 
@@ -56,7 +56,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
         words: overrides KEY=VALUE and GROUP=OPTION. config_dir: folder of --config-dir. multirun: whether -m is set.
 
     Raises:
-        UserError: an option is unknown or unused, -m is missing for a sweep, or a folder is missing.
+        UserError: an option is unknown or no job reads it, a sweep has no -m, or a folder is missing.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -93,7 +93,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
 def _check_configs(
     configs: Sequence[Any], jobs: Sequence[list[str]], names: Sequence[str], groups: Mapping[str, Any]
 ) -> None:
-    """Check that configs have a known stage, a valid root and correct booleans, and that jobs read each option."""
+    """Check stage, root and booleans of the configs, and that at least one job reads each option in `names`."""
     from hydra import compose
     from omegaconf import OmegaConf
 
@@ -191,7 +191,7 @@ def _check_switches(cfg: Any, names: Sequence[str], defaults: Any) -> None:
 
 
 def check_option(group: str, value: Any, options: Sequence[str]) -> None:
-    """Raise UserError if a group's value is no string; otherwise, Hydra would later print a traceback."""
+    """Raise UserError unless a group's value consists of strings; Hydra would print a traceback for other values."""
     words = value if isinstance(value, list) else [value]
     if not all(isinstance(w, str) for w in words) or not (words or group in OPTIONAL):
         raise UserError(f"{group}: expected one of {choices(options)}, got {value}")

@@ -1,7 +1,7 @@
 """Make, resume and read run folders runs/<stage>/<name>/ with config, provenance, tables and summary.
 
 The status in meta.json is `running` from the start, and remains `running` if the process is killed. A run folder
-receives its final name when the first files are complete. A process that writes in a run folder locks overrides.yaml.
+receives its final name when the first files are complete. A lock on overrides.yaml allows only one process to write.
 """
 
 import csv

@@ -50,7 +50,7 @@ class AdapterContext:
         return apply_correction(self.arm, correction), noise
 
     def gated(self, adapter: Holdable) -> Adapter:
-        """Return the adapter; if the robot has a tool, a `ContactGate` wraps and freezes the adapter in contact."""
+        """Return the adapter; if the robot has a tool, wrap it in a `ContactGate`, which freezes it in contact."""
         if self.robot.tool is None:
             return adapter
         wrench = WrenchObserver(self.robot, self.dynamics)

@@ -10,7 +10,7 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def detect(threshold, floor, state):
-    """Test whether a contact begins or ends; a joint must move, because friction of resting joints hides forces."""
+    """Test whether a contact begins or ends, if any joint moves; friction of resting joints hides forces."""
     x, P, contact = state.x, state.P, state.contact
     square = floor**2
     a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]

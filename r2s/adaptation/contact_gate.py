@@ -1,6 +1,6 @@
 """Freeze an adapter in contact, because adapters treat a contact force as a model error and push against the force.
 
-In contact, the gate returns the torque that the adapter computed REWIND cycles earlier, and freezes the estimate.
+In contact, the gate keeps the torque from REWIND cycles before the contact's detection, and freezes the estimate.
 """
 
 from typing import Protocol

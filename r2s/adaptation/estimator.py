@@ -4,8 +4,8 @@
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A call of the estimator takes about 15 us, or 50 us at the end of a span. The property `now` takes longer and returns
-a physical body, whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1), 2018).
+A call takes about 15 us, or 50 us at the end of a span. The property `now` takes longer; it reports the payload as a
+physical body, whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1), 2018).
 """
 
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ class Estimator:
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Start a motion from rest; a pause of `pause_s` since the last motion increases the estimate's variance."""
+        """Start a motion from rest and keep the estimate; a pause of `pause_s` before the motion adds variance."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None

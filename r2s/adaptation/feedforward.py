@@ -75,7 +75,7 @@ def plausible_payload(x, most, out):
     """Write the inertial parameters (10,) of a payload with estimated mass and center, clipped to the arm's limits.
 
     most: (2,), largest mass in kg, and largest distance in m from the payload frame to the center. The tensor is that
-    of a water ball, because the data hardly determine tensors, and a wrong tensor would feed back the acceleration.
+    of a ball of water, because data hardly determine tensors, and a wrong tensor would feed back the acceleration.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0
@@ -110,7 +110,7 @@ def shrinkage_weights(filter, residual, payload, weight):
 
 @njit(cache=True, error_model="numpy")
 def _estimated_torque(x, state, payload, weight, slow, torque):
-    """Write `weight` times the torque that x predicts to `torque` (n,) Nm; slow: (n, 10), low-pass of `payload_p`."""
+    """Write the weighted torque of x and `payload` to `torque` (n,) Nm; slow: (n, 10), low-pass of `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
         total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j]

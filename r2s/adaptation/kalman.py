@@ -115,7 +115,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Increase the state's variances, at most to the prior's variances, because the payload may change in a pause."""
+    """Increase variances for a pause of `seconds`, at most to the prior's; the payload may have changed meanwhile."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:

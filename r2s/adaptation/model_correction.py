@@ -98,7 +98,7 @@ def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
 def corrected_residuals(
     robot: Robot, arm: ArmModel, correction: ModelCorrection, residuals: list[MomentumResidual]
 ) -> list[MomentumResidual]:
-    """Return the `residuals` of `arm` minus all terms of the correction, including inertia and latency."""
+    """Return residuals and friction of the corrected arm, inertia and latency included, from `residuals` of `arm`."""
     shared, own, y, _ = _columns(robot, arm, residuals)
     terms = own * np.concatenate([correction.joints, correction.inertia, correction.latency], 1)
     y = y - shared @ np.concatenate([correction.links.ravel(), correction.compliance]) - terms.sum(-1)

@@ -1,4 +1,4 @@
-"""Compute an arm's generalized momentum, and its derivatives by a payload's ten inertial parameters; compiled.
+"""Compute an arm's generalized momentum, and its derivatives (columns) by a payload's inertial parameters; compiled.
 
 The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q), without accelerations (De Luca and Mattone, ICRA
 2003). Joint j has the screw axis S_j about the base origin and moves bodies with the total momentum h_j. Then p_j is

@@ -59,7 +59,7 @@ class ResidualState(NamedTuple):
 
 
 class MomentumResidual(NamedTuple):
-    """Residual of n joints at the end of a span, and means of measured signals over the last three spans."""
+    """Residual of n joints at the end of a span; means are over the last three spans."""
 
     y: np.ndarray  # (n,) Nm, the residual
     payload: np.ndarray  # (n, 10), the payload's columns of y
@@ -86,8 +86,8 @@ def update_residual(arm, state, q, dq, tau, out):
     """Process one cycle; return whether a span ended and `out` contains the residual of this span.
 
     Args:
-        arm: model of the arm. state: is updated in place. q, dq: (n,) rad, rad/s, measured in this cycle.
-        tau: (n,) Nm, command sent in this cycle, without gravity. out: `MomentumResidual`, is updated in place.
+        arm: `ArmModel`. state: `ResidualState`, updated in place. q, dq: (n,) rad, rad/s, measured in this cycle.
+        tau: (n,) Nm, command sent in this cycle, without gravity. out: `MomentumResidual`, updated in place.
     """
     counts = state.counts
     momentum(arm, q, dq, state.terms, state.work)

@@ -52,7 +52,7 @@ class Observer:
 
 @njit(cache=True, error_model="numpy")
 def _observe(arm, state, residual, q, dq, tau, share, disturbance):
-    """Process one cycle; update disturbances (n,) Nm: the mean over three spans, and this mean after a low-pass."""
+    """Process one cycle; update `disturbance` (2, n) Nm: mean over three spans, and its low-pass of gain `share`."""
     measured, filtered = disturbance[0], disturbance[1]
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):

@@ -62,7 +62,7 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
 def estimate_recording(
     robot: Robot, estimator: Estimator, recording: Recording, report: Callable[[Estimate], None] | None = None
 ) -> list[Estimate]:
-    """Return the estimate at the end of every span of the recording; pass each estimate to `report`."""
+    """Return the estimate at the end of every span of the recording; pass each one to `report` at once."""
     recording, out = at_rate(robot, recording), []
     for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         estimator.begin(pause_s)

@@ -130,7 +130,7 @@ class WrenchObserver:
 
     @property
     def square(self) -> float:
-        """Squared force, in units of its covariance; a contact begins when this value exceeds `threshold`."""
+        """Squared force, in units of its covariance; a contact begins once it exceeds `threshold` for 15 ms."""
         return float(self._state.contact[SQUARE])
 
     @property
@@ -161,7 +161,7 @@ def observe_recording(
     """Return a table with one row per millisecond: wrench, half widths of its 95 % intervals, contact, tip position.
 
     Args:
-        estimator: estimates the payload, whose effect the observer removes from the wrench. Tool contacts freeze it.
+        estimator: estimates the payload, whose effect is subtracted. With a tool, contact freezes this estimate.
         report: called with each new estimate of the payload.
     """
     recording = at_rate(robot, recording)
@@ -205,7 +205,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why rate or length make the recordings unfit for `contact_threshold`; None if they are fit."""
+    """Return why rate or length makes the recordings unfit for `contact_threshold`; None if they are fit."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]

@@ -239,7 +239,7 @@ def _keep_within_edges(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _update(state, gain, innovation, variance):
-    """Correct the state by a scalar measurement; the gradient of the measurement by the state is `gain` (N,)."""
+    """Correct the state by a scalar measurement whose gradient with respect to the state is `gain` (N,)."""
     x, P, column = state.x, state.P, state.column
     N = len(x)
     total = variance

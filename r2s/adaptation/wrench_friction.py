@@ -147,7 +147,7 @@ def side_variance(noise, joints, j):
 
 @njit(cache=True, error_model="numpy")
 def holding_friction(state, j, gain):
-    """Return joint j's friction at rest, Nm, and set `gain` (N,) to the gradient of this friction by the state x."""
+    """Return joint j's friction at rest, Nm; write its gradient with respect to the state to `gain` (N,)."""
     x, joints, J = state.x, state.joints, state.jacobian
     n = joints.shape[1]
     w = len(x) - 2 * n

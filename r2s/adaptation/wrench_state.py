@@ -26,7 +26,7 @@ class WrenchNoise(NamedTuple):
     """Uncertainties that the wrench filter assumes: friction of n joints, inertia, sensor noise, and force."""
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a joint in motion
-    edges: np.ndarray  # (n, 2) Nm, breakaway torque of each joint in the negative and the positive direction
+    edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway torque: at rest, friction stays between them
     presliding: np.ndarray  # (n,) rad, decay length of presliding; 0: a joint sticks until it breaks away
     inertia: float  # inertia error as a share of a joint's net torque
     speed: float  # rad/s, white noise of measured speeds

@@ -60,7 +60,7 @@ class CommandLoop:
         self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
 
     def place(self, q: np.ndarray) -> ArmState:
-        """Move the arm to rest at q (n,) rad and begin a motion there; raise ArmStopped as `Arm.move_to` does."""
+        """Move the arm to q (n,) rad and begin a motion from rest there; raise ArmStopped as `Arm.move_to` does."""
         self._check_request()
         self._reset()
         try:
@@ -86,7 +86,7 @@ class CommandLoop:
         """Run one cycle and return the state of the next one.
 
         Args:
-            command: (c,), input of the control law; None: no new command. hold: (n,) Nm, compensation of a payload.
+            command: (c,), input of the control law; None: no new command. hold: (n,) Nm, see `DriverBatch.__call__`.
 
         Raises:
             StopRequested: a stop was requested, and the driver has brought the arm to rest.
@@ -161,9 +161,9 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return the reason if the driver or the arm itself had already begun a stop, else None.
+        """Stop the arm; return the reason if the driver was stopping it or it stops itself meanwhile, else None.
 
-        A driver with a push limit first holds or releases a contact, as in any stop (r2s/physics/contact_stop.py).
+        A driver with a push limit first handles a contact force, as in any stop (r2s/physics/contact_stop.py).
         """
         reason = None if self._ended else self.driver.stopping
         if reason is not None:

@@ -46,7 +46,7 @@ class Memory(NamedTuple):
         held: (m, n) Nm, last sum of adapter torque and `Given.hold`, which a stop without contact still applies.
         share: (m,), factor on the allowed speeds, which is 1 in a motion and decreases in a stop (`_brake`).
         cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, and the stop's start.
-        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), number of cycles changed by the safety filter.
+        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the filter changed a torque.
         rests: (m,), whether each arm is at rest. commanded: (m,), whether each arm has received a command.
         least: (m, K) m, smallest allowed distances between the bodies of the fence's K pairs.
         push: (m, COLUMNS), parameters and state of the push limit (push_limit.py); (m, 0): no push limit.
@@ -84,7 +84,7 @@ class Given(NamedTuple):
     """Inputs of the driver of m arms in one cycle.
 
     command: (m, c), commands, used if `new` is True. added: (m, n) Nm, adapter torques, used if `adds` is True.
-    hold: (m, n) Nm, compensation that a stop still applies. contact: (m,), whether each arm is in contact.
+    hold: (m, n) Nm, part of the target that a stop still applies. contact: (m,), whether each arm is in contact.
     """
 
     command: np.ndarray
@@ -193,7 +193,7 @@ def _kinematics(model, q):
 def _brake(i, seen, arm, bounds, model, memory):
     """Set the target torque of arm i in a stop, and lower the allowed speeds from the present speed toward zero.
 
-    A stop with code SILENT, LAW_NOT_FINITE or REQUESTED first holds or releases a contact (`stop_torque`).
+    Only a stop with code SILENT, LAW_NOT_FINITE or REQUESTED handles a contact force (`stop_torque`).
     """
     needs, why = 0.0, memory.why[i]
     memory.target[i] = 0.0
@@ -214,8 +214,8 @@ def drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
-        q, dq: (m, n) rad, rad/s, measured. applied: (m, n) Nm, torques of the last cycle. given: driver inputs.
-        bounds: driver settings. control: number and parameters of the control law. memory: state, updated in place.
+        q, dq: (m, n) rad, rad/s, measured. applied: (m, n) Nm, torques of the last cycle. given, bounds, model: see
+            the classes. control: number and parameters of the control law. memory: `Memory`, updated in place.
     """
     out, (m, n) = np.empty_like(memory.sent), q.shape
     number, parameters = control

@@ -1,10 +1,10 @@
 """The driver: once per millisecond it computes, from a policy's command, a torque that respects the arm's limits.
 
-Each cycle checks that the command is finite and recent (watchdog). The target torque then passes the control law
-(r2s/physics/control_laws.py), soft start and low-pass, the adapter, which adds a torque (r2s/adaptation/adapter.py),
-the safety filter of the training (r2s/physics/safety_filter.py), and a limit on the change from the torque that
-the arm applied in the last cycle. The driver has no clock and no connection to an arm: states and commands are its
-only inputs, so tests can run the driver on a million adversarial inputs.
+Each cycle checks that the command is finite and recent (watchdog). The control law (r2s/physics/control_laws.py)
+computes a target torque, which passes soft start and low-pass. The torque of an adapter (r2s/adaptation/adapter.py)
+is added. The same safety filter as in training (r2s/physics/safety_filter.py) limits the sum; finally, the
+change from the torque that the arm applied in the last cycle is limited. The driver has no clock and no connection to
+an arm: states and commands are its only inputs, so tests can run it on a million adversarial inputs.
 
 `DriverBatch` drives many arms in lock-step; `Driver` drives one arm.
 """
@@ -128,7 +128,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, torque in a stop: compensation, plus the contact torque if the stop holds a contact."""
+        """(m, n) Nm, torque that a stop still applies: compensation, plus contact torque if it holds a contact."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -265,7 +265,7 @@ class Driver:
 
         Args:
             state: the arm's state in this cycle. command: (c,), input of the control law; None: no new command.
-            added: (n,) Nm, torque of the adapter; None: no adapter. hold: (n,) Nm, compensation of a payload.
+            added: (n,) Nm, torque of the adapter; None: no adapter. hold: (n,) Nm, see `DriverBatch.__call__`.
         """
         given, more, kept = (None if x is None else x[None] for x in (command, added, hold))
         contact = np.array([state.in_contact])

@@ -20,7 +20,7 @@ class ArmStopped(RuntimeError):  # noqa: N818 (a stop is not a bug)
     """Error: the motion has ended, for the reason in the message; the next `move_to` begins a new motion.
 
     Attributes:
-        recording: the motion recorded before the stop; None if it is too short.
+        recording: the motion recorded before the stop; None if nothing, or too little, was recorded.
     """
 
     recording: Recording | None = None
@@ -51,7 +51,7 @@ class ArmState:
         control_command_success_rate: share of the last 100 commands that reached the arm; 0 while no motion runs.
         O_T_EE: (16,), pose matrix of the end effector in the base frame, column by column.
         m_ee, m_load: kg, masses of end effector and load that the arm's gravity compensation assumes.
-        box: (6,), pose of a box, measured by a camera in the base frame: center, m, and direction of the first axis.
+        box: (6,), pose of a box in the base frame, measured by a camera: center, m, and direction of the first axis.
     """
 
     t: float
@@ -133,8 +133,8 @@ class Operated(Protocol):
     Attributes:
         operator: function that asks the operator, given the reason of the stop, and returns whether the arm may move.
             Without an operator (None), the arm may not move again after a stop.
-        blocked: reason of a stop that the operator has not yet cleared; None: no such stop. Code that stops the arm
-            must write the reason to `blocked`.
+        blocked: reason of a stop about which `move_to` must first ask the operator; None: no such stop. Code that
+            stops the arm's motion must write the reason to `blocked`.
     """
 
     operator: Callable[[str], bool] | None

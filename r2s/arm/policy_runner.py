@@ -34,7 +34,7 @@ class Stop:
     """Why an episode ended early.
 
     Attributes:
-        episode: number from 0. when: time of the stop, or "on the way to its start". reason: reason of the stop.
+        episode: number from 0. when: time in the episode, or "on the way to its start". reason: reason of the stop.
         log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, command Nm.
     """
 
@@ -210,7 +210,7 @@ class PolicyRunner:
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
     """Compute smooth joint speeds (k, n) rad/s in every `every`-th cycle, from the angles (n,) rad of all cycles.
 
-    Each speed is the slope of a parabola fitted over 2 SMOOTHING_CYCLES + 1 cycles (Savitzky and Golay, 1964).
+    A speed is a parabola's slope over SMOOTHING_CYCLES on each side (Savitzky and Golay, Anal. Chem. 36(8), 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:
@@ -220,7 +220,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Convert an `ArmState`, the effort (n,) Nm, stop flag and filter rate to a `State`, a batch of one arm."""
+    """Convert an `ArmState`, effort (n,) Nm, stop flag and share of filtered cycles to a `State` of one arm."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],

@@ -47,7 +47,7 @@ def press_plan(
     point: Sequence[float] | None = None,
     normal: Sequence[float] | None = None,
 ) -> PressPlan:
-    """Return the task for recording presses on a plane: point (3,) m within 5 mm, normal (3,) within 5 degrees.
+    """Return the plan for a plane whose point (3,) m and normal (3,) are known within 5 mm and 5 degrees.
 
     Raises:
         UserError: the robot has no tool, or the plane is invalid.

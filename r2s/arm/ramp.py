@@ -94,7 +94,7 @@ def ramp(
     # all joints in one direction, then in the other, so that each joint rests in between
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
-    # the ramp of a joint in motion starts at the command that stopped it; 2 * most bounds the unknown friction
+    # the ramp of a joint that slid starts at the command that stopped it; 2 * most bounds the unknown friction
     most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
     timing = timing or Timing()
     how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot), "speed_share": speed_share(arm)}

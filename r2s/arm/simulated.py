@@ -15,13 +15,13 @@ class SimulatedArm:
 
     Attributes:
         external: (n,) Nm, external joint torque that acts from the next cycle on; zero by default.
-        declared_payload: payload in the arm's gravity compensation.
+        declared_payload: payload that the arm's gravity compensation assumes.
 
     Args:
         robot: the arm. dynamics: its true dynamics.
         position_noise, velocity_noise: standard deviations of white noise on q, rad, and dq, rad/s.
         seed: random seed of the noise.
-        payload: carried body and its attachment times. declared_payload: payload in the arm's gravity compensation.
+        payload: carried body and its attachment times. declared_payload: payload that gravity compensation assumes.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class SimulatedArm:
         return self._state
 
     def command(self, tau: np.ndarray) -> None:
-        """Apply the command tau (n,) Nm, without gravity, for 1 ms; raise ArmStopped after a reflex."""
+        """Apply tau (n,) Nm, without gravity, for 1 ms; raise ArmStopped if a real arm would stop itself."""
         self._reflexes.command(tau, self._last)
         self._update_payload()
         self._last = np.array(tau, dtype=float)

@@ -22,7 +22,7 @@ GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s eac
 
 
 class _Request:
-    """The stop request of this process, with `ending` while a motion stops, `served` once this motion has ended."""
+    """The stop request of this process; `ending`: a motion is stopping for it; `served`: no motion runs any more."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -49,7 +49,7 @@ def begin_ending() -> None:
 
 
 def serve() -> None:
-    """Record that the motion has ended on request; from now on, a signal raises KeyboardInterrupt at once."""
+    """Record that no motion runs after the request; from now on, a signal raises KeyboardInterrupt at once."""
     _request.ending, _request.served = False, True
 
 
@@ -74,7 +74,7 @@ def pipeline() -> int | None:
 
 
 def _follow(parent: int, over: threading.Event) -> None:
-    """Send SIGTERM to this process if the process `parent` ends before the event `over` is set."""
+    """Send SIGTERM to this process if `parent` is not, or no longer, its parent before the event `over` is set."""
     while not over.wait(FOLLOW_S):
         if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -96,16 +96,16 @@ def handled_signals(
 ) -> Iterator[None]:
     """Convert each signal of SIGNALS to a stop request while an arm is open in this process.
 
-    If no motion is stopping GRACE_S after the request, the main thread gets a KeyboardInterrupt, and this context
-    raises `Stopped` with the signal's name. If its block ends before the request has stopped a motion, the context
-    also raises `Stopped`, because later code may move the arm. The context acts only in the main thread.
+    If no motion has responded GRACE_S after the request, the main thread gets a KeyboardInterrupt, and this context
+    raises `Stopped` with the signal's name. If its block ends before a motion has responded, the context also raises
+    `Stopped`, as later code may move the arm. Outside the main thread it does nothing: Python allows no handlers.
 
     Args:
         forward: function that the signal handler calls with each signal's number.
         parent: pid of the parent process, whose end acts like SIGTERM; None: no process is watched.
 
     Raises:
-        Stopped: a signal arrived between motions.
+        Stopped: a signal arrived while no motion ran.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

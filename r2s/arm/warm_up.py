@@ -52,10 +52,10 @@ def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = No
     """Run the code of the 1 kHz loop on a mock arm, so that numba compiles the code.
 
     Call this function in the process that will drive the arm, before the arm is opened. The mock arm runs recordings
-    and a ramp and, if there is a task, an episode with a copy of the adapter.
+    and ramps and, if there is a task, an episode with a copy of the adapter.
 
     Raises:
-        Exception: the adapter raised this exception.
+        Exception: any exception that the adapter raises.
     """
     rest = np.zeros((CYCLES, robot.n))
     still = Excitation(SIM_DT * np.arange(CYCLES), robot.q_home + rest, rest, rest)

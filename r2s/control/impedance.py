@@ -2,7 +2,7 @@
 
 r2s/physics/impedance_laws.py contains the control laws; this module computes their parameters from arm, task and
 model. Default values scale with the arm: a spring's force is a share of the torque limit divided by the lever arm at
-home, and a spring's stiffness is this force divided by a distance. The loop's latency limits a spring's stiffness.
+home, and a spring's stiffness is this force divided by a distance, or less if the loop's latency requires it.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from r2s.physics.newton_euler import COM, LINK, MASS, links_of
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 
 ACTIONS = ("target", "stiffness", "both")
-# the springs' share of the force that the torque limit allows in the home posture; the rest: damping, feedforward
+# the springs' share of what the torque limit allows in all directions at home; the rest: damping, feedforward
 CLIP = 0.7
 CLIP_M = 0.05  # m, error at which the default spring saturates
 
@@ -46,12 +46,12 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Number of values in a setpoint: the target, 6 values of the contact if `hybrid`, and 3 if `slides`."""
+        """Number of values: target; if `hybrid`, normal (3), force, measured force, flag; if `slides`, pull (3)."""
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
     def slides(self) -> bool:
-        """Whether the task moves its target along a surface; the setpoint then ends with the force `task.pull`."""
+        """Whether the task moves its target along a surface; the setpoint then ends with `task.pull` (3,) N."""
         return bool(self.hybrid and self.parameters[law.APPROACH] == law.SLIDES)
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ class Impedance(Controller):
         return self.model(q[None], still, still, still)[0]
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s): the task's target; hybrid control appends the contact, measured force 0."""
+        """Return the setpoints (m, s): the target; for hybrid control also the contact, without a measured force."""
         if not self.target_size:
             return np.empty((len(t), 0))
         if self.law is joint_impedance_law:
@@ -167,15 +167,15 @@ def cartesian_impedance(
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
         displacement, rotation: m and rad, shift and rotation of the target by an action of 1.
         stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less so as not to exceed `fastest_spring`.
-        rotational_stiffness: Nm/rad, largest rotational stiffness; 0: the orientation is free.
+        rotational_stiffness: Nm/rad, largest; 0: the orientation is free, and only the null-space springs act on it.
         force_clip: N, largest spring force at the largest stiffness, at most the force F that the torque limit allows
             in all directions in the home posture; None: CLIP F. moment_clip: Nm, largest spring moment, likewise.
         null_stiffness: 1/rad, each joint's null-space stiffness towards home as a multiple of its torque limit.
         hybrid: whether a force acts along a surface normal, and the impedance only across this normal. An action
             that displaces the target against the normal adds a force stiffness * displacement. If `task.approaches`,
             the target moves into the surface; the spring limits the force, so the tip is no faster than the target.
-        normal: (3,), surface normal in the base frame. force: N, force against the normal. None: the task's contact.
-        integral_rate: 1/s, integral gain of the force error. integral_max: integral's limit, a share of force_clip.
+        normal: (3,) in the base frame, out of the surface. force: N, against the normal. None: the task's contact.
+        integral_rate: 1/s, integral gain on a measured force error. integral_max: largest integral over force_clip.
 
     Raises:
         UserError: the task has no target or contact, or a setting is out of its range.
@@ -263,7 +263,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Return `value`, checked; None: CLIP times the most that `limit` allows in the home posture."""
+    """Return the force or moment `value`, checked; None: CLIP times what `limit` allows in all directions at home."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most
@@ -290,7 +290,7 @@ def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _action(
     action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an action's scale and offset, and write the action's position in a command to `parameters`."""
+    """Return an action's scale and offset, and write the action's indices in a command to `parameters`."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
     parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]

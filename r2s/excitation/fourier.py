@@ -1,9 +1,9 @@
 """Design an excitation: a finite Fourier series that the arm follows at several speeds.
 
-The choice of a series by the determinant of its information matrix (D-optimality) follows Swevers et al., IEEE T-RA
-13(5), 1997. A prior prevents unidentifiable quantities from dominating the determinant. Only motion at several speeds
-determines friction curves and delay. So the motion consists of rungs, which are sections of the series at 10 % to
-100 % of full speed; the arm rests between rungs. Slow rungs also run backwards, so that joints reverse at low speed.
+The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
+T-RA 13(5), 1997. A prior prevents unidentifiable quantities from dominating the determinant. Only motion at several
+speeds determines friction curves and delay. So the motion consists of rungs: sections of the series at 10 % to 100 %
+of full speed, with rests between them. Slow rungs also run backwards, so that joints reverse at low speed.
 """
 
 from collections.abc import Callable
@@ -43,13 +43,13 @@ SHORTEST_S = 4.0  # s, minimum fundamental period
 RANGE = 0.8  # share of the distance from the center to the nearer position limit, or of pi rad if that is less
 SPEED = 0.65  # share of dq_max
 ACCELERATION = 0.7  # share of ddq_max
-STUCK_S = 0.12  # s for which a light joint may stick at a reversal; after this time the joint moves faster
+STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then the joint catches up at a higher speed
 # Search.
 DRAWS = 12  # random series
 KEPT = 3  # number of safe random series; the search starts from the best of these
 TRIES = 5  # candidates per step of the local search
 MIN_AMPLITUDE = 0.3  # share of a joint's largest amplitude; a series that is safe only below this share is dropped
-MARGIN = 0.3  # least `_safety` (share of a clearance, 0.03 of tau_max), a reserve for motion between two samples
+MARGIN = 0.3  # least `_safety`: 0.3 of a clearance and 0.03 of tau_max, a reserve for motion between two samples
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
 FINE = 10  # number of samples for limits per sample for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
@@ -73,7 +73,7 @@ def fourier(
 
     A random series uses up to 80 % of the position range, 65 % of the velocity limit and 70 % of the acceleration
     limit, and less near obstacles. A local search changes the series to increase the motion's `information`. The
-    motion is shorter than the period of the series, so no part repeats. Equal arguments produce equal motions.
+    series ends before its period, so the motion does not repeat itself. Equal arguments produce equal motions.
 
     Args:
         robot: limits, links and nominal model.

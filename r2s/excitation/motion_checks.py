@@ -177,8 +177,8 @@ class Space:
     an arm stops beyond its `DeviationLimits`, which depend on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, smallest required distances, first between end effector and z_min, then between links and
-            table, last between geoms of pairs. For the end effector, `gaps` requires 0 m; fourier.py uses the value.
+        clearance: (K,) m, smallest required distances: end effector above z_min (only a scale for fourier.py, since
+            `gaps` requires 0 m), then links above the table, then between the geoms of each pair.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -260,7 +260,7 @@ class Space:
         return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
-        """Raise UserError if a posture in q (T, n) rad has a gap below 0; `when(k)` is the error text for row k."""
+        """Raise UserError if a posture in q (T, n) rad has a gap below 0; `when(k)` describes row k."""
         gaps = self.gaps(q)
         bad = np.argwhere(~(gaps >= 0))
         if len(bad):

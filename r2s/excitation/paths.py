@@ -19,8 +19,8 @@ SAME = 1e-3  # rad, a joint this close to its target need not move
 def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, space: Space) -> np.ndarray:
     """Return the first candidate path (k, n) rad from q_from to q_to without `path_violation`.
 
-    The candidates are the straight line, two straight lines through q_home, two paths that move one joint at a time
-    (from the last or from the first joint on), and two paths through q_home that move one joint at a time.
+    The candidates are the straight line, one path of two lines through q_home, two paths that move one joint at a
+    time (from the last or from the first joint on), and two paths through q_home that move one joint at a time.
 
     Args:
         robot: limits and links.

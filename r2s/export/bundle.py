@@ -126,7 +126,7 @@ def check_with_own_runtime(folder: Path) -> None:
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
-    """Copy policy.onnx; compare its actions with those of policy.pt, and its metadata with the contract."""
+    """Copy policy.onnx, and check that its actions equal those of policy.pt and its metadata equal the contract."""
     import onnx
     from onnx.reference import ReferenceEvaluator
 

@@ -183,7 +183,7 @@ def controller(control: Controller, task: Task) -> dict[str, Any]:
 
 
 def links_of(robot: Robot, dynamics: Dynamics) -> list[dict[str, Any]]:
-    """Return each link's joint pose and axis, mass, center of mass and inertia tensor at the joint angle zero."""
+    """Return each link's joint pose and axis at angle zero, and mass, center of mass and tensor in the link frame."""
     out = []
     for k in chain(robot, dynamics, friction=False)[0]:
         row: dict[str, Any] = {"place": k.origin[:3, 3], "frame": k.origin[:3, :3], "axis": k.axis}

@@ -108,7 +108,7 @@ class Model:
 
 
 class Driver:
-    """Run control law, low-pass and safety filter; a call returns a torque command within the arm's limits.
+    """Run control law, low-pass and safety filter; one call per cycle returns a torque within the arm's limits.
 
     Attributes:
         effort: (n,) Nm, the target torque after the low-pass. stopping: why the driver stops the arm, or None.
@@ -228,7 +228,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within all limits nearest to `effort`, and whether the two differ."""
+        """Return the torque (n,) Nm within all limits nearest to `effort`, and whether a limit changed it."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -282,7 +282,7 @@ class Driver:
         return speed
 
     def _stops(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the torques (n,) Nm that keep ddq between `low` and `high`, found by block principal pivoting."""
+        """Return the torques (n,) Nm to add so that ddq stays in [low, high], found by block principal pivoting."""
         c = self._number
         side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))
         push = np.zeros_like(ddq)

@@ -61,7 +61,7 @@ class Follower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return {name: values} for the observation of a control step, and the controller's `setpoint`.
+        """Return {name: values} for a control step's observation (`goal`: reference position), and the `setpoint`.
 
         After the last step the reference remains at the end of the path.
 

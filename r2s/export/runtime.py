@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Raise BundleError if start or first goal is outside the training's region; at a later one, stop the arm."""
+        """Raise BundleError if start or first goal is outside the training's region; if a later goal is, stop."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)
@@ -233,8 +233,8 @@ class Runtime:
     def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the plan of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2; call only between motions.
 
-        The time between two rows is one control step. The motion must begin and end at rest. The policy follows the
-        first `steps` + 1 rows. The policy also observes some later rows; near the end, these are the additional rows.
+        The time between two rows is one control step. The motion must begin and end at rest. The path is the
+        first `steps` + 1 rows; further rows follow, one for each row that the policy previews.
 
         Raises:
             BundleError: the policy's goals are points or plans on a surface, or the motion has a wrong shape.

@@ -58,7 +58,7 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
     """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,) s.
 
-    The integral of the squared autocorrelation bounds the correlation time even if residual times slope oscillates.
+    It is the integral of the squared autocorrelation, an upper bound even if residual times slope oscillates.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))

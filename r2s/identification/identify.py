@@ -84,7 +84,7 @@ class State:
         robot, nominal, recording, searches, settings, ramps: see `identify`. `select_family` sets nominal.family.
         prior: {parameter: prior standard deviation in SI units}. terms: model terms to estimate besides friction.
         families: {friction family: prediction error of held-out torque}; empty if the user chose the family.
-        space: the parameter space; `fit_breakaway` adds breakaway commands, and `fit_stiction` a stiction model.
+        space: the parameter space; `fit_breakaway` and `fit_stiction` add their breakaway and stiction values.
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
         edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
             sliding, only for friction families with a Stribeck effect.
@@ -130,7 +130,7 @@ class State:
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Return the arm's motion after breakaway; None without ramps, without Stribeck effect, or with bristles."""
+        """Return parameters of motion after breakaway; None without ramps or Stribeck effect, or with bristles."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)

@@ -27,8 +27,8 @@ class Known:
     """A normal distribution of named values, which a problem uses as an `ExtraResidual`.
 
     Attributes:
-        names: names of the K values, such as coulomb[2]. mean: (K,) mean values in SI units, or their logarithms.
-        covariance: (K, K), with drift. drift: (K,) standard deviation of the drift between the two dates.
+        names: K names such as coulomb[2]. mean: (K,) in SI units; for logarithmic parameters, mean of the logarithm.
+        covariance: (K, K), with drift. drift: (K,) standard deviation of the drift between the dates, or 0.
     """
 
     names: tuple[str, ...]
@@ -78,7 +78,7 @@ class Known:
 
 
 def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[float, str]:
-    """Return the largest deviation of x (P,) from the prior, in standard deviations, and the name of that value.
+    """Return the largest deviation of x (P,) from the prior, in standard deviations, and the worst value's name.
 
     Deviations are measured along the principal axes of the prior's correlation matrix.
     """

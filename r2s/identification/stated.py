@@ -15,7 +15,7 @@ from r2s.physics.friction import family, known_families
 
 Stated = Mapping[str, Mapping[str, Any]]  # {"coulomb": {"mean": [3.1, None, 2.0], "width": 0.2}, ...}
 KEYS = ("mean", "width", "fixed")
-TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to the width of its usual bounds
+TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to the width of its original bounds
 
 
 def check_stated(stated: Stated, n: int | None = None) -> None:

@@ -77,7 +77,7 @@ class Unexplained:
         return out
 
     def gravity_shares(self) -> np.ndarray | None:
-        """Return the share of nominal gravity torque that tau contains, per joint whose motion determines it."""
+        """Return the share of nominal gravity torque in tau, for joints whose motion determines it, or None."""
         inertial = self.inverse_dynamics(False)
         weight, shares = self.inverse_dynamics(True) - inertial, []
         for j in self.seen:
@@ -113,7 +113,7 @@ class Unexplained:
 
 
 def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for each different joint order, such as alphabetical, of tau and of all signals."""
+    """Return (misfit, message) for joint orders of tau or of all signals: by name, rotated, reversed, swapped."""
     robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}
@@ -141,7 +141,7 @@ def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for each link that fits tau only if one factor scales its mass and inertia."""
+    """Return (misfit, message) for each link that needs a different mass, with moments scaled by the same factor."""
     robot, m, out = left.robot, left.m, []
     y = regressor(robot, m.q, m.dq, m.ddq, robot.gravity if gravity else None)
     standard, names = LinkInertia(robot.mass, robot.com, robot.inertia).standard(), robot.model(gravity=False)

@@ -146,7 +146,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints whose motion fits columns of different joints far better, with these columns, or None."""
+    """Return joints that other columns fit far better, and these columns, or None; pairs: as `Unexplained.pairs`."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():

@@ -136,7 +136,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
             UserError: the actions have a wrong shape, or an episode has ended and automatic resets are disabled.
             FloatingPointError: an action is not finite.
         """
-        waiting = self.ended.copy()  # arms that the mode NextStep resets in this step, without a result
+        waiting = self.ended.copy()  # arms that the mode NextStep resets in this step; their result is dropped
         if waiting.any() and self.mode == AutoresetMode.DISABLED:
             raise UserError(f"step: the episode of arm {waiting.argmax()} has ended; reset it first")
         action = np.asarray(actions, dtype=np.float32)

@@ -104,7 +104,7 @@ class Learner(nn.Module, ABC):
         """Take one gradient step and return detached scalars to log.
 
         Args:
-            batch: B transitions; observation, next_observation (B, d) in SI units; action (B, a); reward, terminated.
+            batch: observation, next_observation (B, d) in SI units; action (B, a); reward, terminated (B,).
         """
 
     def gradients(self, batch: Mapping[str, Tensor], *noise: Any) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
@@ -151,7 +151,7 @@ class Learner(nn.Module, ABC):
         """Compile the losses and their gradient for a batch size, before the first update.
 
         Compilation takes half a minute on one core, or some seconds with a cached result. On a GPU, torch also
-        captures a CUDA graph. If compilation fails (no C++ compiler), r2s warns and uses the uncompiled losses.
+        captures a CUDA graph. If compilation fails (e.g. no C++ compiler), r2s warns and uses the uncompiled losses.
 
         Returns:
             Whether the losses are compiled.
@@ -274,7 +274,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Change the target entropy as the entropy of a Gaussian with standard deviations multiplied by `share`."""
+        """Shift the target entropy as a Gaussian's entropy shifts if `share` multiplies its standard deviations."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 

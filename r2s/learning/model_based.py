@@ -1,6 +1,6 @@
 """Model-based baselines: minimum-jerk joint motion, computed torque, friction compensation.
 
-Baselines have the interface, observations and rate of a policy. Baselines use the center of the randomization.
+Baselines have the interface, observations and rate of a policy, and use the model at the center of the randomization.
 """
 
 import mujoco

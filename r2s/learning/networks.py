@@ -57,7 +57,7 @@ class Policy(nn.Module):
 
     Args:
         normalizer, actor: networks. scale, offset: (a,), convert actions from [-1, 1] to SI units, offset + scale x
-            action, as in `r2s.control.controller.Controller`; without an offset, the offset is 0.
+            action, as in `r2s.control.controller.Controller`; an offset of None means 0.
     """
 
     action_scale: Tensor
@@ -74,7 +74,7 @@ class Policy(nn.Module):
         return self.actor.mode(self.normalizer(observation))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return actions in SI units; with control=torque, target torques in Nm without gravity."""
+        """Return actions in SI units; for control=torque, Nm without gravity, before low-pass and safety filter."""
         return self.action_offset + self.action(observation) * self.action_scale
 
 

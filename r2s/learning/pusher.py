@@ -24,7 +24,7 @@ NEAR = 0.012  # m, lateral error of the tip in front of a face, below which the 
 WAY = 0.4  # 1/m, cost of a face point per m from the tip to this point, relative to the steepest possible descent
 DONE = 0.008  # m, error below which the pusher stops
 SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, between pushes; m, error below which a push slows
-GAIN = 0.25  # tip speed feedback over damping of the impedance law; 25 Hz and the latency allow little more
+GAIN = 0.25  # gain of the tip speed feedback / damping of the impedance law; 25 Hz and the latency allow little more
 
 
 class Pusher:

@@ -1,4 +1,4 @@
-"""Domain randomization: random dynamics around nominal ones, with physically valid inertia tensors of all links."""
+"""Domain randomization: random dynamics around a center, with physically valid inertia tensors of all links."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,14 +30,14 @@ class UniformRandomization:
 
     Each friction parameter phi is center * U(1 - phi_relative, 1 + phi_relative); the paper uses phi_relative = 0.10.
     Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws
-    are independent. A drawn tensor that violates the triangle inequality, as can happen for a slender link, is drawn
-    again. With inertia_relative = 0.05, 100 % of the draws are valid for the Panda's links 4 and 7, 47 to 63 % for
+    are independent, so some tensors belong to no body (see `physical`), mainly those of slender links; they are drawn
+    again. With inertia_relative = 0.05, all draws are valid for the Panda's links 4 and 7, 47 to 63 % for
     links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate I_xx and I_yy of
     link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Each tensor element still spans its full +-5 %.
 
     Attributes:
         robot: the arm.
-        center: nominal dynamics of the arm, without a batch dimension.
+        center: dynamics at the center of the ranges, without a batch dimension.
         phi_relative, inertia_relative: half widths of the ranges, relative to the center; 0: no variation.
         payload: [least, most] kg, range of each arm's payload, see `with_payloads`; None: no payload.
 
@@ -113,7 +113,7 @@ class ForceRandomization:
     this torque acts on the joint itself, so the safety filter does not change this torque.
 
     Attributes:
-        robot: the arm. center: nominal dynamics of the arm, without a batch dimension.
+        robot: the arm. center: dynamics of the arm, without a batch dimension.
         share: largest torque, relative to the joint's friction level `Dynamics.level`.
 
     Raises:

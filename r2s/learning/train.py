@@ -73,7 +73,7 @@ class Loop:
             initial value.
         explore_end: ratio of final to initial exploration noise, which falls geometrically over the budget.
         eval_env_steps: env steps between two evaluations; a training ends with one more evaluation.
-        compile: whether to compile the losses, within the budget. concurrent: whether arms step in a separate thread.
+        compile: compile the losses first, within the budget. concurrent: step the arms in a separate thread.
         matmul: precision of float32 matrix products in updates, for torch.set_float32_matmul_precision: "medium"
             allows bfloat16 factors; "auto" selects the result of `fastest_matmul`.
 
@@ -145,7 +145,7 @@ def train(
         evaluate: function that runs a policy and returns `Episodes`, see r2s/learning/evaluate.py.
         loop, budget: settings of the training loop, and length of the training.
         demonstrator: source of the actions in the first loop.learning_starts env steps; None: uniform random actions.
-        checkpoint: `Checkpoint` to which every evaluation saves the training; a saved training resumes.
+        checkpoint: saves the training after every evaluation but the last; a saved training resumes. None: no saving.
         callbacks: functions that receive logs and progress.
 
     Raises:
@@ -181,7 +181,7 @@ class Training:
     """State of a training: arms, learner, replay buffer and counters; the arguments are those of `train`.
 
     Attributes:
-        env_steps, updates: numbers of env steps and updates so far. next_eval: env_steps at the next evaluation.
+        env_steps, updates: numbers so far. next_eval: value of env_steps from which the next evaluation is due.
         factor: `Reward.factor`, then the last result of `Reward.adapt`. evaluation: last row of evaluations.csv.
     """
 

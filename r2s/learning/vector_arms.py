@@ -19,14 +19,14 @@ class VectorArms:
     """Simulate `width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
     Each ms of a control period has these stages: control law, soft start, low-pass, clip, rate limit, safety filter,
-    delay and lag, physics. Kinematics are computed once per period. A `State` contains true speeds and their noise.
+    delay and lag, physics. Kinematics are computed once per period. A `State` has true speeds and, separately, noise.
 
     Attributes:
         speeds: None, because simulated speeds are exact and need no smoothing.
 
     Args:
         robot, task: the arm, and the task with its controller.
-        dynamics: dynamics of `width` arms, or of one arm that represents all arms.
+        dynamics: dynamics of `width` arms, or of one arm for all arms.
         nthread: number of threads; 0: all cores.
         soft_start_s: s, time over which the torque of an episode fades in.
         seed: seed of the sensor noise; the noise restarts when `place` resets all arms.

@@ -1,8 +1,8 @@
 """Convert target torque to joint torque in steps of 1 ms: soft start, low-pass, clip, rate limit, motor delay.
 
 Training, evaluation and hardware share the functions of this module, so a policy has the same latency on the arm as
-in simulation. The safety filter (safety_filter.py) acts between rate limit and delay. The filter runs in the
-physics step of a simulation (mujoco_callback.py), and in the driver of an arm (r2s/arm/driver.py).
+in simulation. The safety filter (safety_filter.py) acts between rate limit and delay. In training and evaluation, the
+filter runs in the physics step (mujoco_callback.py); on an arm, it runs in the driver (r2s/arm/driver.py).
 """
 
 import math
@@ -24,7 +24,7 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
 
     Args:
         target: Nm, target torque. filtered, effort: Nm, low-pass state and effort of the previous cycle.
-        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: soft start, cycles.
+        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: cycles of the soft start.
         tau_max: Nm, largest effort. step_max: Nm, largest change of the effort per cycle.
     """
     faded = target
@@ -100,8 +100,8 @@ SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    If a command arrives within a step, the previous command acts until the arrival. The motor torque m follows the
-    command u with dm/dt = (u - m) / lag, so the mean of m over a time s is u + (m - u) (1 - exp(-s / lag)) lag / s.
+    If a command arrives within a step, the previous command acts until then. The motor torque m lags the command u:
+    dm/dt = (u - m) / lag. From an initial m0, its mean over a time s is u + (m0 - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
         line: (SLOTS, n) Nm, recent commands; row k % SLOTS is the command of cycle k. motor: (n,) Nm, motor torques.

@@ -1,8 +1,8 @@
-"""Compiled collision check of many arms: each arm with itself, the table and obstacles.
+"""Compiled collision check of many arms: each arm with itself and the table.
 
 r2s checks the geoms of the robot's file, except planes and height fields. If the file enables collision only for some
-geoms, r2s checks only these geoms. Convex hulls replace meshes, as in MuJoCo, and bounding spheres
-replace signed distance fields. The check omits two kinds of pairs:
+geoms, r2s checks only these geoms. Convex hulls replace meshes, as in MuJoCo, and bounding spheres replace signed
+distance fields. The check omits these pairs:
 
 - A geom and the table, if the geom's height is constant, because no joint or only vertical joint axes move the geom.
 - Two geoms of neighboring links, which touch at their joint, and two geoms closer than HOUSING_M at q_home, which can
@@ -86,7 +86,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Geometry for the compiled check: bodies, hull vertices, rows of `bodies` to check, and table height, m."""
+    """Geometry: bodies (G, WIDTH), hull vertices (V, 3) m, body rows of `above` (A,) and `pairs` (P, 2), table m."""
 
     bodies: np.ndarray
     vertices: np.ndarray

@@ -12,8 +12,8 @@ The stiffness of tangential bristles is proportional to the normal force F (Canu
 
 The unknowns are the joint velocities at the end of the step. Both contact forces are linearized about a guess of the
 unknowns; the constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law solves
-the linearized equations, so contact forces can start a joint at rest. `start_guess` writes the first guess. Then
-`add_contact`, `coming_velocity` and `next_guess` repeat until the guess is accurate, usually once.
+these equations, so contact forces can start a joint at rest. `start_guess` writes the first guess. `add_contact`,
+`coming_velocity` and `next_guess` repeat until the guess is accurate, usually once. `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -216,7 +216,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Subtract a box's velocity `point` (3,) m/s from `slide` and `rate`; return relative rate and speed, m/s."""
+    """Return rate and speed, m/s, relative to a box that moves at `point` (3,) m/s in the contact; update `slide`."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]
@@ -320,7 +320,7 @@ def finish_contact(contact, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _deflect(contact, slide, speed, h, terms):
-    """Write contact force and bristle deflection after h s; terms: normal force, N, spring, N/m, damper, N s/m."""
+    """Write force, and deflection after h s at `slide` (3,) m/s; terms: normal force N, spring N/m, damper N s/m."""
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0
     z = contact[DEFLECTION : DEFLECTION + 3]

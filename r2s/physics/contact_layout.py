@@ -9,7 +9,7 @@ from r2s.physics.surface import Surface
 
 # Columns of `contact`: the surface (see `Surface`), the tool, and the results of a step
 K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
-# HALF: half edges of a box, 0 for a plane. AXES: box axes, row by row. NORMAL: for a box, the normal at the tip
+# HALF: half edges of a box, 0: plane. AXES: matrix with box axes as columns, row by row. NORMAL: at the tip for a box
 HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
 # Columns for a box that slides on a table (sliding.py). MASS: 0 for a fixed surface. WEIGHT: N. TABLE: friction
 # coefficient. REACH: m, moment over force of table friction. UP: table normal. VELOCITY (3): m/s, of center. SPIN:

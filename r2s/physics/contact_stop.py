@@ -3,11 +3,11 @@
 If a stop only removed the command, the surface's elastic energy F^2 / 2k would push the tip off by up to F / k, or
 joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver has three kinds of stop:
 
-- hold: the target torque is J^T R, where R is the contact force that the push limit estimated at the stop's start.
+- hold: the target torque is J^T R with the push limit's estimate R of the force at the stop's start. Nothing moves.
 - release: the tip moves outward at the speed LEAVE until the contact force F is gone. A velocity loop tracks the
-  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains R and the modeled friction force
-  h; for an arm with more friction, an integral adds at most h. During the outward motion, joint friction pushes the
-  tip inward by h, so R = F - h. This motion ends when R falls to RELEASED - SLIDES h. The remaining contact force is
+  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains the present R and the modeled
+  friction force h; for an arm with more friction, an integral adds at most h. Joint friction pushes an outward moving
+  tip inward with h, so R = F - h. The motion ends when R falls to RELEASED - SLIDES h. The remaining contact force is
   at most RELEASED + (1 - SLIDES) h for a true friction of at most h, and RELEASED for a true friction of SLIDES h.
 - retreat: the arm releases the tip, then moves the tip RETREAT_M farther outward.
 
@@ -22,7 +22,7 @@ from r2s.physics.push_limit import FELT, HEIGHT, HOLD, LEAVE, PHASE, PULL, RESIS
 from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
-RELEASED = 0.5  # N, contact force below which a tip is released
+RELEASED = 0.5  # N, contact force below which a tip counts as released
 SLIDES = 0.25  # ratio of friction in slow sliding to breakaway friction; 0.35 with conf/friction/paper
 RETREAT_M = 0.01  # m; this space is free, as the tip came from `task.clearance` = 15 mm above the plane
 LEAVES_S = 0.4  # s; then 0.1 s is left to brake. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml

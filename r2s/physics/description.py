@@ -1,8 +1,8 @@
 """Write an arm as MJCF, URDF or SDF, with the same links, limits and friction.
 
 Masses, centers of mass, inertia tensors, rotor inertias and friction come from `dynamics`, all other values from
-`robot`. In the URDF and SDF files, a link's frame is the joint's frame at angle zero, so that no inertial frame is
-rotated, because ignition-physics 5.1 of Gazebo Fortress misreads a rotated inertial frame.
+`robot`. In the URDF and SDF files, a link's frame is the joint's frame at angle zero, so inertia tensors need no
+rotated inertial frame, which ignition-physics 5.1 of Gazebo Fortress misreads.
 """
 
 from dataclasses import dataclass
@@ -90,7 +90,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
 
 
 def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return Coulomb torques (n,) Nm and viscous coefficients (n,) Nm s/rad for the friction at 0.3 and 1 dq_max."""
+    """Return Coulomb (n,) Nm and viscous friction (n,) Nm s/rad that match the friction at 0.3 and 1 times dq_max."""
     fast, slow = (dynamics.family.level(dynamics.phi, share * robot.dq_max) for share in (1.0, 0.3))
     viscous = np.maximum((fast - slow) / (0.7 * robot.dq_max), 0.0)
     return np.maximum(fast - viscous * robot.dq_max, 0.0), viscous
@@ -221,7 +221,7 @@ def write_world(
 
     The physics step is 1 ms; simulated time runs as fast as possible. The world has no gravity (libfranka's
     convention), no limits of velocity or torque (the driver enforces these limits), and no friction (r2s applies the
-    friction torque). Joint damping of armature / 1 ms replaces rotors, which SDF lacks; r2s/engines cancels it.
+    friction torque). Joint damping of armature / 1 ms replaces rotors (SDF has none); r2s/engines cancels its torque.
 
     Args:
         path: file to write. robot, dynamics: the arm. plugin: the world's plugin element. version: SDF version.

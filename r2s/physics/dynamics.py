@@ -39,9 +39,9 @@ class Dynamics:
             uses dq as logged.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: the friction law.
-        stiction_model: "command" (eq. (6) of the paper): a joint at rest sticks while command plus offset is between
-            the breakaway torques. "net": a joint sticks while the sum of all torques on the joint, including the
-            coupling to other joints, is between the breakaway torques (r2s/physics/stick_slip.py).
+        stiction_model: "command" (eq. (6) of the paper): on a joint at rest, command and offset have no effect while
+            their sum is between the breakaway torques. "net": a joint sticks while the sum of all torques on it,
+            including the coupling to other joints, is between the breakaway torques (r2s/physics/stick_slip.py).
         delay, lag: (...) s, pure delay and first-order lag of the actuation. After `Simulator.drive`, the simulator
             applies delay and lag; otherwise, `Motors` (r2s/physics/actuation.py) applies them.
         declared_payload: (..., 4), mass, kg, and first moment, kg m, in the last link's frame, of the payload that is
@@ -144,8 +144,8 @@ def nominal_dynamics(
     """Return the dynamics that `conf/friction` and `conf/inertia` describe; a scalar value applies to all joints.
 
     phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). With phi1=None, frictionloss and damping in
-    the robot's file are Coulomb and viscous friction; for a joint without both, phi1 is PHI1 tau_max. If `family` is
-    not "auto", its parameters are chosen for the same friction at 1 rad/s. If a breakaway torque is
+    the robot's file are Coulomb and viscous friction; for a joint without both, phi1 is PHI1 tau_max. family="auto"
+    keeps this law; any other family has parameters with the same friction at 1 rad/s. If a breakaway torque is
     None, the file's frictionloss replaces this torque.
 
     Raises:

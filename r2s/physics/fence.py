@@ -2,9 +2,9 @@
 
 The fence predicts the posture in which the arm would rest if it braked now. In the predicted posture, the bodies of
 each pair of `CollisionCheck` must be FENCE_M apart. At full speed, the bodies must be FENCE_M (1 + SPREAD) apart,
-because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and the joint
-speeds lag the ramp by LAG_S. A joint slower than the ramp moves at constant speed until the ramp falls to this speed.
-The predicted posture moves continuously with the arm, so the posture cannot skip an obstacle between two cycles.
+because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and joints lag
+the ramp by LAG_S. A joint that uses a smaller share of its allowed speed than the fastest joint brakes only when the
+ramp has fallen to this share. The predicted posture moves continuously with the arm, so it cannot skip an obstacle.
 
 If two bodies start closer, the arm may move them apart: the required distance is half of their largest distance in
 the motion so far, at most FENCE_M. The fence ignores bodies that overlap at the start until they separate.
@@ -32,7 +32,7 @@ class Fence(NamedTuple):
 
 
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return the index (E,) of the pair that stops the driver in each of E motions q, dq (E, T, n); -1: no stop.
+    """Return the index (E,) of the pair at which the driver would stop each motion q, dq (E, T, n); -1: no stop.
 
     limits: (n, COLUMNS), limits of the joints from `filter_limits`.
     """

@@ -107,7 +107,7 @@ class Family:
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
         """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of the family `other`.
 
-        If both families have a viscous parameter, the viscous friction is also the same.
+        If `phi` contains a viscous parameter and it is not optional in this family, its value is copied.
         """
         if other == self:
             return phi
@@ -323,7 +323,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if the module of the friction family `name` is neither imported nor in `trust`."""
+    """Raise UserError if `family` would import `name`, which `file` contains, from a module not in `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(
@@ -340,7 +340,7 @@ def family_path(one: Family) -> str:
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
     """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s in steps of dt s.
 
-    z replaces sign(v) in friction; dz/dt = (v - |v| z) / distance (Dahl 1968) is integrated exactly. distance: rad.
+    z replaces sign(v): dz/dt = (v - |v| z) / distance (Dahl 1968), exactly from z = 0. distance: rad, one or (n,).
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 

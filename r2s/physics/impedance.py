@@ -3,8 +3,8 @@
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
 With the damping D = 2 zeta (M # K_q), every mode has the damping ratio zeta. Here M is the mass matrix, K_q = J^T K J
-+ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. This D equals the
-double diagonalization of Albu-Schaeffer et al. (ICRA 2003) without eigenvectors. The null-space projector N is
++ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. This damping is that of the
+double diagonalization of Albu-Schaeffer et al. (ICRA 2003), without eigenvectors. The null-space projector N is
 dynamically consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force has a potential, even if
 clipped. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs;
 damping refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al.,
@@ -61,7 +61,7 @@ REST_DQ, DIRECTION_DQ = 0.01, 0.003
 # SLOPE_RATE: 1/s, of the slope estimate; it settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING: m/s, below
 # it the estimate adapts slower; five times the tip's speed noise: 3e-3 rad/s (Panda) at levers of 0.5 m in 7 joints
 SLOPE_RATE, SLIDING = 10.0, 0.02
-SMALLEST = 0.01  # smallest applied share of a requested rise of stiffness
+SMALLEST = 0.01  # share of a requested rise of stiffness; a smaller share is not halved again but becomes 0
 MOBILITY = 1e-3  # 1/kg, 1/(kg m^2): directions with less mobility, near a singularity, are treated as blocked
 
 

@@ -237,7 +237,7 @@ def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
     """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's motion.
 
     The gradient method (Widrow and Hoff, 1960) fits the slope g in: tip speed along the normal = g . target velocity.
-    This function adds the rise of the surface to `velocity` (3,) m/s. The correcting force is the sum of two clamped
+    The surface's rate of rise adds to `velocity` (3,) m/s. The correcting force is the sum of two clamped
     integrals of the position error, one along the motion, where friction acts, and one across the motion.
     """
     up, rises, fast = 0.0, 0.0, SLIDING * SLIDING

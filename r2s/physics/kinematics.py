@@ -112,7 +112,7 @@ def _follow(links, tip, home, start, points, out):
                     gram[k, c] = DAMPING if k == c else 0.0
                     for j in range(n):
                         gram[k, c] += jacobian[k, j] * jacobian[c, j]
-            for j in range(n):  # in the first step; later steps correct the end effector
+            for j in range(n):  # only in the first step; later steps correct the end effector
                 null_step[j] = HOMEWARD * (home[j] - q[j]) if iteration == 0 else 0.0
             for k in range(3):
                 for j in range(n):

@@ -1,6 +1,6 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A payload changes mass, center of mass and inertia tensor of the last link; every simulator is exact for it. An
+A payload changes mass, center of mass and inertia tensor of the last link, which is exact in every simulator. An
 external force could not represent a payload, because the force would depend on the acceleration that it causes. The
 payload's frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
 """
@@ -55,7 +55,7 @@ def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload")
     `on_s` and `off_s`. A string is the path of an identification's payload.yaml or run folder.
 
     Args:
-        value: the setting. name: its name in error messages. most: largest mass, kg, and distance, m, see `Robot`.
+        value: the setting. name: its name in error messages. most: kg and m, as `Robot.payload_max`.
 
     Raises:
         UserError: mass, centre, tensor or time is out of range, or a file is missing; the message begins with `name`.

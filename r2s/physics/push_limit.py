@@ -10,7 +10,7 @@ Here P is the push of the command, F >= 0 the contact force, and P_f the push of
 
 - Force: P + hidden <= force_max.
 - Speed: dv/dt <= RATE (v_max - v). With an estimate R of the force against the push, this rule is P <= R + m RATE
-  (v_max - v). The allowed speed v_max is `speed_near` at the surface and grows with the distance from the surface.
+  (v_max - v). The allowed speed v_max is `speed_near` / OVERSHOOT at the surface and grows with the distance from it.
 
 The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. In
 free motion, R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, R is P, so the speed rule
@@ -95,7 +95,7 @@ class PushLimit:
         return mass, mass * float(np.abs(lever) @ friction)
 
     def bound(self, robot: Robot, q: np.ndarray, stiffness: float, friction: float = 0.0) -> float:
-        """Return the largest contact force, N, at q (n,) rad for `stiffness`, N/m, and `friction` of a surface.
+        """Return the largest force, N, at q (n,) rad on a surface with `stiffness`, N/m, and Coulomb `friction`.
 
         The result is infinite if surface friction can push a sliding tip inward without limit.
         """
@@ -151,7 +151,7 @@ def push_limit(
 def tip_motion(limit, kinematics, dq, row):
     """Write the Jacobian J (n,) m/rad into `row`; return height, m, normal and lateral speed, m/s, dJ/dt dq, m/s^2.
 
-    The height is above the highest possible true plane. The normal speed is inward; the lateral is along the plane.
+    The height is above the highest possible true plane. The normal speed is inward, the lateral one along the plane.
     """
     position, R, anchor, axis = kinematics
     a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
@@ -196,7 +196,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
         limit: (COLUMNS,) from `PushLimit.columns`; this function updates the estimate R and the last speed.
         arm: `JointDynamics` with finite values. kinematics: position (3,) m and rotation (9,) of the last link, and
             anchors (n, 3) m and axes (n, 3) of the joints, all in the base frame.
-        last: (n,) Nm, command of the previous cycle.
+        last: (n,) Nm, the torque that the arm applied last.
         friction: (n,) Nm, friction level of each joint.
         work: (n + WORK, n), scratch array; afterward, row n contains J and row n + 1 contains J M^-1.
     """
@@ -231,7 +231,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Apply the push limit to the torques `out` (n,) Nm, and limit joint accelerations in contact.
+    """Limit push and joint accelerations of the torques `out` (n,) Nm, with the contact force as a load.
 
     Return whether `out` changed. `push_bound` explains the arguments, `filter_torque` explains `share` and `limits`.
     """
@@ -251,7 +251,7 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     for j in range(n):
         mobility += row[j] * lever[j]
     # low, high: N, bracket of f; before, after: excess there. If no joint is at its bound, the first trial hits the
-    # middle of the tolerance CLOSE: at its edge, round-off would decide, and equivalent code could differ
+    # middle of the tolerance CLOSE: at its edge, round-off would decide on another trial
     low, high, after, force = 0.0, np.inf, 0.0, (before + 0.5 * CLOSE) / mobility
     for _ in range(ROUNDS):
         for j in range(n):

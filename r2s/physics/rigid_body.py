@@ -167,7 +167,7 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def set_links(
     model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
 ) -> None:
-    """Set a model's link masses (n,) kg, centers of mass (n, 3) m, tensors (n, 3, 3) and armature (n,) kg m^2."""
+    """Set a model's masses (n,) kg, centers of mass (n, 3) m, tensors about these (n, 3, 3), armature (n,) kg m^2."""
     at = model.jnt_bodyid
     model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com

@@ -123,7 +123,7 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
 
     Args:
         arm: `JointDynamics` with finite values.
-        effort: (n,) Nm, requested torque. last: (n,) Nm, command of the previous cycle.
+        effort: (n,) Nm, requested torque. last: (n,) Nm, command that the arm applied last.
         share: factor on the allowed joint speeds: 1, or less while the arm brakes.
         friction: (n,) Nm, estimated friction, at least 0.
         limits: (n, COLUMNS) of `filter_limits`. work: (2 n + WORK, n), scratch array.
@@ -168,7 +168,7 @@ def joint_bounds(arm, share, limits, work):
 def bounded(arm, friction, limits, work, desk, out):
     """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether `out` exceeded a bound.
 
-    desk: (n, n), scratch array; if `desk` is `work[:n]`, this function overwrites the Cholesky root in `work`.
+    desk: (n, n), scratch array; if it is `work[:n]`, the bounds can be used only once (the root is overwritten).
     """
     n, dq = len(out), arm.dq
     ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]

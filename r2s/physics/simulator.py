@@ -91,7 +91,7 @@ class Simulator:
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray | None = None, repeat: int = 1) -> None:
         """Set the dynamics of the arms `ids`, by default of all arms.
 
-        A field without a batch axis applies to all `ids`; a batched value applies to `repeat` consecutive arms.
+        A field without a batch axis applies to all `ids`; each entry of a batch applies to `repeat` consecutive arms.
         """
         arms = np.arange(self.nsim) if ids is None else np.asarray(ids)
         moments, axes = principal_axes(dynamics.inertia)
@@ -195,7 +195,7 @@ class Simulator:
         return {name: getattr(self, name) for name in (*names, "_offset", "_surfaces")}
 
     def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
-        """Simulate nstep steps with torques tau (m, nstep, n) Nm; return {"qpos": (m, nstep, n), ...}."""
+        """Simulate steps with torques tau (m, nstep, n) Nm; return {"qpos": (m, nstep, n), ...} after each step."""
         spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
         return self.batch.rollout(tau.shape[1], tau, control_spec=spec, record=record, ids=ids)
 

@@ -26,7 +26,7 @@ class JointForces(NamedTuple):
 
     dq: (n,) rad/s, joint velocities. drive: (n,) Nm, sum of torques without friction. friction: (n,) Nm, friction at
     dq. rest: (2, n) Nm, kinetic friction at zero speed in negative and positive direction. edges: (2, n) Nm,
-    breakaway torques in both directions, at least as large as `rest`; 0: no stiction.
+    breakaway torques in these directions, with at least the magnitude of `rest`; 0: no stiction.
     """
 
     dq: np.ndarray
@@ -63,7 +63,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
 
     Args:
         mass: packed mass matrix, kg m^2. damping: (n,) Nm s/rad, implicit damping. h: s, duration of the step.
-        forces: velocities and torques at the beginning of the step.
+        forces: `JointForces` at the beginning of the step.
         dq_min: rad/s, speed below which a joint stops if its net torque lies between its breakaway torques.
         work: (n + 4, n), scratch array. coming: (n,) rad/s, array for the resulting velocities.
     """
@@ -113,7 +113,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
 
 @njit(cache=True, error_model="numpy")
 def _initial_sides(forces, dq_min, side, friction, coming):
-    """Write each joint's side, friction and velocity; return if a HELD joint has speed, and if all joints rest."""
+    """Write each joint's side, friction and velocity; return whether a HELD joint moves and whether all rest."""
     dq, drive, edges, n = forces.dq, forces.drive, forces.edges, len(forces.dq)
     slow, held, inside = False, 0, True
     for j in range(n):

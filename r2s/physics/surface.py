@@ -124,7 +124,7 @@ def load_tool(path: str | Path) -> Tool:
     """Read a tool file, JSON: `tip_in_flange_m` (3 numbers), `radius_m`, optional `mass_kg`.
 
     Raises:
-        UserError: the file is missing or no valid JSON, a key is unknown or missing, or a value is out of range.
+        UserError: the file is missing or not valid JSON, a key is unknown or missing, or a value is out of range.
     """
     if not isinstance(path, str | Path):
         raise UserError(f"robot.tool: expected a JSON file, got {path!r}")

@@ -37,11 +37,11 @@ def is_urdf(path: Path) -> bool:
 def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
-    The spec has the file's body and joint names, joint damping and friction. Joints in `lock` ({name: rad or m}), and
-    joints that mimic a locked joint, become fixed at these positions.
+    The spec has the file's body and joint names, joint damping and friction. Joints in `lock` ({name: rad or m})
+    become fixed at these positions, and joints that mimic them at the resulting positions.
 
     Raises:
-        UserError: the file is no XML or no URDF, or the arm has a joint that is neither revolute nor fixed.
+        UserError: the file is not XML, not URDF, or not an arm of revolute (or continuous) joints.
     """
     return _Reader(path, lock or {}).spec()
 
@@ -108,7 +108,7 @@ class _Reader:
         return out
 
     def _lock(self, at: dict[str, float]) -> None:
-        """Fix the joints in `at` ({name: rad or m}), and joints that mimic them, at these positions."""
+        """Fix joints at positions `at` ({name: rad or m}), and joints that mimic them at the resulting ones."""
         for name in at:
             if name not in self.joints:
                 joints = choices(self.joints)
@@ -145,7 +145,7 @@ class _Reader:
         return along / np.linalg.norm(along)
 
     def _attach(self, joint: ET.Element) -> None:
-        """Check a joint's type, and register the joint with its parent link and its child link."""
+        """Check a joint, and register the joint with its parent link and its child link."""
         kind, child = joint.get("type"), self._end(joint, "child")
         lock = f"; robot.lock={{{joint.get('name')}: 0}} welds it there"
         if kind not in (*MOVING, FIXED):

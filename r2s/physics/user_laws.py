@@ -1,6 +1,6 @@
 """Call a user's control or friction law from the cached compiled code of r2s.
 
-Compiled code with a new law would take half a minute to compile in every process. So only the law is compiled, and
+Compiling the code of r2s for a new law would take half a minute in every process. So only the law is compiled, and
 the code of r2s calls it by address. A law of r2s has a small number instead of an address. Addresses are below 2^53,
 so that a float64 contains them exactly.
 """
@@ -46,7 +46,7 @@ def stack(typingctx, count):
 
 @intrinsic
 def _call(typingctx, address, args):
-    """Call the C function at an address, without a result, with the values of a tuple; pointers are integers."""
+    """Call the C function at `address`, which returns nothing, with the values in `args`; pointers are integers."""
 
     def codegen(context, builder, signature, values):
         given = [builder.extract_value(values[1], k) for k in range(len(args))]
@@ -61,7 +61,7 @@ def _call(typingctx, address, args):
 
 @njit(cache=True)
 def call_control(address, q, dq, command, parameters, memory, out):
-    """Call the control law at an address (control_laws.py); write torques of 0 if `address` is none."""
+    """Call the control law at an address (control_laws.py); write torques of 0 if `address` is no address."""
     if address < LEAST_ADDRESS:
         out[:] = 0.0
         return
@@ -72,7 +72,7 @@ def call_control(address, q, dq, command, parameters, memory, out):
 
 @njit(cache=True)
 def call_friction(address, p, v, h, memory):
-    """Call the friction law at an address (friction.py); return torque and slope, 0 if `address` is none."""
+    """Call the friction law at an address (friction.py); return torque and slope, 0 if `address` is no address."""
     if address < LEAST_ADDRESS:
         return 0.0, 0.0
     out = carray(stack(2), (2,))  # type: ignore[call-arg]

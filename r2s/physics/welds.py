@@ -37,7 +37,7 @@ class Bodies:
         return body, pose
 
     def lumped(self, body: int) -> Inertia:
-        """Return mass, center of mass and central tensor of `body` together with all bodies welded to `body`."""
+        """Return mass, center of mass and tensor about this center, of `body` with all bodies welded to it."""
         parts = [(self.mass[body], self.com[body], self.inertia[body])]
         for other in range(1, self.model.nbody):
             anchor, pose = self.moving_parent(other)

@@ -37,7 +37,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
         raise UserError("cannot be read as csv: No columns to parse from file")
     plain = [k for k in filled if lines[k].lstrip()[0] not in MARKS]
     first: int | None = next((k for k in plain if _is_numeric(lines[k])), None)
-    if first is None:  # a text column makes no line numeric: the header is the first line
+    if first is None:  # no line is numeric, as a column is text: the header is the first line
         title = plain[0] if plain and plain[0] == filled[0] else filled[0]
         first = next((k for k in filled if k > title), title + 1)
     above = [k for k in filled if k < first]
@@ -88,7 +88,7 @@ def bare_name(name: str) -> tuple[str, float]:
     found = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name)
     unit = found[2].strip().lower() if found else ""
     if not found or unit not in UNITS or (unit in ("a", "ma") and not found[1].lower().startswith(("i", "current"))):
-        return name, 1.0  # `tau1 [A]` is a current
+        return name, 1.0  # `tau1 [A]` is a current, no torque
     return found[1], UNITS[unit]
 
 

@@ -112,7 +112,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, int, float]]]:
-    """Return (field, joint, (feature, element index, factor to SI units)) for each feature element of a joint."""
+    """Return (field, joint, (feature, element index, factor to SI units)) for each element of an arm joint."""
     out = []
     for feature, spec in features.items():
         shape = spec["shape"]

@@ -42,7 +42,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return one track per stretch if `each` is True, else one track per part of t (T,) s between clock restarts."""
+    """Return a track per stretch if `each`, else per part without restart or long pause; omit any below OVERLAP_S."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -160,7 +160,7 @@ def _own_lag(track: Track) -> int | None:
 
 
 def _lag(a: Track, b: Track) -> int | None:
-    """Return the lag, in rows, at which b repeats a, or None; of several lags, choose one with most common rows."""
+    """Return the lag, in rows, at which b repeats a, or None; of several lags, that with the most rows in common."""
     error, count = _errors(a.q, b.q)
     runs = _runs(error < TOLERANCE)
     if not runs:

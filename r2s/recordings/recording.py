@@ -283,7 +283,7 @@ class Recording:
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
-        """Return (training, validation) without common motion. validation_fraction: share of rows for validation.
+        """Return (train, validation) without common motion; validation has about `validation_fraction` of the rows.
 
         1. If the motion has a period (argument or attribute), validation is the end of each period: the rows with the
            largest phase, `t` modulo period. A chronological split could put the same motion in both parts; for
@@ -291,8 +291,8 @@ class Recording:
         2. Without a period, but with several trajectories, validation consists of the last trajectories.
         3. Without a period and with one trajectory, validation is the end of the recording.
 
-        If validation does not consist of whole trajectories, training has no rows within 0.1 s of a validation row.
-        Trajectories of a single row are dropped from training and validation.
+        In cases 1 and 3, training has no rows within 0.1 s of a validation row. Trajectories of a single row are
+        dropped from training and validation.
         """
         if not 0 < validation_fraction < 1:
             raise UserError(f"validation_fraction: expected a number in (0, 1), got {validation_fraction}")

@@ -1,4 +1,4 @@
-"""Repair log faults that have only one remedy: swapped or repeated rows, zero stamps, wrapped or misread angles.
+"""Repair log faults with only one remedy: swapped, repeated or held rows, zero stamps, wrapped or misread angles.
 
 Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired, but
 reported by `Recording` or by the checks of an identification.

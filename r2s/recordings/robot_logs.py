@@ -140,9 +140,9 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    A log's order may differ from the robot's, because some ROS 2 drivers sort joints by name. The joints are found,
-    in order of priority, by (1) `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix as in
-    panda_joint1; (3) n names that differ only in a number; (4) the first n names, if n is 1 or `model_joints` empty.
+    A log's order may differ, because some ROS 2 drivers sort joints by name. The first applicable rule decides: (1)
+    `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix as in panda_joint1; (3) n names that
+    differ only in a number, sorted by this number; (4) the first n names, if n is 1 or `model_joints` empty.
 
     Args:
         logged: joint names in the log.

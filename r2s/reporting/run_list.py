@@ -21,7 +21,7 @@ LEAST = 20  # letters; a result is not cut to fewer than this
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
-    """Return a table with a row of strings per run folder below `root`, sorted by start time.
+    """Return a table with a row of strings per run folder below `root`, the newest run last.
 
     Args:
         root: folder of all runs. stage: list only runs of this stage. failed: list only failed and killed runs.

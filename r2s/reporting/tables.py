@@ -24,7 +24,7 @@ def measure_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.Data
 
 
 def diagnostic_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return a table of the diagnostic measures in `rows`, such as path gap, limit margin and collisions."""
+    """Return a table of the diagnostic measures that `rows` contain, such as path gap and limit margin."""
     present = [measures[key] for key in measures.diagnostics if any(key in row for row in rows.values())]
     return _table(present, rows, "", decimals=0)
 

@@ -63,7 +63,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     The order of a grid's jobs is arbitrary, so the grid's best value is averaged over `ORDERS` random orders.
 
     Args:
-        trials: output of `trials_table`. measure: column in evaluations.csv. against: glob of the grid's run folders.
+        trials: output of `trials_table`. measure: column in evaluations.csv. against: glob of grid runs, or None.
         larger: whether a larger value of the measure is better.
     """
     if not against:

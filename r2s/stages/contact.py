@@ -28,7 +28,7 @@ def contact_data(cfg, robot, file):
     file: `FileData` of the config, which names the columns of the files.
 
     Raises:
-        UserError: the robot has no tool, data.torque is not commanded, data.contact is missing, or a file is invalid.
+        UserError: tool or commanded torque is missing, a validation has no data.contact, or a file is invalid.
     """
     from r2s.identification.checks import check_recording
 
@@ -72,7 +72,7 @@ def pressed_surface(cfg, run, arm, plan):
     """Let the arm press on the surface, and return the `ContactData`; a resumed run reads its existing recording.
 
     Raises:
-        Stopped: the arm stopped; contact_until_stop.npz contains the motion up to the stop.
+        Stopped: the arm stopped; contact_until_stop.npz contains the paths completed before, if any.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.presses import record_presses

@@ -10,7 +10,7 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
-SLOW_MS = 1.5  # ms; if recorded commands are farther apart, r2s prints the hold of a command that it assumes
+SLOW_MS = 1.5  # ms; if recorded commands are farther apart, r2s prints how long it assumes each command is held
 LEAST_PRESSES = 4
 MAX_OVERLAP = 0.2  # largest share of a validation motion that may repeat training motion, for example in the approach
 
@@ -114,7 +114,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with the period of data.command_hz; if unset, print the assumed hold of a command."""
+        """Return the recording with the data.command_hz period; if unset, print the assumed hold of slow commands."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:

@@ -39,7 +39,7 @@ def reads(cfg):
 class Parts:
     """Inputs of an identification, checked before a run folder is made.
 
-    `groups` and `ramps` are empty until an arm is recorded. `motion`: data.excitation. `earlier`: identify.from.
+    Without data=recording, `groups` and `ramps` are recorded later. motion: data.excitation. earlier: identify.from.
     """
 
     robot: Any

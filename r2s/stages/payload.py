@@ -12,7 +12,7 @@ from r2s.stages.data import check_cutoff, read_file
 
 @dataclass(frozen=True)
 class LoadedData:
-    """Recording of the loaded arm, its files, and the payload (or None) that the gravity compensation includes."""
+    """Recording of the loaded arm, payload (or None) that the gravity compensation includes, and files read."""
 
     recording: Any
     declared: Any

@@ -58,7 +58,7 @@ def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
 
 
 def run_step(words: dict[str, list[str]]) -> None:
-    """Run the commands {label: words} in parallel; print the progress of each and, at the end, all tables.
+    """Run the commands {label: words} in parallel; print the progress of each and, when it ends, its tables.
 
     Raises:
         UserError: a command failed; the remaining commands are terminated.
@@ -168,8 +168,8 @@ def check_free(root: Path, name: str, cfg: Any) -> None:
 def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
     """Return the commands {label: words} of each step: identify the arm, identify a surface, train, transfer.
 
-    The trainings on the identified and the nominal model have the same settings, time and computer. With an adapter,
-    only the transfers run with changed payload, friction and delay of the arm (CHANGES).
+    The trainings on the identified and the nominal model differ only in the model: settings, time and computer are
+    the same. With an adapter, only the transfers run with changed payload, friction and delay of the arm (CHANGES).
 
     Args:
         cfg: config of the pipeline. name: name of the pipeline's run folder; all other folder names begin with it.

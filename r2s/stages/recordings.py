@@ -62,7 +62,7 @@ def recording_files(cfg, key="path"):
 
 
 def _matching(where: str, path: str) -> Iterator[str]:
-    """Yield the files that match a pattern, in alphabetical order; yield a path without wildcards unchanged."""
+    """Yield the files that match a pattern, in alphabetical order; if the path exists or is no pattern, yield it."""
     if not glob.has_magic(path) or located(path).exists():
         yield path
         return

@@ -26,7 +26,7 @@ def reads(cfg):
 
 
 def commands_of(settings):
-    """Return the commands, as lists of words, that produce the page `results.page` from the folder `results.data`.
+    """Return the commands, as lists of words, that produce `results.page`; {data} becomes the folder `results.data`.
 
     A command begins with `make`, or consists of arguments for python.
 
@@ -100,7 +100,7 @@ def cloned(clone, paths):
 
 
 def execute(words, clone, log):
-    """Run `python WORDS`, or WORDS if they begin with make, in the clone; append the output to the file `log`.
+    """Run `python WORDS`, or WORDS if they begin with make, in the clone with its r2s; append the output to `log`.
 
     Raises:
         UserError: the command fails; the message quotes the last line of output.

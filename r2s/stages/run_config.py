@@ -67,7 +67,7 @@ def checked(cfg, where, trust=None):
     """Return a run folder's config with resolved interpolations; raise UserError for untrusted code.
 
     r2s calls every part (`_target_`) that a config names. So conf/ must name the same part in the same group, or a
-    module in `trust` must define the part. Resolvers can read the environment, so they need `oc` in `trust`.
+    module in `trust` must define the part. Resolvers such as ${oc.env:X} read the environment, so `trust` needs `oc`.
 
     Args:
         where: file name for error messages. trust: value of `trust=` (`modules`), instead of the config's `trust`.

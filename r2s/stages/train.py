@@ -202,7 +202,7 @@ def share_threads(cfg):
 
 
 def split_algo(cfg):
-    """Return the settings of conf/algo: number of arms, env steps of demonstrations, `Loop`, algorithm arguments."""
+    """Return number of arms, env steps of demonstrations, residual_l2, `Loop`, other settings (dict) of conf/algo."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}

@@ -23,7 +23,7 @@ from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 MOST_STARTS = 3  # attempts to start a training that the system ends, for example because memory is short
 POLL_S = 0.2
 STOP_S = 20.0  # s, time for a training to end after each signal; a step or an evaluation takes less
-EDGE = 0.05  # share of a range at each end in which a value is at an edge
+EDGE = 0.05  # share of a range, at each end, that counts as its edge
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 

@@ -4,7 +4,7 @@ A training maximizes the mean reward r subject to mean costs c_k <= d_k (constra
 1999). The policy maximizes r - sum_k lambda_k c_k / d_k, where the rate of the multiplier lambda_k is proportional to
 c_k / d_k - 1, and lambda_k is never negative (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization,
 ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies by the current -lambda_k / d_k. So
-stored transitions stay valid, and costs need no separate critic. The means c_k include all training steps.
+stored transitions stay valid, and costs need no separate critic. Means are over all training steps, with exploration.
 """
 
 from collections.abc import Callable, Mapping

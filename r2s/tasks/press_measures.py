@@ -41,11 +41,11 @@ PRESS = MeasureTable(
 def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, float]:
     """Return the measures of the task press, which form one row of evaluations.csv.
 
-    force_rmse_first_N, force_rmse_last_N: RMS force error in the second before the force step, and the last second.
-    overshoot_N: largest excess over the new force in the direction of the force step. overshoot_share: overshoot_N
-    divided by the force step. impact_N: largest force within IMPACT_S of the first touch. contact: share of the time
-    after the first touch in which the tip touches. Episodes with a stop enter only the measure success, the share of
-    all episodes without a stop, with both RMS errors <= GOOD_N, and with an overshoot within OVER_N or OVER_SHARE.
+    force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the force step, and in
+    the last second. Means over episodes: overshoot_N, largest excess over the new force in the direction of the step;
+    overshoot_share, the same divided by the step; impact_N, largest force within IMPACT_S of the first touch;
+    contact, share of the time since the first touch with contact. All these exclude stopped episodes. success: share
+    of all episodes that have no stop, both RMS errors <= GOOD_N, and an overshoot within OVER_N or OVER_SHARE.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]

@@ -74,7 +74,7 @@ class Episodes:
     Attributes:
         t: (T,) s, time. q, dq: (E, T, n) rad, rad/s, angles and speeds. ee: (E, T, 3) m, end effector. goal: goal
             positions, (E, 3) m, or (E, T, 3) m if goals move. tau: (E, T, n) Nm, command at the end of each step.
-        distance: (E, T), error of the task. reward: (E, T), weighted by `Task.paper_weights`; eq. (2) in task reach.
+        distance: (E, T) m; N in task press. reward: (E, T), weighted by `Task.paper_weights`; in task reach, eq. (2).
         reward_smooth: (E, T), the reward computed from speeds without measurement noise.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
@@ -231,7 +231,7 @@ class Task(Protocol):
         ...
 
     def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 11): pose and yaw error of the box, height of the tip above the table m, edges of the box m."""
+        """Return (m, 11): pose of the box, yaw error rad, height of the tip above the table m, edges of the box m."""
         ...
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
@@ -251,7 +251,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, controller: the task and its controller. goals: (m, ...), goals. state: state without sensor noise.
+        task, controller: the task and its controller. goals: (m, ...). state: `observe` adds its sensor noise.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()

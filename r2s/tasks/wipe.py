@@ -139,7 +139,7 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and requested force, N, for hybrid control; the force is linear in time."""
+        """Return (m, 4), normal and requested force, N, for hybrid control; linear in time between both forces."""
         share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
         force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)

@@ -38,7 +38,7 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return the measures of the task wipe, which form one row of evaluations.csv; the path starts at step `begin`.
+    """Return one row of evaluations.csv: measures of task wipe over the steps from `begin`, where the path starts.
 
     within_2N, within_3mm: share of steps with a force error <= 2 N, and with a path error <= 3 mm. wiped: share of
     steps within both limits. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes never

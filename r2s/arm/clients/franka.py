@@ -1,8 +1,8 @@
 """Implement the `Arm` protocol on a libfranka client, hardware or emulated: the base of Panda and FR3.
 
-libfranka has no point-to-point motion in torque control. So `move_to` follows a slow, checked joint path with the
-recorder's tracking controller, in the same 1 kHz torque loop as every other motion. So `move_to` needs no robot model
-from libfranka, and tests on the emulator run the code that also moves the hardware.
+libfranka has no point-to-point motion in torque control. `move_to` therefore follows a slow, checked joint path
+with the recorder's tracking controller, in the same 1 kHz torque loop as every other motion. So `move_to` needs no
+robot model from libfranka, and tests on the emulator run the code that also moves the hardware.
 """
 
 import weakref
@@ -51,8 +51,8 @@ class Franka:
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked: see `Operated`. A reflex, the stop button (even if released since), a rejected command or a
-            failed `move_to` sets `blocked`; `stop` does not. hold: see `Holds`.
+        operator, blocked: see `Operated`. Any stop other than a call of `stop` sets `blocked`: a reflex, the stop
+            button (even if released since), a rejected command, a failed `move_to`. hold: see `Holds`.
         findings: results of the check at connection.
         realtime: whether motions run in a `realtime_section`. In real time, r2s rejects recordings and episodes in
             which less than 99 % of the commands arrive in time.
@@ -60,8 +60,8 @@ class Franka:
     Args:
         robot: limits and nominal model.
         client: the connection.
-        operator: asked after a stop before the arm moves again. Without an operator (None), `move_to` raises
-            NotCleared after a stop until a new connection finds the arm ready.
+        operator: asked after a stop, with the stop's reason, before the arm moves again. Without an operator (None),
+            `move_to` raises NotCleared after a stop until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
         connection: properties that the arm must have; None skips this check.
         speed_share: factor on all allowed speeds in every motion.
@@ -103,7 +103,7 @@ class Franka:
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Move to q (7,) rad at up to a fifth of the speed limits; do not move if the arm is within 2 mrad of q.
+        """Move to q (7,) rad at up to a fifth of the speed limits, unless the arm is within 2 mrad of q; hold there.
 
         The arm follows the first path of r2s/excitation/paths.py that respects the limits and clearances.
 
@@ -167,7 +167,7 @@ class Franka:
             self._stopped = "stop was called"
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read k states of the arm at rest; return the times (k,) s by the arm's clock and by this computer's."""
+        """Read states of the arm at rest; return their times (k,) s by the arm's clock and by this computer's."""
         return self._client.watch(seconds)
 
     def close(self) -> None:

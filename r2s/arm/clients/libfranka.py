@@ -58,7 +58,7 @@ class Client:
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read k states of an arm at rest; return the times (k,) s by the arm's clock and by this computer's."""
+        """Read states of an arm at rest; return their times (k,) s by the arm's clock and by this computer's."""
         times, begun = [], time.perf_counter()
         while time.perf_counter() < begun + seconds:
             times.append((self._call(self._robot.read_once).time.to_sec(), time.perf_counter()))

@@ -57,7 +57,7 @@ class _PandaClient(Client):
 
 
 class _Motion:
-    """Runs libfranka's control loop in a thread: `next` returns a state, `answer` returns the command to the loop."""
+    """libfranka's control loop in a thread: `next` returns a state, `answer` passes a command to the loop."""
 
     def __init__(self, robot: Any, libfranka: Any):
         self._robot, self._libfranka = robot, libfranka
@@ -131,7 +131,7 @@ class Panda(Franka):
         realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
         collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
         declared_payload: payload that the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
-            `payload_of`; r2s refuses an arm that declares a different mass. moves: see `Connection`.
+            `payload_of`; r2s refuses to move an arm that declares another mass. moves: see `Connection`.
 
     Raises:
         UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm there does

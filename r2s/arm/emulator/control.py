@@ -43,7 +43,7 @@ class Fault:
             'press': the stop button is pressed for `cycles` ms. 'hold': an external force stops the first link; the
             arm needs the attribute `external`.
         cycle: control cycle in which the fault begins, from 0.
-        motion: motion with the fault, from 0; a `move_to` runs one motion per straight segment of the joint path.
+        motion: number of the motion, from 0; a client's `move_to` makes one per straight segment of its joint path.
         cycles: number of consecutive cycles with the fault; 20 late or dropped cycles stop the arm.
 
     """
@@ -74,7 +74,7 @@ class Control:
     Args:
         arm: the arm. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
         version: version of the FCI. faults, max_missed: see `Emulator`.
-        desk: settings of `DESK` by name, such as {"m_ee": 0.73}; they may differ from the arm's true settings.
+        desk: settings of `DESK` by name, such as {"m_ee": 0.73}; they may be wrong and do not change the arm.
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class Control:
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
         """Filter the external torque, set wrench and contact flags; after a collision, return error and message.
 
-        As in libfranka, the external torque is tau_J minus the model's torque, so wrong `DESK` settings change it.
+        As in libfranka, it is tau_J minus the model's torque: torque on the surroundings, plus errors of `DESK`.
         Unlike on a real arm, friction and model errors have no effect on the emulated external torque.
 
         Args:

@@ -5,7 +5,7 @@
 
 The emulated box can control any `Arm`. In lock-step, the default, the arm's clock advances only with a command: equal
 commands cause the same motion, bit for bit, even on a slow computer. In real time the clock runs at 1 kHz, and an
-answer that arrives after its millisecond has no effect.
+answer that arrives after its millisecond counts as missed.
 
 The emulator has no network jitter and no brakes, and does not show whether a motion is safe beside a person.
 """

@@ -156,7 +156,7 @@ class TwinBase:
         return self._sent if self._extra_delay else self._tau_J_d
 
     def _delayed(self, tau: np.ndarray) -> np.ndarray:
-        """Queue the command tau (n,) Nm, and return the command that the arm executes after the extra delay."""
+        """Queue the command tau (n,) Nm, and return the command that the arm executes in this cycle."""
         self._pending.append(tau)
         self._sent = tau
         # rate-limited, because a variant may have lost the previous command

@@ -82,7 +82,7 @@ def identify_contact(
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
         held_out: presses on the same surface for validation; None: a fit without the last press predicts that press.
-        seed: seed of the posterior's draws. report: function that receives the share of completed work and a text.
+        seed: seed of the posterior's draws. report: function that receives the completed share and the next step.
 
     Raises:
         UserError: there is too little contact, or the recording does not determine the stiffness.

@@ -16,9 +16,9 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
 SLOWEST = 0.01  # rad/s, slowest sliding; slower joints may stick and slip, which increases the residual
-DRIFT = 0.02  # standard deviation of friction drift and offset drift, relative to a joint's friction
+DRIFT = 0.02  # standard deviation of friction and offset drift since calibration, relative to a joint's friction
 EXACT = 1e-4  # lower limit of a row's sigma, relative to the joint's friction, even in a noise-free simulation
-SEEN = 0.03  # standard deviations; errors of the arm's model with a smaller effect on all rows are dropped
+SEEN = 0.03  # standard deviations; errors of the arm's model with a smaller effect on all rows together are dropped
 FTOL = 1e-6  # a search ends when a step reduces the cost by less than this share
 STEP = 1e-5  # finite-difference step on the unit cube
 REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
@@ -52,7 +52,7 @@ class ContactProblem:
 
     @property
     def motion(self) -> SlidingMotion:
-        """The arm's motion in the recording, averaged over windows in which joints slide."""
+        """The arm's motion in the recording, with the windows in which joints slide."""
         assert isinstance(self.torque.motion, SlidingMotion)
         return self.torque.motion
 

@@ -18,7 +18,7 @@ class Press:
     Attributes:
         t: (M,) s, time. force: (M,) N, predicted normal force. seen: (M,) N, normal force from joint torques.
         depth, rate: (M,) m, m/s, penetration depth and its derivative.
-        error: (M,) N, standard error of the force `seen`. row_s: s, time between two rows of the recording.
+        error: (M,) N, standard error of the force `seen`. row_s: s, time between two moments.
     """
 
     t: np.ndarray

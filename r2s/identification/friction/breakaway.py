@@ -55,7 +55,7 @@ class Breakaway:
             breakaway torque is the sum of `command` and the joint's offset, but ramps do not determine the offset.
         spread: (n, 2) Nm, standard deviation of the release command over ramps; NaN for fewer than two ramps.
         count: (n, 2), number of ramps with a release. ramped: (n, 2), number of all ramps.
-        held: (n, 2) Nm, largest command that the joint withstood; 0 if a ramp moved the joint or no ramp was run.
+        held: (n, 2) Nm, the largest command without motion if no ramp released the joint; 0 otherwise.
         resolution: (n, 2) Nm, accuracy of a ramp's release command: `RELEASE_S` times the ramp's rate.
         value: (K,) Nm, release command of each ramp; NaN without a release.
         misfit: (K,) rad, RMS difference between measured and fitted positions. A misfit well above the encoder noise
@@ -95,7 +95,7 @@ class Slide:
         level: (K,) Nm, command for slow sliding at a speed above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad, viscous friction.
         fall: (K,) rad/s, Stribeck velocity: friction falls from breakaway to `level` as exp(-(v / fall)^2).
-        misfit: (K,) rad, `Breakaway.misfit` of fits without `Slide`; clearly worse fits with `Slide` are dropped.
+        misfit: (K,) rad, `Breakaway.misfit` of fits without `Slide`; worse fits with `Slide` are dropped, see WORSE.
     """
 
     kappa: np.ndarray

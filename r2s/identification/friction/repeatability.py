@@ -18,7 +18,7 @@ REPEATS = 1e-3  # standard deviation between repeated ramps, relative to tau_max
 
 
 class Certainty(NamedTuple):
-    """Standard error `sigma` (n, 2) Nm of mean commands at release (NaN without releases), and degrees of freedom."""
+    """Standard error `sigma` (n, 2) Nm of mean release commands (NaN: no release); Student's degrees of freedom."""
 
     sigma: np.ndarray
     freedom: np.ndarray

@@ -43,7 +43,7 @@ class StaticFriction:
         return self.command + pull - left
 
     def slide(self, d: Dynamics) -> Slide:
-        """Return the joint's motion after each release (NaN without a release) for a Stribeck friction family."""
+        """Return parameters of motion after each release (NaN without a release) for a Stribeck friction family."""
         phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
         sign = np.where(self.side, 1.0, -1.0)
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
@@ -56,7 +56,7 @@ class StaticFriction:
         return Slide(kappa, level, viscous, fall, self._misfit)
 
     def breakaway(self, d: Dynamics) -> np.ndarray:
-        """Return the mean net torques (n, 2) Nm at release; directions without a ramp have the torques of `d`."""
+        """Return the mean net torques (n, 2) Nm at release; directions without a release have the torques of `d`."""
         net, out = self.net_torque(d), d.breakaway.copy()
         for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
             out[j, side] = net[(self.joint == j) & (self.side == side)].mean()

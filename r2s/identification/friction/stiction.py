@@ -73,8 +73,8 @@ def scan_breakaway(
     """Return the breakaway torques (n, 2) Nm with which `dynamics` replays the recording best.
 
     A gradient search would fail, because the replay error jumps if a joint starts to slide one step sooner. A pass
-    varies one breakaway torque at a time and minimizes the replay error of the same joint. Coarse passes scan from 0
-    to `largest` (n,) Nm, fine passes around the best value. Two passes are coarse, because joints affect each other.
+    varies one breakaway torque at a time and minimizes the replay error of its joint. Coarse passes scan from 0 to
+    `largest` (n,) Nm, fine passes ever more finely around the best value. Two are coarse: joints affect each other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

@@ -58,7 +58,7 @@ class BodySpace:
         return z[..., 0], z[..., 1:4], np.trace(second, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - second
 
     def standard(self, z: np.ndarray) -> np.ndarray:
-        """Return the standard parameters (..., 10) of bodies z: mass, then moments and tensor at the end effector."""
+        """Return standard parameters (..., 10) of bodies z about the end effector: mass, first moments, tensor."""
         mass, centre, tensor = self.body(z)
         return LinkInertia(mass, centre, tensor).standard()
 

@@ -152,7 +152,7 @@ class SlidingMotion:
     def command(self, delay: float, lag: float) -> np.ndarray:
         """Return window means (T, n) Nm of the command after the hold, the `delay` in s and the `lag` in s.
 
-        Torque at t is the mean of u(t - delay - hold - x), with uniform random hold and exponential x of mean `lag`.
+        It is the mean of u(t - delay - hold - x), with hold uniform over a step and x exponential with mean `lag`.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)

@@ -57,5 +57,5 @@ class PlannedMotion:
     rows = filtered
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the command (T, n) Nm with a `delay` and a `lag`, s, each approximated to first order in time."""
+        """Return the command (T, n) Nm that acts after `delay` and `lag`, s, to first order in both."""
         return self.tau - (delay + lag) * self.change

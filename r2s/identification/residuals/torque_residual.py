@@ -27,7 +27,7 @@ from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, small against the residual's curvature
-MAX_CORRELATION = 40  # rows, longest correlation length: a slowly drifting residual informs more than one row
+MAX_CORRELATION = 40  # rows, longest correlation length: a slowly drifting residual is worth more than one row
 MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 30_000  # longer recordings (from 5 min at 100 Hz) get fewer rows per s; the cutoff needs 20 per s
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
@@ -224,7 +224,7 @@ class TorqueResidual:
     def _changes(self, x: np.ndarray, stepped: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """Return [(block, indices in x, change)]: changes (T, n) of torque, or (n, 10 n, L) of standard parameters.
 
-        One evaluation per block suffices: friction acts on one joint, and torque is linear in standard parameters.
+        One evaluation per block suffices: friction acts on its joint only; torque is linear in standard parameters.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]

@@ -67,13 +67,13 @@ def cut_windows(
 
     Args:
         limit: largest number of windows; a longer recording yields `limit` evenly spaced windows.
-        slowest: rad/s. A joint slower than `slowest` ends a window, because a tiny parameter change can shift the
-            breakaway of a resting joint by a step and disturb all joints. Joints that never move are ignored.
+        slowest: rad/s. A window ends when a joint is slower; the next starts when all are faster, as a tiny parameter
+            change can shift a joint's breakaway by a step and disturb all. Joints that never move are ignored.
         edges: (n, 2) Nm, lower and upper breakaway command of each joint, widened by SCATTER. A slow joint ends a
             window only if its command lies between its two breakaway commands.
 
     Raises:
-        UserError: no trajectory is as long as a window, or in every window some joint is too slow.
+        UserError: no trajectory is as long as a window, or all joints hardly ever move at the same time.
     """
     grid = recording.resample(SIM_DT)
     steps = round(seconds / SIM_DT)

@@ -123,7 +123,7 @@ class SmoothMotion:
         return x
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the commanded torque (T, n) Nm after `delay` + `lag` s; a short lag acts like a delay."""
+        """Return the command (T, n) Nm after the hold, `delay` and `lag`, in s; a short lag acts like a delay."""
         return self.earlier(delay + lag + HOLD_STEPS * SIM_DT)
 
     def earlier(self, seconds: float) -> np.ndarray:

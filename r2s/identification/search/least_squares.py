@@ -15,7 +15,7 @@ class LeastSquares:
     """The least-squares search.
 
     Attributes:
-        max_evaluations: most Jacobians. ftol: relative decrease of the cost at which the search ends. minutes: limit.
+        max_evaluations: most Jacobians. ftol: least relative gain for another step. minutes: time limit.
         level: what to minimize: "residual" for `Problem.data` or, within seconds, "torque" for the torque residual.
     """
 

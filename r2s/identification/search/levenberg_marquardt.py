@@ -28,7 +28,7 @@ def minimize(
     """Return a local minimum u (P,) of the sum of squares in the unit cube, near `start` (P,).
 
     Args:
-        residual: maps C points (C, P) to residuals (C, R). linearize: maps a point to (residual, Jacobian) pairs.
+        residual: maps (C, P) to (C, R). linearize: maps (P,) to parts of residual (r,) and Jacobian (r, P).
         start, max_evaluations, ftol, minutes: see least_squares.py. name: name of the search in progress rows.
         report: function that receives a row of progress after every step.
     """

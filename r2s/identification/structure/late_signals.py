@@ -28,8 +28,8 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether torque is clearly late, "alike": whether to treat torque and dq as equally late}.
 
     r2s first fits torque with corrected dq. If torque then clearly has a delay, r2s corrects torque and dq.
-    Without a clear signal delay, only dq is corrected, if this lowers the error of held-out torque by more than one
-    standard error. In all other cases, r2s uses torque and dq as logged and treats torque and dq as equally late.
+    Without a clear delay, r2s corrects only dq if this lowers the error of held-out torque by more than one standard
+    error, else uses torque and dq as logged and treats both as equally late. With folds < 2, r2s corrects only dq.
     """
     if DELAY in terms and torque_is_late(cv, terms):
         return {"delayed": True, "alike": False}

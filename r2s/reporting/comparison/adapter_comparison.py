@@ -28,9 +28,9 @@ class AdapterComparison:
 
     Attributes:
         measures: {key: compared measure}. headline: the measure that summarizes a row.
-        scores: table with a line per measure, condition and row. `low` and `high` limit the 95 % interval of `mean`.
-            `difference` is `mean` minus the `mean` of the row `reference`. `worse_low` and `worse_high` limit the
-            95 % interval of the loss against `reference`. Of `asked` requested episodes, `episodes` were averaged.
+        scores: a line per measure, condition and row: `mean`, 95 % interval `low` to `high`; `difference` from the
+            row `reference` (None: no reference); 95 % interval `worse_low` to `worse_high` of how much worse it is;
+            numbers of `stopped`, requested (`asked`) and averaged (`episodes`) episodes, and of `arms`.
         losses: table with a line per condition and row. `value` is the mean of the headline measure in the condition;
             `nominal` is its mean over the same arms and episodes in the nominal condition.
         costs: table with a line per row. `us` is the adapter's computing time per cycle, microseconds.
@@ -181,7 +181,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the reference of row `name`: the adapt=none row with the same policy, else the only adapt=none row."""
+    """Return the reference of row `name`: the adapt=none row of its policy, else the only adapt=none row or None."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]

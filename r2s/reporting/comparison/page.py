@@ -46,7 +46,7 @@ def comparison_page(
         others: {folder without a finished training: reason}.
 
     Returns:
-        The tables {"scores", "improvement", "sensitivity": table}, which scores.py describes.
+        {"scores": table, "improvement": table, "sensitivity": table}, which scores.py describes.
     """
     groups, measures = grouped.members, measures_in(grouped.members)
     tables = {"scores": summary_table(groups), "improvement": improvement_table(groups)}

@@ -54,7 +54,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
     `best`, `median` and `worst` summarize the interquartile means of the settings. `best` is optimistic, because the
     same seeds select and score the setting. `held_out` is a mean over seeds, in which each seed scores the setting
-    that is best at all other seeds. `spread`, with 95 % interval over seeds, is `held_out` minus the median setting's
+    that is best at the other seeds. `spread`, with 95 % interval over seeds, is `held_out` minus the median setting's
     score, or nan for fewer than two common seeds. An algorithm with a small `spread` needs little tuning.
 
     Args:
@@ -79,7 +79,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return scores (S,) at S held-out seeds: of the setting that is best at all other seeds, and the median score.
+    """Return scores (S,) at S held-out seeds: of the setting that is best at the other seeds, and the median score.
 
     Args:
         settings: {seed: score} of each setting; a larger score is better. Only seeds common to all settings are used;
@@ -94,7 +94,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line for each algo or reward setting whose best value is the smallest or largest of at least three."""
+    """Return a line for each algo or reward setting whose best value is at an end of three or more tried values."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -118,7 +118,7 @@ def is_number(value: object) -> bool:
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return a square table for one measure of an `improvement_table`: probability that a row beats a column."""
+    """Return a square of strings for one measure of an `improvement_table`: probability that a row beats a column."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}

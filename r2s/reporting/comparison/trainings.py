@@ -37,7 +37,7 @@ class Trained:
         folder, seed, algo: run folder, random seed, name of the algorithm.
         settings: config values that the training used, such as {"algo.lr": 5e-4, "dr.phi_relative": 0.1}.
         alike: config values that comparable runs share, such as {"task.ctrl_hz": 50, "evaluation.episodes": 200}.
-        origin: commit, machine, threads and device from meta.json, or None; a controller only has a commit.
+        origin: commit, machine, threads and device from meta.json, each may be None; of a controller only the commit.
         typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether the run used +experiment=toy, a training too short for the policy to learn.
         minutes: budget of the run in minutes; None if the budget is in env_steps.
@@ -230,7 +230,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """List names by reason, ["a, b (failed)", "c (unfinished)"]: at most `most` names, cut to `width` letters."""
+    """List names as ["a, b (failed)", "c (unfinished)"]: `most` names per reason, cut to `width` letters."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

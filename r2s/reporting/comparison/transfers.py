@@ -33,7 +33,7 @@ class Transferred:
         arm: name such as "twin, rigid, seed 0". condition: result of `condition`. robot: robot config in training.
         measures: measures of the task. length: duration and policy rate, as "4 s at 100 Hz". goals: number of goals.
         us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
-        episodes: a row per episode, indexed by goal, with measures (`MeasureTable.transfer`), gap and arm_stopped.
+        episodes: a row per episode, indexed by goal, with `MeasureTable.transfer`, gap and arm_stopped (0 or 1).
     """
 
     folder: Path
@@ -103,7 +103,7 @@ def _cost(path: Path) -> float:
 
 
 def _names(goals: np.ndarray) -> Iterator[str]:
-    """Yield names of goals that are the same in all transfers; numbers distinguish goals at the same position.
+    """Yield a name per goal, the same in all transfers; a number distinguishes equal goals.
 
     Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometers.
     """
@@ -117,8 +117,8 @@ def _names(goals: np.ndarray) -> Iterator[str]:
 def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[str, str]]:
     """Return the largest set of comparable transfers, and {run: reason} for all other transfers.
 
-    Transfers are comparable if they agree in robot and task and share goals. Of several runs with the same policy,
-    adapter, arm and condition, only the latest run is used.
+    Transfers are comparable if robot, task and number of goals agree and they share goals. Of several runs with the
+    same policy, adapter, arm and condition, only the latest run is used.
     """
     first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
     apart = {r.folder.name: why for r in found if (why := _difference(r, first))}

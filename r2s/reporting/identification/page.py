@@ -82,7 +82,7 @@ def identification_page(
     """Write the report (Markdown, HTML), figures, base_parameters.csv, torque.npz and recording.rrd.
 
     Args:
-        run: run of the identification. nominal: nominal model. found: identified model. validation: held-out motion.
+        run: run of the identification. nominal: nominal model. found: the result. validation: held-out motion.
         summary: content of summary.json. window_s: length of a replay, s. cutoff_hz: low-pass of the torque fit, Hz.
         more: further sections of the page, {heading: items}, which follow the prediction errors.
     """

@@ -1,1 +1,1 @@
-"""Show runs in experiment-tracking tools: async_tracker.py calls one tracker per tool."""
+"""Show a run in experiment-tracking tools while it is running: async_tracker.py calls one tracker per tool."""

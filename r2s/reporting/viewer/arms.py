@@ -123,7 +123,7 @@ def _boxes(arm: _Arm, up: np.ndarray) -> None:
 
 
 def _paths(arm: _Arm) -> None:
-    """Log each episode's path, the current goal on the path, and the end effector's trail in the error's color."""
+    """Log each episode's path, the current goal on the path, and the end effector's trail, colored by error."""
     pairs = list(zip(arm.episodes, arm.frames, strict=True))
     grey = rr.LineStrips3D.from_fields(colors=[150, 150, 150], radii=0.0015)
     arm.send("path", grey, rr.LineStrips3D.columns(strips=[e.goal for e in arm.episodes]), per_episode=True)

@@ -43,7 +43,7 @@ def log_series(
 
 
 def starts_of(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
-    """Return K start times, equal for all arms, and the end time of the last episode: (K + 1,) s."""
+    """Return the start times of K episodes, equal for all arms, and the end time of the last one: (K + 1,) s."""
     count = max((len(sequence) for sequence in episodes.values()), default=0)
     longest = [max(s[k].duration for s in episodes.values() if k < len(s)) + PAUSE for k in range(count)]
     return np.concatenate([[0.0], np.cumsum(longest)])
@@ -84,7 +84,7 @@ def _picture(name: str, title: str) -> rrb.View:
 
 
 def _learning_tab(curves: Iterable[Measure], pictured: bool) -> rrb.Container:
-    """Return a tab with the learning curves as a figure and as plots; the timeline `time` has no learning curves."""
+    """Return a tab with learning curves as plots, and if `pictured` as a figure; the timeline `time` has none."""
     plots = _plots({m.heading: entity(LEARNING, m.title) for m in curves}, rrb.Corner2D.RightBottom)
     live = rrb.Grid(*plots, grid_columns=3, name="plots: select the timeline env_steps or wall_clock below")
     return rrb.Tabs(*[_picture(LEARNING, "figure")] * pictured, live, active_tab=0, name="learning")
