@@ -2,7 +2,8 @@
 
 `python benchmarks/long_logs.py [KIND ...] [MINUTES ...]` writes recordings at 1 kHz of a synthetic arm of
 three joints, 1, 4, 15 and 60 minutes, and identifies each by the command line: time, and the largest resident memory
-of the process. Writes benchmarks/results/long_logs.md and long_logs.png.
+of the process. Writes benchmarks/results/long_logs.md and long_logs.png from all rows in runs/long_logs.csv, so that
+one kind of torque can be measured again.
 """
 
 import multiprocessing
@@ -36,6 +37,7 @@ KINDS = ("measured", "motor", "commanded")
 DELAY_ROWS = 3  # ms, of the arm's response to a command
 COULOMB, VISCOUS = np.array([12.0, 9.0, 4.0]), np.array([6.0, 4.0, 2.0])  # Nm, Nm s/rad
 NOISE = 1e-5, 3e-3, 2e-3  # rad, rad/s, and of tau_max: standard deviations
+ROWS = ROOT / "runs" / "long_logs.csv"
 CHUNK = 60_000  # rows written at once
 COARSE_S = 0.01  # s between the moments at which rigid-body torque is computed
 
@@ -81,7 +83,7 @@ def identified(arm: Path, torque: str, path: Path) -> tuple[float, float]:
     _, status, usage = os.wait4(child.pid, 0)
     if status:
         sys.exit(f"{' '.join(command)}: exit status {os.waitstatus_to_exitcode(status)}")
-    return time.perf_counter() - began, usage.ru_maxrss / 1024
+    return time.perf_counter() - began, usage.ru_maxrss * 1024 / 1e6  # from KiB
 
 
 def draw(table: pd.DataFrame) -> None:
@@ -91,9 +93,13 @@ def draw(table: pd.DataFrame) -> None:
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     for kind, one in table.groupby("torque", sort=False):
-        for axis, key in zip(axes, ("s", "MB"), strict=True):
-            axis.loglog(one["minutes"], one[key], "o-", label=kind)
-            axis.set(xlabel="length of the recording, min", ylabel=key)
+        for axis, (key, label) in zip(axes, {"s": "time, s", "MB": "largest memory, MB"}.items(), strict=True):
+            axis.plot(one["minutes"], one[key], "o-", label=kind)
+            axis.set(xlabel="length of the recording, min", ylabel=label, xscale="log")
+            axis.set_xticks(MINUTES, [f"{x:g}" for x in MINUTES], minor=False)
+            axis.minorticks_off()
+    for axis in axes:
+        axis.set_ylim(bottom=0)
     axes[0].legend()
     figure.savefig(RESULTS / "long_logs.png", dpi=110)
 
@@ -120,7 +126,17 @@ def main() -> None:
                     continue
                 rows.append({"torque": torque, "minutes": minutes, "s": round(seconds), "MB": round(memory)})
                 print(rows[-1], flush=True)
-    write(pd.DataFrame(rows))
+    write(merged(pd.DataFrame(rows)))
+
+
+def merged(new: pd.DataFrame) -> pd.DataFrame:
+    """Add rows to runs/long_logs.csv in place of older ones of the same kind and length; return all rows."""
+    old = pd.read_csv(ROWS) if ROWS.exists() else new[:0]
+    both = pd.concat([old, new]).drop_duplicates(["torque", "minutes"], keep="last")
+    both = both.sort_values(["torque", "minutes"], key=lambda x: x.map(KINDS.index) if x.name == "torque" else x)
+    ROWS.parent.mkdir(exist_ok=True)
+    both.to_csv(ROWS, index=False)
+    return both.reset_index(drop=True)
 
 
 def write(table: pd.DataFrame) -> None:

@@ -18,6 +18,7 @@ from r2s.recordings.recording import Recording
 
 HORIZON, WINDOWS = 0.5, 60  # length (s, enough for stops) and number of the replays that choose a model
 SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # in `scan_breakaway`: windows, passes, and how many passes are coarse
+SCAN_BATCH = 12  # candidates replayed at once: 600 arms, which take a third of the memory of 36 candidates
 LEAST = 5e-4  # least friction to which the scan range is proportional, relative to tau_max
 POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points in a coarse pass; per side in a fine pass; divisor of its step
 
@@ -80,7 +81,7 @@ def scan_breakaway(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
     )
     windows = cut_windows(recording, window_s, limit=SCAN_WINDOWS)
-    data = ReplayResidual(space, recording, windows, stride=stride, nthread=nthread)
+    data = ReplayResidual(space, recording, windows, stride=stride, batch=SCAN_BATCH, nthread=nthread)
     x, most = space.start, np.tile(largest, 2)[:, None]
     step = most / (POINTS - 1)
     sign = np.repeat([-1.0, 1.0], robot.n)
