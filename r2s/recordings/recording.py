@@ -94,7 +94,7 @@ class Recording:
             raise UserError(f"expected at least {MIN_ROWS} rows, got {len(t)}")
 
     def _check_trajectories(self):
-        index = self.trajectory.astype(np.int64, copy=False)
+        index = self.trajectory.astype(np.int32, copy=False)
         if not np.array_equal(index, self.trajectory):
             row = int(np.flatnonzero(index != self.trajectory)[0])
             raise UserError(f"expected whole numbers in trajectory, got {self.trajectory[row]:g} at row {row}")
@@ -373,7 +373,7 @@ def declared_torque(torque: str | None) -> str:
 
 
 def _floats(field: str, value) -> np.ndarray:
-    own = np.int64 if field == "trajectory" else np.float64
+    own = np.int32 if field == "trajectory" else np.float64
     if isinstance(value, np.ndarray) and value.dtype == own and not value.flags.writeable:
         return np.ascontiguousarray(value)  # a read-only array comes from a recording or reader and needs no copy
     try:
