@@ -12,6 +12,7 @@ from r2s.recordings.recording import Recording
 
 M_MMAP_THRESHOLD, MAPPED = -3, 4 << 20  # option of glibc's mallopt(3); bytes
 LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of MB
+MANY = 10  # parts; more than these are pieces of a recording longer than LONG_S
 
 
 def give_back(recording: Recording) -> None:
@@ -33,8 +34,8 @@ def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np
     out = {}
     for name in names:
         out[name] = np.concatenate([vars(part).pop(name) for part in parts])
-        if out[name].nbytes > MAPPED:
-            _trim()
+        if len(parts) > MANY and out[name].nbytes > MAPPED:
+            _trim()  # only here: mapping large blocks one by one slows a short identification
     return out
 
 
