@@ -4,7 +4,9 @@
 earlier state of r2s), and writes benchmarks/results/scaling.md. `only=NAME` computes one row, `json` prints figures.
 """
 
+import inspect
 import json
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -16,7 +18,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from common import conf, identify_settings, markdown_rows, searches, write_page
+from scipy.signal import lfilter
 
+from r2s.adaptation.arm_model import make_arm_model
+from r2s.adaptation.estimator import Estimator
+from r2s.adaptation.feedforward import plausible_payload
+from r2s.adaptation.momentum import BODY
+from r2s.adaptation.noise_model import default_noise
 from r2s.identification.identify import identify
 from r2s.identification.parameters import logarithmic
 from r2s.physics.actuation import EARLY, Motors
@@ -37,6 +45,20 @@ MASS = 1.15, 0.9, 1.1  # true masses over nominal ones, in turn
 DELAY = 2e-3  # s
 FINE = 10  # steps of the simulated arm in 1 ms: a real one moves in continuous time
 BANDWIDTH = 10.0  # 1/s, of the controller that follows the motion
+ROTOR = 5e-3  # kg m^2 per Nm of tau_max
+LATE = {  # s, time constant of the filter of dq; rows (ms) that torque comes late
+    "on time": (0.0, 0),
+    "dq behind a 10 ms filter": (0.01, 0),
+    "torque 8 ms late": (0.0, 8),
+    "both late": (0.01, 8),
+}
+RIPPLE, PITCH = 0.05, 25.0  # of Coulomb friction; 1/rad
+SEEDS = 4  # motions of each ripple setting
+PERIOD_S = 8.0  # of repeated motion
+TRACKING = 0.015  # rad RMS
+HEAVY, FAR = 3.0, 0.15  # kg, m
+PAUSE_S = 600.0
+COVERED = "95 % intervals that hold the truth"
 
 
 def arm(n, largest, file=""):
@@ -68,22 +90,27 @@ def truth_of(robot, friction=1.0, links=MASS):
     return replace(d, offset=OFFSET_SHARE * tau * np.where(np.arange(n) % 2, -1, 1), delay=DELAY)
 
 
-def motion(robot, t, seed):
-    """Return q, dq, ddq (T, n) of a sum of sines about home."""
+def motion(robot, t, seed, slower=1.0, period=None):
+    """Return q, dq, ddq (T, n) of a sum of sines about home; with a period (s) they repeat."""
     rng, n = np.random.default_rng(seed), robot.n
     out = np.zeros((3, len(t), n))
     for f in (0.15, 0.37, 0.83, 2.3):
-        w, a, phase = 2 * np.pi * f, 0.15 / f**0.7 * rng.uniform(0.5, 1.0, n), rng.uniform(0, 2 * np.pi, n)
+        f = round(f * period) / period if period else f / slower
+        w, a, phase = (
+            2 * np.pi * f,
+            0.15 / (f * slower) ** 0.7 * rng.uniform(0.5, 1.0, n),
+            rng.uniform(0, 2 * np.pi, n),
+        )
         s, c = a * np.sin(w * t[:, None] + phase), a * np.cos(w * t[:, None] + phase)
         out += s, w * c, -(w**2) * s
     out[0] += robot.q_home + 0.3
     return out
 
 
-def log(robot, truth, torque, hz=1000, seconds=16.0, seed=0):
+def log(robot, truth, torque, hz=1000, seconds=16.0, seed=0, **how):
     """Return a recording at `hz`; commands are held from row to row."""
     t, rng, every = 1e-3 * np.arange(round(1e3 * seconds)), np.random.default_rng(seed), 1000 // hz
-    q, dq, ddq = motion(robot, t, seed)
+    q, dq, ddq = motion(robot, t, seed, **how)
     model = robot.model(gravity=torque != "commanded")
     set_links(model, truth.mass, truth.com, truth.inertia, truth.armature)
     data, tau = mujoco.MjData(model), np.empty_like(q)
@@ -127,14 +154,17 @@ def judge(found, truth):
     speeds = np.array([-1.0, -0.1, 0.1, 1.0])[:, None] + 0 * tau
     had, has = (x.friction(speeds) - x.offset for x in (d, truth))
     worst = (np.abs(had - has) / np.abs(truth.friction(speeds))).max()
-    return {"friction - offset, %": 100 * worst, "inside": int(inside.sum()), "of": len(inside)}
+    seen, counts = found.found.identifiable, {"inside": inside, "of": inside | True}
+    counts |= {"seen inside": inside & seen, "seen": seen}
+    return {"friction - offset, %": 100 * worst, **{name: int(mask.sum()) for name, mask in counts.items()}}
 
 
 def summed(results):
     """Return the worst of the errors and the coverage over all arms."""
-    inside, of = (sum(r.pop(k) for r in results) for k in ("inside", "of"))
+    inside, of, seen, known = (sum(r.pop(k) for r in results) for k in ("inside", "of", "seen inside", "seen"))
     worst = {f"worst {k}": f"{max(r[k] for r in results):.2f}" for k in results[0]}
-    return worst | {"intervals with the truth": f"{inside}/{of} = {100 * inside / of:.0f} %"}
+    share = f"{inside}/{of} = {100 * inside / of:.0f} %"
+    return worst | {COVERED: f"{share}; identifiable {seen}/{known} = {100 * seen / max(known, 1):.0f} %"}
 
 
 def priors():
@@ -181,6 +211,129 @@ def wrong_masses():
     return summed(results)
 
 
+def late_signals():
+    """Row 4: inertia about each joint axis, of measured and motor torque."""
+    out, results = {}, []
+    for name, (dq_s, rows) in LATE.items():
+        worst = 0.0
+        for n, largest in (ARMS[1], ARMS[3]):
+            for torque in ("measured", "motor"):
+                robot = arm(n, largest, f'armature="{ROTOR * largest}"' if torque == "motor" else "")
+                truth = truth_of(robot, links=MASS if torque == "measured" else (1.0,))
+                found = found_in(robot, delayed(log(robot, truth, torque, seconds=10.0), dq_s, rows))
+                results.append(judge(found, with_delay(truth, rows)))
+                had, has = (axis_inertia(robot, d) for d in (found.dynamics, truth))
+                worst = max(worst, np.abs(had / has - 1).max())
+        out[f"{name}: worst inertia about a joint's axis, %"] = f"{100 * worst:.1f}"
+    total = summed(results)
+    return out | {COVERED: total[COVERED]}
+
+
+def delayed(r, dq_s, rows):
+    """Return the recording with dq behind a filter of first order (time constant, s) and torque some rows late."""
+    keep = np.exp(-1e-3 / dq_s) if dq_s else 0.0
+    dq = lfilter([1 - keep], [1, -keep], r.dq, axis=0, zi=keep * r.dq[:1])[0]
+    return replace(r, dq=dq, tau=np.concatenate([np.repeat(r.tau[:1], rows, 0), r.tau[: len(r.tau) - rows]]))
+
+
+def with_delay(truth, rows):
+    """Return the truth with the delay of the torque signal; earlier states of r2s have no such parameter."""
+    return replace(truth, signal_delay=1e-3 * rows) if hasattr(truth, "signal_delay") else truth
+
+
+def axis_inertia(robot, d):
+    """Return the inertia (n,) kg m^2 of each joint at home, the other joints at rest."""
+    model = robot.model(gravity=False)
+    set_links(model, d.mass, d.com, d.inertia, d.armature)
+    data, out = mujoco.MjData(model), []
+    for j in range(robot.n):
+        data.qpos[:], data.qvel[:], data.qacc[:] = robot.q_home, 0.0, np.eye(robot.n)[j]
+        mujoco.mj_inverse(model, data)
+        out.append(data.qfrc_inverse[j])
+    return np.array(out)
+
+
+def ripple():
+    """Row 6: link-side torque with a ripple over the angle, by how the motion was recorded."""
+    ways = {
+        "once": {"seconds": 16.0},
+        "six times": {"seconds": 6 * PERIOD_S, "period": PERIOD_S},
+        "four times slower": {"seconds": 64.0, "slower": 4.0},
+        "30 trajectories of 2 s": {"seconds": 60.0},
+    }
+    out = {}
+    for name, how in ways.items():
+        results = []
+        for n, largest in ARMS[:2]:
+            for seed in range(SEEDS):
+                robot = arm(n, largest)
+                truth = truth_of(robot)
+                r = log(robot, truth, "measured", seed=seed, **how)
+                phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, n)
+                r = replace(r, tau=r.tau + RIPPLE * COULOMB_SHARE * robot.tau_max * np.sin(PITCH * r.q + phase))
+                if "trajectories" in name:
+                    index = np.floor(r.t / 2.0 + 1e-9)
+                    r = replace(r, t=r.t - 2.0 * index, trajectory=index)
+                results.append(judge(found_in(robot, r.in_phase()), truth))
+        out[f"motion {name}: {COVERED}"] = summed(results)[COVERED]
+    return out
+
+
+def repeats():
+    """Row 7: how much of the validation motion the fit has seen, if repetitions differ by the tracking error."""
+    robot = arm(*ARMS[1])
+    t = 1e-3 * np.arange(round(1e3 * 6 * PERIOD_S))
+    q, dq, _ = motion(robot, t, 0, period=PERIOD_S)
+    off = motion(robot, t, 1)[0]
+    r = Recording(t, q + TRACKING * (off - off.mean(0)) / off.std(0), dq, 0 * q, "measured").in_phase()
+    train, held = (np.unique(np.round(part.t % PERIOD_S, 2)) for part in r.split(0.25))
+    share = 100 * np.isin(held, train).mean()
+    first, second = (r.select((r.t >= a) & (r.t < a + PERIOD_S)) for a in (0.0, PERIOD_S))
+    return {
+        "phases of held-out motion that were trained on, %": f"{share:.0f}",
+        "a repetition as validation file: motion recognized, %": f"{100 * second.overlap(first):.0f}",
+    }
+
+
+def memory():
+    """Row 8: largest resident memory of a process that identifies link-side torque of three joints."""
+    pool, out = multiprocessing.get_context("spawn"), {}
+    for seconds in (20, 80, 240):
+        with pool.Pool(1) as one:
+            out[f"{seconds} s at 1 kHz, MB"] = f"{one.apply(memory_of, (seconds,)):.0f}"
+    return out
+
+
+def memory_of(seconds):
+    """Identify and return the largest resident memory in MB."""
+    robot = arm(*ARMS[1])
+    found_in(robot, log(robot, truth_of(robot), "measured", seconds=float(seconds)))
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e6
+
+
+def payload_limit():
+    """Row 9: the part of a payload's moment that the online estimate compensates."""
+    x, out, robot = np.zeros(BODY), np.zeros(BODY), arm(*ARMS[3])
+    x[:2] = HEAVY, HEAVY * FAR
+    robot = replace(robot, payload_max=(HEAVY, FAR)) if hasattr(robot, "payload_max") else robot
+    plausible_payload(x, *([np.array(robot.payload_max)] if hasattr(robot, "payload_max") else []), out)
+    return {f"{HEAVY:g} kg at {100 * FAR:g} cm, moment compensated, %": f"{100 * out[1] / x[1]:.0f}"}
+
+
+def pause():
+    """Row 10: width of an offset's interval after a pause, over the width before."""
+    robot = arm(*ARMS[2])
+    model = make_arm_model(robot, truth_of(robot))
+    estimator, at = Estimator(model, default_noise(model)), BODY + robot.n
+    estimator.internals[0].P[:] *= 1e-4  # as after long motion
+    before = estimator.internals[0].P[at, at]
+    knows = "pause_s" in inspect.signature(estimator.begin).parameters
+    estimator.begin(*[PAUSE_S] * knows)
+    ratio = np.sqrt(estimator.internals[0].P[at, at] / before)
+    return {f"width of an offset after {PAUSE_S:g} s without rows, times": f"{ratio:.1f}"}
+
+
 def command_hold():
     """Row 5: a delay of 2 ms, with a command in every row of the log."""
     out = {}
@@ -219,8 +372,8 @@ def identifiable():
 
 
 ROWS = {"1 priors": priors, "2 bounds": bounds, "3 file": file_friction, "3 masses": wrong_masses}
-ROWS |= {"5 hold": command_hold}
-ROWS |= {"12 identifiable": identifiable}
+ROWS |= {"4 late": late_signals, "5 hold": command_hold, "6 ripple": ripple, "7 repeats": repeats, "8 memory": memory}
+ROWS |= {"9 payload": payload_limit, "10 pause": pause, "12 identifiable": identifiable}
 
 
 def main() -> None:

@@ -293,6 +293,19 @@ def test_repetitions_started_by_hand_are_aligned():
     assert apart.in_phase() is apart
 
 
+@pytest.mark.parametrize("error", [0.005, 0.008, 0.015])
+def test_a_soft_arm_repeats_its_motion(error):
+    """Six repetitions, each with another tracking error (rad RMS), have a period; no phase is in both parts."""
+    period, t, rng = 6.66, np.arange(0, 40, 5e-3), np.random.default_rng(0)
+    slow = rng.uniform(0.02, 0.9, (20, 1, 3)) * 2 * np.pi * t[:, None] + rng.uniform(0, 2 * np.pi, (20, 1, 3))
+    off = np.sin(slow).sum(0)
+    q = 0.5 * np.sin(2 * np.pi * t[:, None] / period + np.arange(3)) + error * off / off.std(0)
+    r = Recording(t, q, 0 * q, q, "measured").in_phase()
+    assert r.period == pytest.approx(period, abs=0.1)
+    train, validation = r.split(0.25)
+    assert phase_distance(train.t, validation.t, r.period) >= SPLIT_GUARD_S - 1e-9
+
+
 def test_slow_motion_has_no_period():
     """At 0.01 rad/s postures half a second apart are equal within the tolerance, but that is no period."""
     t = np.arange(0, 60, 0.02)

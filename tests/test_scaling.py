@@ -172,6 +172,25 @@ def test_a_log_of_seconds_lets_no_candidate_in(arm, seconds):
     assert not {b for term in candidates for b in blocks_of(term)} & set(found.space.blocks)
 
 
+@pytest.mark.parametrize("torque", ["measured", "motor"])
+def test_intervals_allow_for_a_removed_term(arm, torque):
+    """The file's masses are 10 to 15 % off, and elimination removes them: a payload and gains replace their effect.
+
+    At least 90 % of the intervals hold the truth. From the selected model alone, 69 and 43 % of the intervals of
+    benchmarks/scaling.py held it.
+    """
+    robot, how = arm(1.0), conf("identify/default")
+    truth, share = truth_of(robot), 1 / np.array([1.15, 0.9, 1.1])
+    wrong = replace(robot, mass=share * robot.mass, inertia=share[:, None, None] * robot.inertia)
+    truth = replace(truth, mass=robot.mass, inertia=robot.inertia)
+    own = {"terms": how["terms"][torque], "prunable_terms": how["prunable_terms"][torque]}
+    found = found_in(wrong, log_of(robot, torque), **own)
+    assert "link_alpha" not in found.space.blocks
+    true = replace(found.space, nominal=truth).start
+    inside = (found.found.low - 1e-9 <= true) & (true <= found.found.high + 1e-9)
+    assert inside.mean() >= 0.9
+
+
 def test_commands_between_the_rows_of_a_slow_log():
     """Held from row to row, or with a stated period interpolated at the rows that the log left out."""
     t, zero = 4e-3 * np.arange(12), np.zeros((12, 1))

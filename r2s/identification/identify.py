@@ -25,7 +25,16 @@ from r2s.identification.known import Known
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.posterior import posterior
 from r2s.identification.prediction import REPLAYED_S
-from r2s.identification.problem import Problem, Report, Search, fits_torque, implicit_friction
+from r2s.identification.problem import (
+    Problem,
+    Report,
+    Search,
+    fit_torque,
+    fits_torque,
+    implicit_friction,
+    without,
+    worse_on_torque,
+)
 from r2s.identification.residuals.replay_residual import ReplayResidual
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.residuals.windows import SCATTER, cut_windows
@@ -51,7 +60,6 @@ CLEAR = 1.5  # a replayed joint slower than this multiple of dq_min may stick
 MAX_BATCH = 64  # candidates replayed at once
 SELECTED_S = 240.0  # s; the selection of friction family and terms uses at most this much of a recording
 REWEIGHTS = 2  # further fits of a local search, each with weights from the residual of the previous fit
-ALIKE = 0.2  # relative uncertainty of the number of independent rows, and so of a sum of squares
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
 
@@ -83,6 +91,7 @@ class State:
     Attributes:
         robot, nominal, recording, searches, settings, ramps: see `identify`. `select_family` sets nominal.family.
         prior: {parameter: prior standard deviation in SI units}. terms: model terms to estimate besides friction.
+        unpruned: the terms before `prune_terms` removed some; () if it removed none.
         families: {friction family: prediction error of held-out torque}; empty if the user chose the family.
         space: the parameter space; `fit_breakaway` and `fit_stiction` add their breakaway and stiction values.
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
@@ -100,6 +109,7 @@ class State:
     prior: dict[str, ArrayLike]
     history: History
     terms: Sequence[str] = ()
+    unpruned: Sequence[str] = ()
     families: dict[str, float] = field(default_factory=dict)
     space: ParameterSpace = None  # type: ignore[assignment] # `formulate` sets these three
     problem: Problem = None  # type: ignore[assignment]
@@ -169,8 +179,9 @@ def identify(
         give_back(recording)
         s = step(s)
     sure = history.step("posterior", lambda: posterior(s.problem, s.u, settings.seed)._asdict())
+    wide = {} if s.commanded else history.step("intervals of all terms", lambda: widest_intervals(s))
     story = {"families": s.families, "edges": s.edges, "refused": s.refused}
-    return conclude(s.problem, s.space, sure, history=pd.DataFrame(history.rows), **story)
+    return conclude(s.problem, s.space, sure, wide, history=pd.DataFrame(history.rows), **story)
 
 
 def select_family(s: State) -> State:
@@ -214,7 +225,23 @@ def prune_terms(s: State) -> State:
         return s
     given = s.cross_validation, s.terms, prunable
     needed = s.history.step("prunable terms", lambda: eliminate_terms(*given))["needed"]
-    return replace(s, terms=[name for name, keep in zip(s.terms, needed, strict=True) if keep])
+    kept = [name for name, keep in zip(s.terms, needed, strict=True) if keep]
+    return replace(s, terms=kept, unpruned=s.terms if len(kept) < len(s.terms) else ())
+
+
+def widest_intervals(s: State) -> dict[str, np.ndarray]:
+    """Return 95 % intervals of the kept values with all terms and usual priors: low, high (P,) on the unit cube.
+
+    Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
+    replaces a removed one, for example a payload replaces the error of a link's mass. The fit's priors serve
+    prediction and can be narrower than the scatter among arms, so they alone may decide between two values.
+    """
+    full = formulate(replace(s, terms=s.unpruned or s.terms))
+    u, problem = fit_torque(full.problem.with_usual_prior())
+    draws = u + posterior(problem.reweighted(u, fitted=True), u, s.settings.seed).steps
+    at = [full.space.names.index(name) for name in s.space.names]
+    low, high = np.quantile(draws[:, at], [0.025, 0.975], axis=0)
+    return {"low": low, "high": high}
 
 
 def formulate(s: State) -> State:
@@ -361,34 +388,3 @@ def _run(
     """Return the solution of a search, and the problem, which is reweighted if the search fits torque."""
     v = np.asarray(s.history.step(name, lambda: {"u": search(problem, u, report or s.history.add)})["u"])
     return v, problem.torque_reweighted(v) if fits_torque(search) else problem
-
-
-def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
-    """Return whether values v (P,) explain the torque clearly worse than values u (P,) that were fitted to torque.
-
-    If v is correct, its estimation error still raises the sum of squares by about P. The sum of squares has the
-    relative uncertainty ALIKE, because the number of independent rows is uncertain.
-    """
-    fitted = problem.on_torque.cost(u)
-    rise = problem.on_torque.cost(v) - fitted
-    return bool(rise > max(len(u), ALIKE * fitted))
-
-
-def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return the solution u (P,) of a local search, with the lag u[at] estimated only if the data require a lag.
-
-    If torque changes slowly, a short lag acts like a delay. The data require a lag if it lowers the cost by more than
-    the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The comparison omits the block
-    that favors the lag most, because the rows of a block are correlated.
-    """
-    having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
-    u = start.copy()
-    u[at] = problem.start[at]
-    u = search(fixed, u, report)
-    if fits_torque(search):
-        fixed = fixed.torque_reweighted(u)
-    u[at] = problem.start[at]  # exactly the start value: `reweight` recognizes a fixed lag by this equality
-    without, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
-    most = np.bincount(problem.clusters, (without - having)[:rows]).max()
-    needed = without.sum() - having.sum() - most > np.log(rows)
-    return search(replace(fixed, sigma=problem.sigma), start, report) if needed else u

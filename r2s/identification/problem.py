@@ -20,6 +20,7 @@ FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bound
 TAIL = 25.0  # for link-side torque, the prior is Student's t: degrees of freedom plus 1
 # implicit friction: least significance of its effect in standard deviations; range of actual over expected size
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
+ALIKE = 0.2  # relative uncertainty of the number of independent rows, and so of a sum of squares
 ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more: nominal friction may be off by tens of Nm
 FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by less (relative)
 Report = Callable[[dict], None]
@@ -106,6 +107,12 @@ class Problem:
         sigma = self.sigma.copy()
         sigma[at] = FIXED * self.space.width[at]
         return replace(self, sigma=sigma)
+
+    def with_usual_prior(self) -> "Problem":
+        """Return the problem with every prior at least as wide as the scatter among arms, `ParameterSpace.usual`."""
+        usual = np.where(np.isinf(self.space.usual), self.sigma, self.space.usual)
+        own = np.isinf(self.sigma) | (self.sigma < 2 * FIXED * self.space.width)  # flat or fixed
+        return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
         """Return the problem with flat priors of the values in `names`, whose prior is an extra residual."""
@@ -194,6 +201,37 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
         if k < rounds - 1:
             problem = problem.reweighted(u, fitted=True)
     return u, problem
+
+
+def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
+    """Return whether values v (P,) explain the torque clearly worse than values u (P,) that were fitted to torque.
+
+    If v is correct, its estimation error still raises the sum of squares by about P. The sum of squares has the
+    relative uncertainty ALIKE, because the number of independent rows is uncertain.
+    """
+    fitted = problem.on_torque.cost(u)
+    rise = problem.on_torque.cost(v) - fitted
+    return bool(rise > max(len(u), ALIKE * fitted))
+
+
+def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
+    """Return the solution u (P,) of a local search, with the lag u[at] estimated only if the data require a lag.
+
+    If torque changes slowly, a short lag acts like a delay. The data require a lag if it lowers the cost by more than
+    the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The comparison omits the block
+    that favors the lag most, because the rows of a block are correlated.
+    """
+    having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
+    u = start.copy()
+    u[at] = problem.start[at]
+    u = search(fixed, u, report)
+    if fits_torque(search):
+        fixed = fixed.torque_reweighted(u)
+    u[at] = problem.start[at]  # exactly the start value: `reweight` recognizes a fixed lag by this equality
+    without, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
+    most = np.bincount(problem.clusters, (without - having)[:rows]).max()
+    needed = without.sum() - having.sum() - most > np.log(rows)
+    return search(replace(fixed, sigma=problem.sigma), start, report) if needed else u
 
 
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:

@@ -10,14 +10,13 @@ from itertools import pairwise
 import numpy as np
 
 STEP = 0.02  # s, grid of the comparison
-TOLERANCE = 0.01  # rad RMS, tracking difference between two repetitions of one motion
-MIN_MOTION = 3.0  # least standard deviation of a joint's motion, as a multiple of TOLERANCE; peak to peak about 10
+MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances; peak to peak about 10
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
 MAX_COMPARED = 60  # limit on the tracks compared with one track and on the pieces in `overlap`, for speed
 PIECE_S, PIECE_MOTION = 1.0, 2.0  # least duration (s) and range (standard deviations of the motion) of a piece
-TRACKING = 0.02  # rad RMS, tracking error of a slow or soft arm
-# smallest and largest tolerance of `overlap`, in standard deviations; at 0.2 single joints of unrelated motion match
+TRACKING = 0.03  # rad RMS, difference between two repetitions, each with 15 to 20 mrad of tracking error
+# smallest and largest tolerance, in standard deviations; at 0.2 single joints of unrelated motion match
 SIMILAR = 0.04, 0.12
 STILL = 0.25  # lower bound on a joint's standard deviation, relative to the largest of all joints
 
@@ -60,12 +59,12 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
     The shifts align the phase of a motion that occurs in several tracks. The period is None if no motion repeats. If
     no track repeats itself, but tracks repeat each other, the period is the time span of all aligned tracks.
     """
-    shift, found, period = np.zeros(len(tracks)), False, None
-    for k, b in enumerate(tracks):
-        if period is None and (lag := _own_lag(b)):
+    shift, found, period, tolerance = np.zeros(len(tracks)), False, None, _tolerance(tracks)
+    for k, b in enumerate(tracks if tolerance.any() else []):
+        if period is None and (lag := _own_lag(b, tolerance)):
             period = lag * STEP
         for i, a in enumerate(tracks[: min(k, MAX_COMPARED)]):
-            if (other := _lag(a, b)) is not None:
+            if (other := _lag(a, b, tolerance)) is not None:
                 shift[k] = shift[i] + a.start + other * STEP - b.start
                 found = True
                 break
@@ -78,11 +77,9 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that occurs in `training`, in all joints at the same time.
 
-    A piece of motion occurs in `training` if each joint's RMS distance is below the joint's tolerance. A joint's
-    tolerance is TRACKING, clipped to the range SIMILAR times the joint's standard deviation in `other`.
+    A piece of motion occurs in `training` if each joint's RMS distance is below the joint's `_tolerance` in `other`.
     """
-    deviation = np.nanstd(np.concatenate([track.q for track in other]), axis=0) if other else np.zeros(1)
-    tolerance = np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
+    tolerance, deviation = _tolerance(other), _deviation(other)
     pieces = [piece for track in other for piece in _pieces(track.q, PIECE_MOTION * deviation.max())]
     pieces = pieces[:: 1 + len(pieces) // MAX_COMPARED]
     repeated = 0
@@ -93,6 +90,20 @@ def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
                 repeated += 1
                 break
     return repeated / max(len(pieces), 1)
+
+
+def _deviation(tracks: Sequence[Track]) -> np.ndarray:
+    """Return the standard deviation (n,) rad of each joint's angle over all tracks."""
+    return np.nanstd(np.concatenate([track.q for track in tracks]), axis=0) if tracks else np.zeros(1)
+
+
+def _tolerance(tracks: Sequence[Track]) -> np.ndarray:
+    """Return the RMS distance (n,) rad, per joint, below which two pieces of motion in `tracks` count as the same.
+
+    It is TRACKING, clipped to the range SIMILAR times the joint's standard deviation.
+    """
+    deviation = _deviation(tracks)
+    return np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
 
 
 def _pieces(q: np.ndarray, motion: float) -> list[np.ndarray]:
@@ -137,32 +148,33 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return np.maximum(square, 0.0), variance, count
 
 
-def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the RMS distance (L,) rad between a and b, and the number of their common rows (L,), at L lags.
+def _errors(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest ratio (L,) of a joint's RMS distance between a and b to its tolerance (n,) rad, at L lags.
 
-    The distance is inf at a lag if the common rows last less than OVERLAP_S, or if no joint moves by MIN_MOTION.
+    Also return the number of common rows (L,). The ratio is inf at a lag if the common rows last less than OVERLAP_S,
+    or if no joint moves by MIN_MOTION.
     """
     square, variance, count = _distances(a, b)
-    counts = (count >= OVERLAP_S / STEP) & (variance.max(1) > (MIN_MOTION * TOLERANCE) ** 2)
-    return np.where(counts, np.sqrt(square.mean(1)), np.inf), count
+    counts = (count >= OVERLAP_S / STEP) & ((variance / tolerance**2).max(1) > MIN_MOTION**2)
+    return np.where(counts, np.sqrt((square / tolerance**2).max(1)), np.inf), count
 
 
-def _own_lag(track: Track) -> int | None:
+def _own_lag(track: Track, tolerance: np.ndarray) -> int | None:
     """Return the first lag, in rows, at which a track repeats itself, or None if the track does not repeat."""
     q, least = track.q, round(OVERLAP_S / STEP)
-    error = _errors(q, q)[0][len(q) - 1 :]  # from lag 0
+    error = _errors(q, q, tolerance)[0][len(q) - 1 :]  # from lag 0
     error[:least] = np.inf
-    for run in _runs(error < TOLERANCE):
+    for run in _runs(error < 1.0):
         best = run.start + int(error[run].argmin())
         if best > least:  # a match at the smallest lag is slow motion, not a repetition
             return best
     return None
 
 
-def _lag(a: Track, b: Track) -> int | None:
+def _lag(a: Track, b: Track, tolerance: np.ndarray) -> int | None:
     """Return the lag, in rows, at which b repeats a, or None; of several lags, that with the most rows in common."""
-    error, count = _errors(a.q, b.q)
-    runs = _runs(error < TOLERANCE)
+    error, count = _errors(a.q, b.q, tolerance)
+    runs = _runs(error < 1.0)
     if not runs:
         return None
     longest = max(runs, key=lambda run: count[run].max())
