@@ -405,8 +405,8 @@ def main() -> None:
     lines = {f"{n}: {k}": {"before": before.get(n, {}).get(k, ""), "now": v} for n, k, v in pairs}
     text = (
         f"Arms of {', '.join(f'{n} joints and up to {t:g} Nm' for n, t in ARMS)}; friction, offsets and links are "
-        "drawn and known. `before`: commit 8bc76fa. Intervals of rows 1, 3, 4 and 6 are wider than 95 % where a prior or a "
-        "removed term decides. Row 11, new arms of an independent simulator: independent.md."
+        "drawn and known. `before`: commit 8bc76fa. Intervals of rows 1, 3, 4 and 6 are wider than 95 % where a "
+        "prior or a removed term decides. Row 11, new arms of an independent simulator: independent.md."
     )
     table = markdown_rows(lines, "row")
     print(table)

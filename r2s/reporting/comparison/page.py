@@ -72,7 +72,7 @@ def _sections(
     sections: dict[str, Sequence[Item]] = {
         f"{count} runs in {len(grouped.members)} groups, last evaluation": [
             "Interquartile mean over seeds (the mean of fewer than four) with a 95 % bootstrap interval, none for a "
-            "single seed. A group is named by the overrides that differ; all other settings are default.",
+            "single seed. A group is named by the overrides that differ among groups.",
             scores_rows(measures, tables["scores"]),
             *([[f"{label}: {name}" for label, name in grouped.key.items()]] if grouped.key else []),
         ]
