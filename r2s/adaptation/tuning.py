@@ -89,6 +89,9 @@ REVERSES = 1.2  # times the speed noise: a larger fast speed determines the side
 SIDE_NOISE = 1.0  # times the speed noise: standard deviation of the speed that determines the side of friction
 CREPT, CREEP_RATE = 1.5, 50.0  # times the angle noise: displacement of a creeping joint; 1/s, its low-pass
 BRISTLES = 0.06  # share of the squared distance of the breakaway edges: friction variance in the middle of presliding
+BRISTLES_AT_REST = (
+    0.02  # share of the squared distance of the breakaway edges: friction variance at rest, with bristles
+)
 MOMENTUM_NOISE = 1.33  # times the speed noise: white noise of the filtered speeds in momenta
 # 1/s, high-pass of momenta; 1/s, low-pass of its square; factor from the result to momentum noise (vibrating gears)
 SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
@@ -101,7 +104,9 @@ FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s, s: largest force rate from STIFFNE
 TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s, if innovations exceed TOUCH variances; gain of their low-pass
 HAND_RATE = 0.3  # N/sqrt(s), random walk of the force, also on an arm at rest
 EDGE_SHARE = 0.7  # per cycle: share by which a resting joint's friction is moved back to its edge
-CREEP_SHARE = 0.3  # share of the force variance that a creeping tip would cause in a stiff environment
+# share of the force variance that a creeping tip would cause in a stiff environment; the same with bristles, where
+# joints creep without breaking away (a surface of 9e4 N/m)
+CREEP_SHARE, BRISTLE_CREEP = 0.3, 5.0
 MOMENT_ARM = 0.1  # m, lever arm of forces on an arm without a tool, which scales the moment
 FREE_FORCE = 0.1  # N, standard deviation of the force at the beginning of a motion
 # N per kg of the largest payload, per axis, 0.25 N for a Panda's 3 kg: error beyond the filter's covariance

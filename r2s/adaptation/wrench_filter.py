@@ -10,7 +10,8 @@ The uncertainty of a joint's friction depends on whether the joint moves (wrench
   correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain.
 - A joint at rest only bounds the wrench. The friction of this joint balances all other torques, and may be any torque
   between the negative and the positive breakaway torque (edges). The variance of this friction is at most that of a
-  uniform distribution between the edges.
+  uniform distribution between the edges. If the friction family has bristles, their deflection, and so the friction,
+  follows from the angle of the joint, with a smaller variance.
 The filter assumes that the wrench changes as the tip moves, as in a stiff environment. If all joints rest, only a
 person's hand can change the force, and friction hides changes between the edges.
 """
@@ -29,6 +30,7 @@ from r2s.adaptation.wrench_state import (
     CYCLE,
     FAST,
     FAST_P,
+    FRICTION,
     KNOWN,
     MOMENTUM_NOISE,
     MOTOR,
@@ -169,9 +171,15 @@ def _predict(noise, state):
 
 
 @njit(cache=True, error_model="numpy")
-def _hidden(noise, j):
-    """Return the variance, Nm^2, of a torque that may lie anywhere between the breakaway edges of joint j."""
-    return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 / 12.0
+def _hidden(noise, joints, j):
+    """Return mean, Nm, and variance, Nm^2, of the friction of joint j at rest, before a measurement.
+
+    With bristles, the angle determines the friction; else it may lie anywhere between the breakaway edges.
+    """
+    square = (noise.edges[j, 1] - noise.edges[j, 0]) ** 2
+    if noise.presliding[j] > 0.0:
+        return joints[FRICTION, j], tuning.BRISTLES_AT_REST * square
+    return 0.5 * (noise.edges[j, 0] + noise.edges[j, 1]), square / 12.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -193,7 +201,8 @@ def _wrench_variance(noise, state):
         rate = tuning.TOUCH_RATE
     variance = rate * rate * SIM_DT * tuning.FORCE_RATE_S
     variance += tuning.HAND_RATE**2 * SIM_DT
-    return variance + tuning.CREEP_SHARE * tuning.STIFFNESS**2 * creep
+    share = tuning.BRISTLE_CREEP if noise.presliding.any() else tuning.CREEP_SHARE
+    return variance + share * tuning.STIFFNESS**2 * creep
 
 
 @njit(cache=True, error_model="numpy")
@@ -229,10 +238,9 @@ def _keep_within_edges(noise, state):
             friction = holding_friction(state, j, gain)
             variance = gain @ P @ gain
             beyond = min(max(friction, noise.edges[j, 0]), noise.edges[j, 1]) - friction
-            hidden = _hidden(noise, j)
+            mean, hidden = _hidden(noise, joints, j)
             if variance > hidden:
-                middle = 0.5 * (noise.edges[j, 0] + noise.edges[j, 1])
-                _update(state, gain, middle - friction, hidden * variance / (variance - hidden))
+                _update(state, gain, mean - friction, hidden * variance / (variance - hidden))
             if beyond != 0.0:  # P is unchanged: in later cycles, the same edge adds no information
                 state.x[:] += tuning.EDGE_SHARE * beyond / max(variance, 1e-9) * (P @ gain)
 

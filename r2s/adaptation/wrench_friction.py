@@ -86,22 +86,21 @@ def known_torque(arm, noise, state, q):
                 side = now if abs(now) > tuning.REVERSES * noise.speed else joints[SLOW, j]
             side = 1.0 if side > 0.0 else -1.0
             speed = side * max(side * now, 0.0)
-            sin, cos = np.sin(q[j]), np.cos(q[j])
-            level = arm.load[j] * abs(terms.compensated[j])
-            level += arm.angle_friction[j, 0] * sin + arm.angle_friction[j, 1] * cos
-            z, moved = side, abs(joints[CREEP, j]) if joints[CREEP, j] != 0.0 else abs(speed) * SIM_DT
-            if noise.presliding[j] > 0.0:
-                z += (joints[DEFLECTION, j] - side) * np.exp(-moved / noise.presliding[j])
-            joints[DEFLECTION, j] = z
-            model = friction_torque(arm.table[j], arm.max_speed[j], speed, z) + level * z
+            moved = abs(joints[CREEP, j]) if joints[CREEP, j] != 0.0 else abs(speed) * SIM_DT
+            model, joints[DEFLECTION, j] = _model(arm, noise, state, j, q[j], side, speed, moved)
             if rested:
                 joints[FRICTION_BEFORE, j] = model
                 P[b + j, b + j] = noise.friction[j] ** 2
             joints[FRICTION, j] = model
-        elif not rested:  # friction balances all other torques: no error
-            x[b + j] = 0.0
-            P[b + j] = 0.0
-            P[:, b + j] = 0.0
+        else:
+            if not rested:  # friction balances all other torques: no error
+                x[b + j] = 0.0
+                P[b + j] = 0.0
+                P[:, b + j] = 0.0
+            if noise.presliding[j] > 0.0:  # the angle shows the bristles' deflection
+                moved = joints[MOVED, j]
+                side = 1.0 if moved > 0.0 else -1.0
+                joints[FRICTION, j] = _model(arm, noise, state, j, q[j], side, 0.0, abs(moved))[0]
         torque = arm.offset[j] + arm.drag[j, 0] * np.sin(q[j]) + arm.drag[j, 1] * np.cos(q[j])
         torque += terms.coriolis[j] - terms.uncompensated[j]
         friction = 0.5 * (joints[FRICTION, j] + joints[FRICTION_BEFORE, j])
@@ -110,9 +109,20 @@ def known_torque(arm, noise, state, q):
 
 
 @njit(cache=True, error_model="numpy")
+def _model(arm, noise, state, j, angle, side, speed, moved):
+    """Return joint j's modeled friction, Nm, and bristle deflection (-1 to 1) after a motion by `moved` rad."""
+    level = arm.load[j] * abs(state.terms.compensated[j])
+    level += arm.angle_friction[j, 0] * np.sin(angle) + arm.angle_friction[j, 1] * np.cos(angle)
+    z = side
+    if noise.presliding[j] > 0.0:
+        z += (state.joints[DEFLECTION, j] - side) * np.exp(-moved / noise.presliding[j])
+    return friction_torque(arm.table[j], arm.max_speed[j], speed, z) + level * z, z
+
+
+@njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
     """Detect whether joint j rests; a joint at rest that creeps counts as in motion for one cycle."""
-    joints[CREEP, j] = 0.0
+    crept, joints[CREEP, j] = joints[CREEP, j], 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])
         if abs(joints[SLOW, j]) > tuning.MOVES * noise.speed:
@@ -126,7 +136,8 @@ def _rest_or_motion(noise, joints, j, q):
     if stopped or (still and abs(joints[SLOW, j]) < tuning.RESTS * noise.speed):
         if stopped:
             joints[SLOW, j] = joints[FAST, j]
-        joints[REST, j], joints[QUIET, j], joints[ANCHOR, j], joints[MOVED, j] = 1.0, 0.0, joints[ANGLE, j], 0.0
+        joints[ANCHOR, j] = joints[ANCHOR, j] + crept if crept != 0.0 else joints[ANGLE, j]
+        joints[REST, j], joints[QUIET, j], joints[MOVED, j] = 1.0, 0.0, 0.0
 
 
 @njit(cache=True, error_model="numpy")
