@@ -20,6 +20,7 @@ from r2s.arm.driver import Driver
 from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.friction import BRISTLE
 from r2s.physics.kinematics import POSE, hand_kinematics
 from r2s.physics.payload import ee_pose, payload_of
 from r2s.physics.rigid_body import mass_matrix
@@ -146,6 +147,32 @@ def test_a_command_within_the_band_changes_no_force_at_rest():
     net = tau + torque
     assert (np.abs(net) < BAND + 0.05).all()  # what friction cannot hold, the force does
     assert np.linalg.norm(observer.force) > 1.0
+
+
+def test_bristles_show_a_force_on_a_resting_arm():
+    """Joints creep by half a presliding distance while the force on the tip grows to 12 N and falls to 4 N.
+
+    The angle shows the friction (BRISTLES_AT_REST), so the force is found to a third of what the most sensitive
+    joint's band hides, 1.7 N.
+    """
+    names, n, distance = BRISTLE.names, 7, 1e-3
+    values = {"coulomb": BAND, "viscous": 0.1, "presliding": distance, "stribeck_velocity": 0.1}
+    phi = np.stack([np.broadcast_to(values.get(name, 0.0), n) for name in names], -1)
+    dynamics = replace(truth(), family=BRISTLE, phi=phi, breakaway=np.column_stack([-BAND, BAND]), delay=0.0, lag=0.0)
+    observer, rng, J = WrenchObserver(ROBOT, dynamics), np.random.default_rng(0), jacobian(ROBOT.q_home)
+    t = np.arange(round(4.0 / SIM_DT)) * SIM_DT
+    force = np.interp(t, [0.5, 2.0, 2.5, 3.5], [0.0, 12.0, 12.0, 4.0])
+    up, way = np.array([0.0, 0.0, 1.0]), np.sign(J[2]) * np.where(np.abs(J[2]) > 0.05, 1.0, 0.0)
+    creep, z, error = np.append(0.0, np.diff(-5e-4 * force / 12.0)), np.zeros(n), []
+    angle = np.cumsum(creep)[:, None] * way
+    for k, moved in enumerate(creep[:, None] * way):
+        z += (np.sign(moved) - z) * -np.expm1(-np.abs(moved) / distance)
+        tau = dynamics.friction(np.zeros(n), z) - J.T @ up * force[k]
+        q = ROBOT.q_home + angle[k] + 1e-2 * NOISE * rng.normal(size=n)
+        observer(q, moved / SIM_DT + NOISE * rng.normal(size=n), tau)
+        error.append(observer.force @ up - force[k])
+    assert observer.rests.all()
+    assert np.sqrt(np.mean(np.square(error))) < np.min(BAND[:4] / np.abs(J[2, :4]).clip(0.05)) / 3
 
 
 def test_a_payload_is_no_contact_once_it_is_known():
