@@ -52,7 +52,7 @@ def carried(robot, share=0.7):
 
 
 def truth_and_recording(robot, torque, payload, declared=None, seed=3):
-    truth = truth_of(robot, links=(1.0,))
+    truth = truth_of(robot, masses=(1.0,))
     loaded = dynamics_with_payload(robot, truth, payload, declared)
     return truth, log(robot, loaded, torque, seconds=SECONDS, seed=seed)
 
@@ -109,7 +109,7 @@ def test_from_commands_whatever_was_declared(robot, declared):
 
 def test_a_gain_that_stands_in_for_the_masses_is_not_the_payloads(robot):
     """All masses are 8 % less than in the file, and gains took that: the payload is right within 2 %, not 8 % off."""
-    payload, truth = carried(robot), truth_of(robot, links=(1.0,))
+    payload, truth = carried(robot), truth_of(robot, masses=(1.0,))
     lighter = replace(truth, mass=0.92 * truth.mass, inertia=0.92 * truth.inertia)
     recording = log(robot, dynamics_with_payload(robot, lighter, payload), "measured", seconds=SECONDS, seed=3)
     arm = identified(robot, truth, "measured", gain=[-0.3, 0.3])
