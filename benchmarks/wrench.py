@@ -127,12 +127,14 @@ def row(r: dict) -> dict[str, str]:
 def main() -> None:
     """Write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--arms", type=Path, default=ROOT.parent / "shared/data/contact_arms")
+    parser.add_argument("--arms", default=str(ROOT.parent / "shared/data/contact_arms"), help="'' leaves them out")
     parser.add_argument("--twins", default="rigid_0,rigid_1,rigid_2,elastic_0,elastic_1,elastic_2")
     options = parser.parse_args()
+    if options.arms and not Path(options.arms).is_dir():
+        parser.error(f"--arms: no folder {options.arms}; --arms '' leaves the independent arms out")
     rows = {}
-    for name in ARMS if options.arms.is_dir() else ():
-        rows[name] = arm((options.arms / name).resolve())
+    for name in ARMS if options.arms else ():
+        rows[name] = arm((Path(options.arms) / name).resolve())
         print(name, rows[name], flush=True)
     twins = [(v, int(s)) for v, s in (word.split("_") for word in options.twins.split(",") if word)]
     identify_twins([(v, s, twin_run(v, s)) for v, s in twins], ROOT / "runs")
