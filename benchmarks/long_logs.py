@@ -22,6 +22,7 @@ from scipy.interpolate import CubicSpline
 
 from r2s.physics.rigid_body import LinkInertia, rigid_body
 from r2s.physics.robot import load_robot
+from r2s.provenance import git
 from r2s.recordings.recording import save_npz
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body pos="0 0 0.4"><body>
@@ -124,7 +125,8 @@ def main() -> None:
                 seconds, memory = identified(arm, torque, log)
                 if not k:
                     continue
-                rows.append({"torque": torque, "minutes": minutes, "s": round(seconds), "MB": round(memory)})
+                row = {"torque": torque, "minutes": minutes, "s": round(seconds), "MB": round(memory)}
+                rows.append(row | {"commit": (git()["commit"] or "unknown")[:7]})
                 print(rows[-1], flush=True)
     write(merged(pd.DataFrame(rows)))
 

@@ -105,11 +105,8 @@ def motion(robot, t, seed, slower=1.0, period=None):
     out = np.zeros((3, len(t), n))
     for f in (0.15, 0.37, 0.83, 2.3):
         f = round(f * period) / period if period else f / slower
-        w, a, phase = (
-            2 * np.pi * f,
-            0.15 / (f * slower) ** 0.7 * rng.uniform(0.5, 1.0, n),
-            rng.uniform(0, 2 * np.pi, n),
-        )
+        w, a = 2 * np.pi * f, 0.15 / (f * slower) ** 0.7 * rng.uniform(0.5, 1.0, n)
+        phase = rng.uniform(0, 2 * np.pi, n)
         s, c = a * np.sin(w * t[:, None] + phase), a * np.cos(w * t[:, None] + phase)
         out += s, w * c, -(w**2) * s
     out[0] += robot.q_home + 0.3
@@ -163,9 +160,9 @@ def judge(found, truth):
     speeds = np.array([-1.0, -0.1, 0.1, 1.0])[:, None] + 0 * tau
     had, has = (x.friction(speeds) - x.offset for x in (d, truth))
     worst = (np.abs(had - has) / np.abs(truth.friction(speeds))).max()
-    seen, counts = found.found.identifiable, {"inside": inside, "of": inside | True}
-    counts |= {"seen inside": inside & seen, "seen": seen}
-    return {"friction - offset, %": 100 * worst, **{name: int(mask.sum()) for name, mask in counts.items()}}
+    seen = found.found.identifiable
+    counts = {"inside": inside.sum(), "of": len(inside), "seen inside": (inside & seen).sum(), "seen": seen.sum()}
+    return {"friction - offset, %": 100 * worst, **counts}
 
 
 def summed(results):
@@ -234,8 +231,7 @@ def late_signals():
                 had, has = (axis_inertia(robot, d) for d in (found.dynamics, truth))
                 worst = max(worst, np.abs(had / has - 1).max())
         out[f"{name}: worst inertia about a joint's axis, %"] = f"{100 * worst:.1f}"
-    total = summed(results)
-    return out | {COVERED: total[COVERED]}
+    return out | {COVERED: summed(results)[COVERED]}
 
 
 def delayed(r, dq_s, rows):

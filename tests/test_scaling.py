@@ -176,8 +176,7 @@ def test_a_log_of_seconds_lets_no_candidate_in(arm, seconds):
 def test_intervals_allow_for_a_removed_term(arm, torque):
     """The file's masses are 10 to 15 % off, and elimination removes them: a payload and gains replace their effect.
 
-    At least 90 % of the intervals hold the truth. From the selected model alone, 69 and 43 % of the intervals of
-    benchmarks/scaling.py held it.
+    At least 90 % of the intervals hold the truth; those of the selected model alone are too narrow.
     """
     robot, how = arm(1.0), conf("identify/default")
     truth, share = truth_of(robot), 1 / np.array([1.15, 0.9, 1.1])

@@ -88,10 +88,9 @@ MOVES, RESTS, STILL_SPEED, STILL = 0.4, 0.2, 1.2, 25
 REVERSES = 1.2  # times the speed noise: a larger fast speed determines the side of friction
 SIDE_NOISE = 1.0  # times the speed noise: standard deviation of the speed that determines the side of friction
 CREPT, CREEP_RATE = 1.5, 50.0  # times the angle noise: displacement of a creeping joint; 1/s, its low-pass
-BRISTLES = 0.06  # share of the squared distance of the breakaway edges: friction variance in the middle of presliding
-BRISTLES_AT_REST = (
-    0.02  # share of the squared distance of the breakaway edges: friction variance at rest, with bristles
-)
+# shares of the squared distance of the breakaway edges: friction variance in the middle of presliding, in motion; at
+# rest, if the friction family has bristles
+BRISTLES, BRISTLES_AT_REST = 0.06, 0.02
 MOMENTUM_NOISE = 1.33  # times the speed noise: white noise of the filtered speeds in momenta
 # 1/s, high-pass of momenta; 1/s, low-pass of its square; factor from the result to momentum noise (vibrating gears)
 SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0

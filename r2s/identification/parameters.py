@@ -237,8 +237,9 @@ class ParameterEstimate:
     """Estimated parameter vector with arrays (P,) in SI units.
 
     Attributes:
-        x: estimated values. low, high: ends of 95 % intervals of the values. identifiable: whether the data determine
-            a value. samples: (S, P) random draws from the posterior.
+        x: estimated values. low, high: ends of 95 % intervals of the values, for measured and motor torque wider than
+            the scatter of `samples` (`widest_intervals`). identifiable: whether the data determine a value.
+        samples: (S, P) random draws from the posterior.
     """
 
     x: np.ndarray
