@@ -1,9 +1,11 @@
 """Identify surfaces that an arm presses on, whose parameters are all known.
 
-    python benchmarks/contact_identification.py [--arms FOLDER] [--seeds 0-19]
+    python benchmarks/contact_identification.py [--arms FOLDER] [--seeds 0-19] [--twins rigid_100,elastic_200,...]
 
 arms    simulated arms with contact, train, validation and ramps recordings and the truth, FOLDER/<name>, which are no
         part of this repository: stage=identify with its defaults, then the surface against the truth
+twins   variant_seed: `stage=identify` from free motion, then with data.presses=6 on the surface of the seed; finished
+        identifications in runs/identify are not repeated
 seeds   recordings of benchmarks/pressing.py on drawn surfaces: coverage of the intervals
 
 Only this script reads the truth. It writes benchmarks/results/contact_identification.md.
@@ -18,9 +20,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import ROBOT, ROOT, markdown, markdown_rows, write_page
+import yaml
+from common import JUDGING, ROBOT, ROOT, identify_twins, markdown, markdown_rows, write_page
+from press_twins import TOOL, armed, twin_run
 from pressing import drawn_surface, estimated_arm, press_recording
 
+from r2s.arm.twins.touch import draw_surface
 from r2s.identification.contact.contact_file import load_contact
 from r2s.identification.contact.estimate import Arm, ContactEstimate, identify_contact
 from r2s.identification.contact.exchange import linearized
@@ -32,6 +37,11 @@ from r2s.physics.surface import Surface, Tool, load_tool
 from r2s.recordings.readers import read
 
 NUMBERS = ("slope", "stiffness", "exponent", "damping", "friction")
+TWINS_NOTE = (
+    "Identified from free motion, then from presses (`data.presses=6`), with encoders on the motors. slope: error of "
+    "the estimate and its 95 % interval; with rigid gears: error if the gears are taken as rigid; gears: mean "
+    "deflection by the largest torques. The prior of the gears was chosen on twins 0 to 9."
+)
 PLAY = 2e-5  # m, of a Panda's encoders; see `TipMotion`
 
 
@@ -106,6 +116,57 @@ def judged_arm(folder: Path, words: list[str]) -> dict[str, str]:
     }
 
 
+def identify_surface(variant: str, seed: int) -> Path:
+    """Let a twin record presses and identify its surface, unless it is done; return the run folder."""
+    run = ROOT / "runs" / "identify" / f"surface_{variant}_{seed}"
+    words = ["arm=twin", f"arm.variant={variant}", f"arm.seed={seed}", "arm.surface=true", "data.presses=6"]
+    tool = run.with_name("press_tool.json")
+    tool.write_text(json.dumps({"tip_in_flange_m": TOOL.tip.tolist(), "radius_m": TOOL.radius}))
+    words += [f"calibration={twin_run(variant, seed)}", f"robot.tool={tool}", f"root={ROOT / 'runs'}"]
+    if not (run / "contact.yaml").is_file():
+        command = [sys.executable, "run.py", "stage=identify", *words, f"name={run.name}"]
+        subprocess.run(command, cwd=ROOT, check=True)
+    return run
+
+
+def judged_twin(variant: str, seed: int) -> tuple[Score, dict[str, str]]:
+    """Return errors and row of the table for a twin."""
+    run, robot = identify_surface(variant, seed), armed(ROBOT)
+    found, document = load_contact(run), yaml.safe_load((run / "contact.yaml").read_text())
+    truth = draw_surface(robot, True, np.random.default_rng([seed, 4]))
+    assert isinstance(truth, Surface)
+    s, slope = score(found.surface, found.interval, truth), linearized(truth)[0]
+    own, rigid = (d["parameters"]["slope_at_10N"]["value"] for d in (document, document["rigid_gears"]))
+    low, high = (100 * (end / slope - 1.0) for end in found.interval["slope"])
+    held_out = json.loads((run / "summary.json").read_text())["contact"]["validation"]["force_rmse_N"]
+    return s, {
+        "true slope, N/mm": f"{1e-3 * slope:.1f}",
+        "slope at 10 N, %": f"{100 * (own / slope - 1.0):+.1f} [{low:+.1f}, {high:+.1f}]",
+        "with rigid gears, %": f"{100 * (rigid / slope - 1.0):+.1f}",
+        "friction": f"{s.friction:+.4f}",
+        "plane, mm": f"{1e3 * s.plane:+.3f}",
+        "normal, °": f"{s.tilt_deg:.3f}",
+        "gears, mrad": f"{1e3 * (document['gears']['value'] * robot.tau_max).mean():.1f}",
+        "outside 95 %": ", ".join(name for name, inside in s.covered.items() if not inside) or "none",
+        "held-out force, N RMS": f"{held_out:.2f}",
+    }
+
+
+def twin_parts(twins: list[tuple[str, int]]) -> list[str]:
+    """Return the section of the twins: a table, and the coverage for each variant."""
+    identify_twins([(v, s, twin_run(v, s)) for v, s in twins], ROOT / "runs")
+    rows, scores = {}, {}
+    for variant, seed in twins:
+        judged = " (judging)" if seed in JUDGING[variant] else ""
+        name = f"{variant} twin {seed}{judged}"
+        one, rows[name] = judged_twin(variant, seed)
+        scores.setdefault(f"{variant}{judged}", []).append(one)
+        print(name, rows[name], flush=True)
+    inside = {k: np.mean([list(s.covered.values()) for s in own]) for k, own in scores.items()}
+    shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in inside.items())
+    return ["## Twins", TWINS_NOTE, markdown_rows(rows, "twin"), f"95 % intervals that contain the truth: {shares}."]
+
+
 def drawn_scores(robot: Robot, seeds: list[int]) -> list[Score]:
     """Identify the drawn surface of each seed with an arm known up to its posterior."""
     scores = []
@@ -136,6 +197,7 @@ def main() -> None:
     """Judge the arms and draw the seeds; write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=Path, help="folder of the simulated arms")
+    parser.add_argument("--twins", default="", help="variant_seed, separated by commas")
     parser.add_argument("--seeds", default="0-19", help="first and last seed")
     options, words = parser.parse_known_args()
     first, last = map(int, options.seeds.split("-"))
@@ -145,10 +207,13 @@ def main() -> None:
             path.parent.name: judged_arm(path.parent, words) for path in sorted(options.arms.glob("*/contact.npz"))
         }
         parts += ["## Simulated arms that stick and slip", markdown_rows(rows, "arm")]
+    if options.twins:
+        parts += twin_parts([(v, int(s)) for v, s in (word.split("_") for word in options.twins.split(","))])
     robot = replace(ROBOT, tool=Tool(np.zeros(3), 0.01))
     parts += [f"## {last - first + 1} drawn surfaces"]
     parts += [markdown(coverage(drawn_scores(robot, list(range(first, last + 1)))))]
     command = "contact_identification.py" + (" --arms FOLDER" if options.arms else "") + f" --seeds {options.seeds}"
+    command += f" --twins {options.twins}" * bool(options.twins)
     write_page("contact_identification", "Surfaces identified from joint torques", command, parts)
     print("\n\n".join(parts))
 

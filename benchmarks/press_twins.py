@@ -1,8 +1,10 @@
 """Recordings of a twin that presses on the surface of its seed and slides along it, with the true force."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from common import ROOT
 
 from r2s.arm.twins.make_twin import make_twin
 from r2s.physics.contact_layout import FORCE, NORMAL
@@ -20,6 +22,11 @@ PLACES = ((0.0, 0.0), (0.04, 0.05), (-0.03, -0.06))  # m
 SLIDE, SPEED = 0.05, 0.06  # m, m/s
 WRIST = np.array([0.3, 0.3, 0.3, 0.3, 1.0, 1.0, 1.0])  # of POSTURE: the tip's spring leaves the orientation free
 STEP, HOLD, LIFT = 0.4, 0.4, 0.02  # s, s, m
+
+
+def twin_run(variant: str, seed: int) -> Path:
+    """Return the run folder of a twin's identification from free motion."""
+    return ROOT / "runs" / "identify" / f"wrench_{variant}_{seed}"
 
 
 def armed(robot: Robot) -> Robot:

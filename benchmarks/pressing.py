@@ -96,11 +96,17 @@ def planned_motion(robot: Robot, surface: Surface, plan: Plan) -> CubicSpline:
 
 
 def press_recording(
-    arm: Arm, surface: Surface, seed: int, plan: Plan | None = None, *, touched: bool = True
+    arm: Arm,
+    surface: Surface,
+    seed: int,
+    plan: Plan | None = None,
+    *,
+    touched: bool = True,
+    gears: np.ndarray | float = 0.0,
 ) -> Recording:
     """Return a recording of the arm on a surface; the true arm is a draw of the posterior, chosen by the seed.
 
-    touched: False: the same motion without the surface.
+    touched: False: the same motion without the surface. gears: rad/Nm, compliance (n,) between encoders and links.
     """
     rng, robot = np.random.default_rng(seed), arm.robot
     assert arm.samples is not None
@@ -109,8 +115,15 @@ def press_recording(
     t = np.arange(0.0, motion.x[-1], SIM_DT)
     late = np.clip(t + float(true.delay) + 0.5 * SIM_DT, 0.0, motion.x[-1])  # a command is held for a step
     q, dq, ddq = (motion(late, k) for k in (0, 1, 2))
-    tip = TipMotion.of(robot, q, dq, SIM_DT, late == late[0], 0.0)
-    tau = InverseDynamics(robot, true).rigid(q, dq, ddq) + true.friction(dq, np.sign(dq)) - true.offset
-    tau -= tip.contact(surface)[0] * touched
-    q = np.round((motion(t) + ENCODER * rng.standard_normal(q.shape)) / ENCODER) * ENCODER
-    return Recording(t, q, motion(t, 1) + SPEED * rng.standard_normal(q.shape), tau, "commanded")
+    inverse = InverseDynamics(robot, true)
+    contact = TipMotion.of(robot, q, dq, SIM_DT, late == late[0], 0.0).contact(surface)[0] * touched
+    bent = gears * (inverse.gravity(q) - contact)  # rad, by which motors are ahead of links; quasi-static
+    sliding = dq + np.gradient(bent, SIM_DT, axis=0)
+    tau = inverse.rigid(q, dq, ddq) + true.friction(sliding, np.sign(sliding)) - true.offset - contact
+    shift = (late[1] - t[1]) / SIM_DT  # the motors at t instead of `late`
+    at = np.arange(len(t)) - shift
+    ahead, speed = (
+        np.stack([np.interp(at, np.arange(len(t)), x) for x in own.T], -1) for own in (bent, sliding - dq)
+    )
+    q = np.round((motion(t) + ahead + ENCODER * rng.standard_normal(q.shape)) / ENCODER) * ENCODER
+    return Recording(t, q, motion(t, 1) + speed + SPEED * rng.standard_normal(q.shape), tau, "commanded")

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 from common import JUDGING, ROBOT, ROOT, identify_twins, markdown_rows, write_page
 from contact_identification import identify_arm
-from press_twins import armed, press_twin
+from press_twins import armed, press_twin, twin_run
 
 from r2s.adaptation.wrench import WrenchObserver, contact_threshold, observe_recording
 from r2s.adaptation.wrench_fusion import FusedWrench
@@ -79,7 +79,7 @@ def scores(found: pd.DataFrame, recording, true: np.ndarray, normal: np.ndarray)
 def arm(folder: Path) -> dict[str, str]:
     """Return the row of an independent arm."""
     run, robot = identify_arm(folder, []), replace(ROBOT, tool=load_tool(folder / "tool.json"))
-    dynamics, surface = calibrated(run, robot)[0], load_contact(run)
+    dynamics, surface = calibrated(run, robot)[0], load_contact(run).simulated
     observer = WrenchObserver(robot, dynamics)
     observer.threshold = contact_threshold(robot, observer, free_recordings(run))
     recording, truth = read(folder / "contact.npz", torque="commanded"), np.load(folder / "truth_contact.npz")
@@ -105,11 +105,6 @@ def twin(variant: str, seed: int) -> dict[str, str]:
     recording, *true = press_twin(robot, variant, seed)
     found = scores(observe_recording(robot, observer, recording), recording, *true)
     return row(found) | {"fused, right / moved, N": "", "true parameters, N": ""}
-
-
-def twin_run(variant: str, seed: int) -> Path:
-    """Return the run folder of a twin's identification."""
-    return ROOT / "runs" / "identify" / f"wrench_{variant}_{seed}"
 
 
 def row(r: dict) -> dict[str, str]:

@@ -81,6 +81,39 @@ def test_the_surface_that_was_pressed_is_identified(found, surface):
     assert all(found.identifiable.values())
 
 
+def test_elastic_gears_are_told_apart_from_the_surface(robot):
+    """Encoders on motors: gears that halve the stiffness are identified, with a surface and plane behind them."""
+    arm, surface = estimated_arm(robot, SEED), replace(drawn_surface(SEED), stiffness=3e4, exponent=1.0)
+    gears = 0.006 * np.linspace(0.85, 1.15, robot.n) / robot.tau_max
+    plan = replace(QUICK, places=((0.0, 0.0), (0.10, 0.08), (-0.08, 0.10)))
+    found = identify_contact(arm, press_recording(arm, surface, SEED, plan, gears=gears))
+    low, high = np.percentile(found.draws["gears"] @ robot.tau_max, [2.5, 97.5])
+    assert low < gears @ robot.tau_max < high < 2 * low
+    low, high = found.interval("slope")
+    assert low < 3e4 < high < 2 * low
+    rigid = found.rigid_gears
+    assert rigid.interval("slope")[1] < low
+    height, wrong = ((surface.point - one.surface.point) @ surface.normal for one in (found, rigid))
+    assert abs(height) < 2e-4 < 5e-4 < abs(wrong)  # gravity moves the tip behind the encoders
+    assert found.validation.rmse() < rigid.validation.rmse()
+
+
+def test_two_springs_in_series_have_one_force(robot, surface):
+    """A tip behind gears presses as a softer surface does: 1 / k = 1 / k_surface + softness, also with exponents."""
+    count, stiff = 50, replace(surface, exponent=1.0, damping=0.0, friction=0.0)
+    q = robot.q_home + np.zeros((count, robot.n))
+    tip = TipMotion.of(robot, q, 0.0 * q, SIM_DT, np.arange(count) == 0, 0.0)
+    deep = np.linspace(1e-5, 2e-3, count)
+    tip = replace(tip, centre=surface.point + (tip.radius - deep)[:, None] * surface.normal)
+    gears = np.linspace(5e-5, 2e-4, robot.n)
+    soft = ((surface.normal @ tip.jacobian(np.arange(count), surface.normal)) ** 2 * gears).sum(1)
+    for exponent in (1.0, 1.5):
+        one = replace(stiff, exponent=exponent)
+        _, force, depth, _ = replace(tip, compliance=gears).contact(one)
+        np.testing.assert_allclose(depth + soft * force, deep, atol=1e-12)
+        np.testing.assert_allclose(force, one.coefficient * depth**exponent, rtol=1e-9, atol=1e-9)
+
+
 def test_the_held_out_press_is_predicted(found):
     """The last place was not fitted: its force, loading and unloading, follows from the others."""
     assert found.validation.summary()["seconds"] > 1.0
@@ -106,9 +139,8 @@ def test_the_moments_that_count_do_not_depend_on_the_size_of_the_force():
         contact = lambda *_, f=scale: (f * tau * depth[:, None], f * depth, depth, depth)  # noqa: E731
         problem = SimpleNamespace(
             motion=SimpleNamespace(instants=np.arange(T), t=np.arange(T), filtered=lambda x: x),
-            tip=SimpleNamespace(contact_of=contact), space=SimpleNamespace(plane=lambda u: (u, u), law=lambda u: u),
-            error=scale * error, directions=np.zeros((T, n, 1)), best_arm=lambda u: np.zeros(1), rows=rows,
-            sigma=np.full((T, n), 0.05 * scale), torque=SimpleNamespace(row_s=0.01),
+            contact=contact, error=scale * error, directions=np.zeros((T, n, 1)), best_arm=lambda u: np.zeros(1),
+            rows=rows, sigma=np.full((T, n), 0.05 * scale), torque=SimpleNamespace(row_s=0.01),
         )  # fmt: skip
         kept.append(press_errors(problem, np.zeros(8), [np.ones(T, dtype=bool)]))
     assert 0 < len(kept[0].t) < T

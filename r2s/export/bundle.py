@@ -113,7 +113,7 @@ def surface_of(source: Path, robot: Robot, task: Task, dynamics: Dynamics) -> Su
     if not task.touches:
         return None
     if (source / "contact.yaml").is_file():
-        return load_contact(source, "dr.surface").surface
+        return load_contact(source, "dr.surface").simulated.surface
     return task.expected(robot, dynamics).surface
 
 

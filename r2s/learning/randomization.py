@@ -179,7 +179,7 @@ class ContactRandomization(UniformRandomization):
         """All posterior draws of the identified surface, as a `Surface` with a batch axis; None without `surface`."""
         if not self.surface:
             return None
-        draws = load_contact(self.surface, "dr.surface").draws
+        draws = load_contact(self.surface, "dr.surface").simulated.draws
         return Surface(**{k: np.array([getattr(s, k) for s in draws]) for k in DRAWN})
 
     @cached_property

@@ -57,11 +57,18 @@ class InverseDynamics:
             out += self.load_friction(q) * np.tanh(sliding / SLIDES)
         return out
 
+    def gravity(self, q: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n) Nm by which the joints hold the links at rest at q (m, n) rad."""
+        return self._at_rest(self._links[0], q)
+
     def load_friction(self, q: np.ndarray) -> np.ndarray:
         """Return the magnitude (m, n) Nm of load-dependent friction at q (m, n) rad."""
-        nominal, none, gravity = self._links[1], np.zeros(q.shape), np.empty(q.shape)
-        _rigid(nominal, nominal, self.robot.gravity, none[0], (np.array(q), none, none), gravity, True)
-        return self.dynamics.load * np.abs(gravity)
+        return self.dynamics.load * np.abs(self._at_rest(self._links[1], q))
+
+    def _at_rest(self, links: np.ndarray, q: np.ndarray) -> np.ndarray:
+        none, out = np.zeros(q.shape), np.empty(q.shape)
+        _rigid(links, links, self.robot.gravity, none[0], (np.array(q), none, none), out, True)
+        return out
 
 
 @njit(cache=True, error_model="numpy")

@@ -130,7 +130,7 @@ def identify_surface(cfg, run, arm, data):
     save_contact(run.folder / "contact.yaml", arm.robot, found, source | {"run": str(run.folder)})
     for line in write_description(run.folder / "model", arm.robot, arm.space.dynamics(arm.x)):
         print(line)
-    write_surface(run.folder / "model", arm.robot, found.surface)
+    write_surface(run.folder / "model", arm.robot, (found.rigid_gears or found).surface)
     contact_figure(run.figure("contact"), found)
     print_table(console(), contact_table(found), "surface, 95 % intervals")
     print_table(console(), press_table(found), "surface against joint torques")

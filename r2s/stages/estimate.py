@@ -105,7 +105,7 @@ def identified_surface(cfg, robot):
 
     if robot.tool is None:
         raise UserError("robot.tool: estimate.surface needs the tip that touches: robot.tool=TOOL.json")
-    return load_contact(cfg.estimate.surface, "estimate.surface")
+    return load_contact(cfg.estimate.surface, "estimate.surface").simulated
 
 
 def wrench_observer(cfg, robot, dynamics, surface):

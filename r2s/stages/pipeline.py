@@ -250,7 +250,7 @@ def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrid
     if "friction" not in cfg.task or any(o.startswith("task.friction=") for o in overrides):
         return
     for label in trained.keys() - {"nominal"}:
-        trained[label].append(f"task.friction={load_contact(surface).surface.friction:.4g}")
+        trained[label].append(f"task.friction={load_contact(surface).simulated.surface.friction:.4g}")
 
 
 def check_steps(cfg: Any, overrides: Sequence[str]) -> None:

@@ -1,7 +1,7 @@
 """Write and read contact.yaml and contact_posterior.npz, an identified surface for other stages and programs."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,14 @@ import yaml
 
 from r2s.errors import UserError
 from r2s.files import DAMAGED, atomic_write, run_file
-from r2s.identification.contact.estimate import ContactEstimate
+from r2s.identification.contact.estimate import COVERED, ContactEstimate
 from r2s.identification.contact.exchange import inverse_mass, mujoco_contact, sdf_surface
 from r2s.identification.contact.surface_space import LOAD
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 
 UNITS = {"stiffness": "N/m", "exponent": "1", "damping": "s/m", "friction": "1", "bristle": "m"}
+RIGID_GEARS = "rigid_gears"  # key of the surface for simulations with rigid gears
 LAWS = {
     "normal": "F = k 1mm (d / 1mm)^exponent (1 + damping d') >= 0 of the penetration d, k the stiffness at 1 mm",
     "tangential": "friction F in sliding, reached over a deflection of about `bristle`",
@@ -32,12 +33,19 @@ class IdentifiedSurface:
             (N/m at 10 N), height (m along the normal) and tilt_deg (angle from the normal).
         identifiable: {name: whether the recording determines this value}; names include plane and slope.
         draws: surfaces drawn from the posterior.
+        rigid_gears: the same for simulations with rigid gears, as r2s's; see `ContactEstimate`.
     """
 
     surface: Surface
     interval: dict[str, tuple[float, float]]
     identifiable: dict[str, bool]
     draws: list[Surface]
+    rigid_gears: "IdentifiedSurface | None" = None
+
+    @property
+    def simulated(self) -> "IdentifiedSurface":
+        """The surface for simulations with rigid gears."""
+        return self.rigid_gears or self
 
 
 def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mapping[str, Any]) -> None:
@@ -46,38 +54,47 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     Args:
         path: the contact.yaml to write. robot: the arm with its tool. source: names of recording, calibration, run.
     """
-
-    def number(value: float) -> float:
-        return float(f"{value:.6g}")
-
-    def entry(value: float, unit: str, ends: tuple[float, float], name: str) -> dict[str, Any]:
-        out = {"unit": unit, "value": number(value)}
-        out |= {"interval95_low": number(ends[0]), "interval95_high": number(ends[1])}
-        return out | {"identifiable": found.identifiable[name]}
-
-    surface, tool = found.surface, robot.tool
+    tool, simulated = robot.tool, found.rigid_gears or found
     assert tool is not None
-    parameters = {n: entry(getattr(surface, n), unit, found.interval(n), n) for n, unit in UNITS.items()}
-    slope = f"slope_at_{LOAD:g}N"
-    parameters[slope] = entry(found.slope, "N/m", found.interval("slope"), "slope")
-    low, high = found.height
     document: dict[str, Any] = {"robot": robot.name, "source": dict(source), "law": LAWS}
     document["tool"] = {"tip_in_flange_m": tool.tip.tolist(), "radius_m": tool.radius}
-    document["parameters"] = parameters
-    document["plane"] = {
-        "point_m": [float(f"{v:.9g}") for v in surface.point],
-        "height_interval95_m": [number(low), number(high)],
-        "normal": [float(f"{v:.9g}") for v in surface.normal],
-        "tilt95_deg": number(found.tilt_deg),
-        "identifiable": found.identifiable["plane"],
-    }
-    document["penetration_m"] = [number(v) for v in found.penetration]
-    document["mujoco"] = mujoco_contact(surface, inverse_mass(robot))
-    document["sdf"] = sdf_surface(surface)
+    document |= _entries(found)
+    ends = np.percentile(found.draws["gears"], COVERED, axis=0)
+    rows = {"value": found.gears, "interval95_low": ends[0], "interval95_high": ends[1]}
+    document["gears"] = {"unit": "rad/Nm"} | {name: [_number(v) for v in row] for name, row in rows.items()}
+    document[RIGID_GEARS] = _entries(simulated)
+    document["mujoco"] = mujoco_contact(simulated.surface, inverse_mass(robot))
+    document["sdf"] = sdf_surface(simulated.surface)
+    draws = found.draws | {f"{RIGID_GEARS}_{name}": values for name, values in simulated.draws.items()}
     with atomic_write(path.with_name("contact_posterior.npz")) as part:  # first, so contact.yaml never exists alone
-        np.savez_compressed(part, **found.draws)  # type: ignore[arg-type]
+        np.savez_compressed(part, **draws)  # type: ignore[arg-type]
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
+
+
+def _entries(found: ContactEstimate) -> dict[str, Any]:
+    """Return the entries of contact.yaml for a surface: parameters, plane and penetration."""
+
+    def entry(value: float, unit: str, ends: tuple[float, float], name: str) -> dict[str, Any]:
+        out = {"unit": unit, "value": _number(value)}
+        out |= {"interval95_low": _number(ends[0]), "interval95_high": _number(ends[1])}
+        return out | {"identifiable": found.identifiable[name]}
+
+    surface = found.surface
+    parameters = {n: entry(getattr(surface, n), unit, found.interval(n), n) for n, unit in UNITS.items()}
+    parameters[f"slope_at_{LOAD:g}N"] = entry(found.slope, "N/m", found.interval("slope"), "slope")
+    plane = {
+        "point_m": [float(f"{v:.9g}") for v in surface.point],
+        "height_interval95_m": [_number(v) for v in found.height],
+        "normal": [float(f"{v:.9g}") for v in surface.normal],
+        "tilt95_deg": _number(found.tilt_deg),
+        "identifiable": found.identifiable["plane"],
+    }
+    return {"parameters": parameters, "plane": plane, "penetration_m": [_number(v) for v in found.penetration]}
+
+
+def _number(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurface:
@@ -92,8 +109,12 @@ def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurfac
     try:
         document = yaml.safe_load(path.read_text())
         with np.load(path.with_name("contact_posterior.npz"), allow_pickle=False) as file:
-            draws = {name: file[name] for name in (*UNITS, "point", "normal")}
-        return _parse(document, draws)
+            draws = {name: file[name] for name in file.files}
+        found = _parse(document, draws)
+        if RIGID_GEARS not in document:  # a file from before gears were estimated
+            return found
+        own = {name.removeprefix(f"{RIGID_GEARS}_"): values for name, values in draws.items() if RIGID_GEARS in name}
+        return replace(found, rigid_gears=_parse(document[RIGID_GEARS], own))
     except (*DAMAGED, AttributeError, IndexError, yaml.YAMLError) as error:
         seen = " ".join(str(error).split())
         raise UserError(f"{where}: {path} is not a contact.yaml of r2s ({seen})") from None

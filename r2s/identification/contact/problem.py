@@ -6,12 +6,13 @@ from functools import cached_property
 import numpy as np
 
 from r2s.identification.arm_uncertainty import arm_directions
-from r2s.identification.contact.surface_space import SurfaceSpace
+from r2s.identification.contact.surface_space import SURFACE, SurfaceSpace
 from r2s.identification.contact.tip import TipMotion
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.modulating_functions import CUTOFF_HZ, RATE_HZ, SlidingMotion
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.search.levenberg_marquardt import minimize
+from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
@@ -23,23 +24,25 @@ FTOL = 1e-6  # a search ends when a step reduces the cost by less than this shar
 STEP = 1e-5  # finite-difference step on the unit cube
 REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
 PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise below 40 Hz
-FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least squares over a surface u (8,) and the arm's uncertainty w (r,), whose prior is standard normal.
+    """Least squares over u (P,), surface and gears, and the arm's uncertainty w (r,), with a standard normal prior.
 
     Each of the R rows is a window in which a joint slides in one direction (see `TorqueResidual`). Resting joints
     have no rows, since their friction may have any value between the breakaway torques. A closed form eliminates w,
     because w acts linearly on the residual (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+
+    If encoders are on the motors, gears deflect behind them: gravity moves the tip by the gears' `sag`, and the force
+    by a spring in series with the surface. Presses at places with different lever arms tell the two springs apart.
 
     Attributes:
         torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
         error: (T, n) Nm, residual torque of the arm with the parameters x, before subtraction of the contact torque.
         directions: (T, n, r) Nm, derivative of the residual torque with respect to w.
         sigma: (T, n) Nm, standard deviation of each residual torque, which the fit treats as independent.
-        space: the space of the surface vectors u.
+        space: the space of the vectors u. sag: (F, n, 3) m per rad/Nm, deflection of the tip by gravity on each gear.
     """
 
     torque: TorqueResidual
@@ -49,6 +52,7 @@ class ContactProblem:
     directions: np.ndarray
     sigma: np.ndarray
     space: SurfaceSpace
+    sag: np.ndarray
 
     @property
     def motion(self) -> SlidingMotion:
@@ -66,16 +70,24 @@ class ContactProblem:
         """(R,) block number of each row; errors in different blocks are treated as independent."""
         return np.unique(self.torque.clusters[self.rows.ravel()], return_inverse=True)[1]
 
+    def contact(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return joint torque (F, n) Nm, normal force (F,) N, depth (F,) m and its rate (F,) m/s for u (P,)."""
+        tip = self.tip
+        if len(u) > SURFACE:
+            soft = self.space.compliance(u)
+            tip = replace(tip, centre=tip.centre - np.einsum("fjk,j->fk", self.sag, soft), compliance=soft)
+        return tip.contact_of(*self.space.plane(u), self.space.law(u))
+
     def contact_torque(self, u: np.ndarray) -> np.ndarray:
-        """Return the joint torque (T, n) Nm of contact with a surface u (8,), averaged over each window."""
-        return self.motion.filtered(self.tip.contact_of(*self.space.plane(u), self.space.law(u))[0])
+        """Return the joint torque (T, n) Nm of contact for u (P,), averaged over each window."""
+        return self.motion.filtered(self.contact(u)[0])
 
     def data(self, u: np.ndarray) -> np.ndarray:
-        """Return the residual (R,), in standard deviations, for a surface u (8,) and model errors w = 0."""
+        """Return the residual (R,), in standard deviations, for u (P,) and model errors w = 0."""
         return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
 
     def slope(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative (R, 8) of `data` with respect to u (8,)."""
+        """Return the derivative (R, P) of `data` with respect to u (P,)."""
         h, here = np.where(u > 0.5, -STEP, STEP), self.data(u)
         return np.stack([(self.data(stepped) - here) / s for stepped, s in zip(u + np.diag(h), h, strict=True)], 1)
 
@@ -89,7 +101,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return the errors w (r,) of the arm's model that minimize the cost of a given surface u (8,)."""
+        """Return the errors w (r,) of the arm's model that minimize the cost of a given u (P,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:
@@ -97,20 +109,21 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + r + 8) of surfaces u (C, 8), each at its best w, with a normal prior on u."""
-        return np.stack([np.concatenate([self._projected(self.data(u)), FLAT * (u - 0.5)]) for u in trials])
+        """Return residuals (C, R + r + P) of vectors u (C, P), each at its best w, with a normal prior on u."""
+        center, weight = self.space.prior(trials.shape[1])
+        return np.stack([np.concatenate([self._projected(self.data(u)), weight * (u - center)]) for u in trials])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative (R + r + 8, 8) of `residual` at u (8,)."""
-        return np.concatenate([self._projected(self.slope(u)), FLAT * np.eye(len(u))])
+        """Return the derivative (R + r + P, P) of `residual` at u (P,)."""
+        return np.concatenate([self._projected(self.slope(u)), np.diag(self.space.prior(len(u))[1])])
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-        """Return the surface u (8,) of a local minimum near u, and the sum of squares at this minimum."""
+        """Return the vector u (P,) of a local minimum near u, and the sum of squares at this minimum."""
         u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with each row's weight set from the size and correlation of the residual at u (8,)."""
+        """Return the problem with each row's weight set from the size and correlation of the residual at u (P,)."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
@@ -120,15 +133,17 @@ class ContactProblem:
         return replace(self, torque=self.torque.within(kept))
 
     def whole(self, u: np.ndarray) -> np.ndarray:
-        """Return u (8,) and the best w (r,) for u in one vector (8 + r,) on the unit cube, for `linearize`."""
+        """Return u (P,) and the best w (r,) for u in one vector (P + r,) on the unit cube, for `linearize`."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return a list of one pair: the residual (R + 8 + r,) and its derivative at the vector `whole` (8 + r,)."""
-        u, w = whole[:8], (whole[8:] - 0.5) * 2 * REACH
-        prior = np.concatenate([np.full(8, FLAT), np.full(len(w), 2 * REACH)])
-        r = np.concatenate([self.data(u) + self.arm @ w, prior * (whole - 0.5)])
-        return [(r, np.concatenate([np.concatenate([self.slope(u), 2 * REACH * self.arm], 1), np.diag(prior)]))]
+        """Return a list of one pair: the residual (R + P + r,) and its derivative at the vector `whole` (P + r,)."""
+        count = len(whole) - self.arm.shape[1]
+        u, w = whole[:count], (whole[count:] - 0.5) * 2 * REACH
+        center, weight = self.space.prior(count)
+        r = np.concatenate([self.data(u) + self.arm @ w, weight * (u - center), w])
+        prior = np.diag(np.concatenate([weight, np.full(len(w), 2 * REACH)]))
+        return [(r, np.concatenate([np.concatenate([self.slope(u), 2 * REACH * self.arm], 1), prior]))]
 
 
 def contact_problem(
@@ -151,8 +166,10 @@ def contact_problem(
     own = torque.reweighted(x, fitted=True)
     directions = arm_directions(own, x, samples, DRIFT, DRIFT * space.dynamics(x).level)
     effect = np.linalg.norm((directions / own.scale[..., None])[own.seen], axis=0)
-    error = own.error(space.dynamics(x))
-    return ContactProblem(own, x, tip, error, directions[..., effect > SEEN], _sigma(own, x), surfaces)
+    d = space.dynamics(x)
+    gravity = InverseDynamics(space.robot, d).gravity(motion.q)
+    sag = np.cross(tip.axes, tip.centre[:, None] - tip.origins) * gravity[..., None]
+    return ContactProblem(own, x, tip, own.error(d), directions[..., effect > SEEN], _sigma(own, x), surfaces, sag)
 
 
 def _sigma(torque: TorqueResidual, x: np.ndarray) -> np.ndarray:

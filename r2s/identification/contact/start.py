@@ -47,7 +47,7 @@ def first_guesses(
     normals = [normal]
     if spread[1] > FLAT * spread[2]:
         normals.insert(0, axes[2] * np.sign(axes[2] @ normal))
-    surfaces = SurfaceSpace(origin - tool.radius * normals[0], normals[0])
+    surfaces = SurfaceSpace(origin - tool.radius * normals[0], normals[0], space.robot.tau_max)
     return surfaces, list(_starts(surfaces, normals, centre - tool.radius * normals[0], force))
 
 

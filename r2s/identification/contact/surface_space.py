@@ -1,4 +1,4 @@
-"""Map the parameters of an unknown surface to a vector on the unit cube."""
+"""Map the parameters of an unknown surface, and of gears in series with it, to a vector on the unit cube."""
 
 from dataclasses import dataclass
 
@@ -23,6 +23,12 @@ BOUNDS = {
 NAMES = tuple(BOUNDS)
 LOWER, UPPER = np.array(list(BOUNDS.values())).T
 WIDTH = UPPER - LOWER
+SURFACE = len(NAMES)  # number of values of a surface; u has 1 + n further values if the gears are elastic
+FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
+# Deflection of gears, rad, by the joints' largest torques. The prior is normal with rigid gears at its center; strain
+# wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
+DEFLECTION, SOFTEST = 0.01, 0.05
+SCATTER, FARTHEST = 0.2, 0.6  # standard deviation and bound of a joint's deflection about the arm's, as shares of it
 
 
 @dataclass(frozen=True)
@@ -30,11 +36,16 @@ class SurfaceSpace:
     """The space of surfaces near a plane through `origin` (3,) m with unit normal `normal` (3,).
 
     A vector u contains two tilts of the plane about axes through `origin`, the tip's height along the normal under
-    the force LOAD, and five values of the force law.
+    the force LOAD, and five values of the force law. If the gears are elastic, it also contains their deflection by
+    the largest torques, and the deviation of each joint from it.
+
+    Attributes:
+        tau_max: (n,) Nm, largest torques of the joints.
     """
 
     origin: np.ndarray
     normal: np.ndarray
+    tau_max: np.ndarray
 
     @property
     def axes(self) -> np.ndarray:
@@ -44,21 +55,38 @@ class SurfaceSpace:
         return np.stack([first, np.cross(self.normal, first)])
 
     def plane(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a point (..., 3) m and the normal (..., 3) of the plane that u (..., 8) describes."""
-        p = LOWER + u * WIDTH
+        """Return a point (..., 3) m and the normal (..., 3) of the plane that u (..., P) describes."""
+        p = LOWER + u[..., :SURFACE] * WIDTH
         normal = self.normal + p[..., :2] @ self.axes
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         height = p[..., 2] + LOAD * p[..., 4] / np.exp(p[..., 3])
         return self.origin + height[..., None] * normal, normal
 
     def law(self, u: np.ndarray) -> np.ndarray:
-        """Return the force law's five values (..., 5) for u (..., 8), in the order that `contact_law` returns."""
-        p = LOWER + u * WIDTH
+        """Return the force law's five values (..., 5) for u (..., P), in the order that `contact_law` returns."""
+        p = LOWER + u[..., :SURFACE] * WIDTH
         K = LOAD / (LOAD * p[..., 4] / np.exp(p[..., 3])) ** p[..., 4]
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
 
+    def compliance(self, u: np.ndarray) -> np.ndarray:
+        """Return the compliance (..., n) rad/Nm of the gears for u (..., P); without values for gears, zeros."""
+        if u.shape[-1] == SURFACE:
+            return np.zeros((*u.shape[:-1], len(self.tau_max)))
+        relative = 1.0 + FARTHEST * (2.0 * u[..., SURFACE + 1 :] - 1.0)
+        return SOFTEST * u[..., SURFACE, None] * relative / self.tau_max
+
+    def with_gears(self, u: np.ndarray) -> np.ndarray:
+        """Return the surface u (8,) with values for gears, which are rigid: (8 + 1 + n,)."""
+        return np.concatenate([u, [0.0], np.full(len(self.tau_max), 0.5)])
+
+    def prior(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return center and 1 / standard deviation (count,) of the normal prior on a vector u (count,)."""
+        gears = [SOFTEST / DEFLECTION, *np.full(len(self.tau_max), 2.0 * FARTHEST / SCATTER)]
+        center = np.concatenate([np.full(SURFACE, 0.5), [0.0], np.full(len(self.tau_max), 0.5)])
+        return center[:count], np.concatenate([np.full(SURFACE, FLAT), gears])[:count]
+
     def surface(self, u: np.ndarray) -> Surface:
-        """Return the surface that u (8,) describes."""
+        """Return the surface that u (P,) describes."""
         point, normal = self.plane(u)
         K, *rest = self.law(u).tolist()
         return Surface(point, normal, K * UNIT_DEPTH ** (rest[0] - 1.0), *rest)

@@ -1,6 +1,6 @@
 """Compute a tool tip's motion in a recording, and the joint torque of its contact with a surface."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface, normal_force
 
+NEWTON = 10  # iterations for two springs in series, which leave an error of 1e-12 for exponents of 1 to 2
+SHALLOW = 1e-6  # share of the deflection that stays in the surface, so that its slope is defined
+
 
 @dataclass(frozen=True)
 class TipMotion:
@@ -22,6 +25,8 @@ class TipMotion:
         centre: (F, 3) m, center of the tip. radius: m, radius of the tip.
         axes, origins: (F, n, 3), joint axes, and points on these axes, in the base frame. dq: (F, n) rad/s, velocity.
         play: m, largest tip path by encoder noise alone; a path shorter than `play` only bends bristles elastically.
+        compliance: (n,) rad/Nm, by which the contact's torque deflects the gears behind encoders on the motors; (0,):
+            rigid gears.
     """
 
     step: float
@@ -32,6 +37,7 @@ class TipMotion:
     origins: np.ndarray
     dq: np.ndarray
     play: float = 0.0
+    compliance: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @staticmethod
     def of(robot: Robot, q: np.ndarray, dq: np.ndarray, step: float, starts: np.ndarray, play: float) -> "TipMotion":
@@ -61,7 +67,7 @@ class TipMotion:
         """Return the result of `contact` for a plane with `point` and `normal`; `law`: result of `contact_law`."""
         tau, out = np.empty_like(self.dq), np.empty((3, len(self.dq)))
         motion = self.centre, self.axes, self.origins, self.dq, self.starts
-        _contact(motion, (self.radius, self.step, self.play), point, normal, law, tau, out)
+        _contact(motion, (self.radius, self.step, self.play, self.compliance), point, normal, law, tau, out)
         return tau, out[0], out[1], out[2]
 
 
@@ -84,9 +90,12 @@ def _contact(motion, settings, point, normal, law, tau, out):
     Friction is mu F z with the bristle deflection z (Dahl 1968 in two dimensions): dz = (dx - |dx| z) / bristle. Here
     x is the tip's deepest point, projected onto the surface. Encoder noise of a resting tip adds up in |dx| and would
     let bristles relax. Therefore a path shorter than `play` only bends bristles elastically.
+
+    Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
+    with compliances C and the force's direction g, F g = F (n - mu z).
     """
     centre, axes, origins, dq, starts = motion
-    radius, step, play = settings
+    radius, step, play, compliance = settings
     K, exponent, damping, friction, bristle = law
     z, lead, n = np.zeros(3), np.zeros(3), dq.shape[1]
     arm, v, f = np.empty((n, 3)), np.empty(3), np.empty(3)
@@ -105,7 +114,14 @@ def _contact(motion, settings, point, normal, law, tau, out):
                 v[k] += arm[j, k] * dq[t, j]
         for k in range(3):
             rate -= normal[k] * v[k]
-        force = normal_force(K, exponent, damping, depth, rate)
+        soft = 0.0
+        for j in range(len(compliance)):
+            along_n, along_g = 0.0, 0.0
+            for k in range(3):
+                along_n += arm[j, k] * normal[k]
+                along_g += arm[j, k] * (normal[k] - friction * z[k])
+            soft += compliance[j] * along_n * along_g
+        force, depth, rate = _in_series(soft, K, exponent, damping, depth, rate)
         if depth <= 0.0 or starts[t]:
             z[:], lead[:] = 0.0, 0.0
         else:
@@ -133,3 +149,22 @@ def _contact(motion, settings, point, normal, law, tau, out):
         out[0, t], out[1, t], out[2, t] = force, depth, rate
         for j in range(n):
             tau[t, j] = arm[j, 0] * f[0] + arm[j, 1] * f[1] + arm[j, 2] * f[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _in_series(soft, K, exponent, damping, depth, rate):
+    """Return force, depth and its rate at a surface behind a spring of compliance `soft`, m/N, by Newton's method.
+
+    depth, rate: m, m/s, the sum of both deflections and its rate. The force rises from below to the solution, since
+    the force of the surface is convex in the depth.
+    """
+    force = normal_force(K, exponent, damping, depth, rate)
+    if soft <= 0.0 or force <= 0.0:
+        return force, depth, rate
+    total, force = depth, 0.0
+    for _ in range(NEWTON):
+        depth = max(total - soft * force, SHALLOW * total)
+        slope = exponent * normal_force(K, exponent, 0.0, depth, 0.0) / depth
+        own = normal_force(K, exponent, damping, depth, rate / (1.0 + soft * slope))
+        force += (own - force) / (1.0 + soft * slope)
+    return force, total - soft * force, rate / (1.0 + soft * slope)

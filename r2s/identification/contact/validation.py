@@ -42,7 +42,7 @@ class Press:
 
 
 def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
-    """Return a mask (T,) for each press on a surface u (8,), in order of time, including GUARD_S before and after."""
+    """Return a mask (T,) for each press on a surface u (P,), in order of time, including GUARD_S before and after."""
     motion = problem.motion
     at = motion.instants[_depth(problem, u) > 0]
     if not len(at):
@@ -53,13 +53,13 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 
 
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
-    """Return the forces that a surface u (8,) predicts and the forces from joint torques, in the masks `parts`.
+    """Return the forces that a surface u (P,) predicts and the forces from joint torques, in the masks `parts`.
 
     Assume that the measured force has the direction of the predicted force. A weighted least-squares fit to the
     torques of joints in motion then determines the ratio of the measured to the predicted force.
     """
     motion = problem.motion
-    tau, force, depth, rate = problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))
+    tau, force, depth, rate = problem.contact(u)
     at = np.searchsorted(motion.instants, motion.t - 1e-6).clip(max=len(motion.instants) - 1)
     force, depth, rate, tau = force[at], depth[at], rate[at], motion.filtered(tau)
     error = problem.error + problem.directions @ problem.best_arm(u)
@@ -74,4 +74,4 @@ def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]
 
 
 def _depth(problem: ContactProblem, u: np.ndarray) -> np.ndarray:
-    return problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))[2]
+    return problem.contact(u)[2]

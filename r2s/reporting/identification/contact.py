@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from r2s.identification.contact.contact_file import UNITS
-from r2s.identification.contact.estimate import ContactEstimate
+from r2s.identification.contact.estimate import COVERED, ContactEstimate
 from r2s.identification.contact.surface_space import LOAD
 from r2s.reporting.figures.colours import colours
 from r2s.reporting.figures.log_rows import thin
@@ -33,6 +33,9 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
     point, normal = (", ".join(f"{v:.5f}" for v in x) for x in (found.surface.point, found.surface.normal))
     cells["point, m"] = [point, f"along the normal\n[{number(low)}, {number(high)}] mm", plane]
     cells["normal"] = [normal, f"tilt below {number(found.tilt_deg, '{:.2g}')}°", plane]
+    low, high = 1e6 * np.percentile(found.draws["gears"].max(1), COVERED)
+    ends = f"[{number(low, FINE)}, {number(high, FINE)}]"
+    cells["softest gear, µrad/Nm"] = [number(1e6 * found.gears.max(), FINE), ends, "yes" if low > 0 else "no"]
     columns = ["value", "95 % interval", "determined"]
     return pd.DataFrame.from_dict(cells, orient="index", columns=columns).rename_axis("surface")
 
