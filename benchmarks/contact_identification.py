@@ -148,7 +148,7 @@ def judged_twin(variant: str, seed: int) -> tuple[Score, dict[str, str]]:
         "normal, °": f"{s.tilt_deg:.3f}",
         "gears, mrad": f"{1e3 * (document['gears']['value'] * robot.tau_max).mean():.1f}",
         "outside 95 %": ", ".join(name for name, inside in s.covered.items() if not inside) or "none",
-        "held-out force, N RMS": f"{held_out:.2f}",
+        "held-out force, N RMS": "-" if held_out is None else f"{held_out:.2f}",
     }
 
 

@@ -118,6 +118,7 @@ def identify_surface(cfg, run, arm, data):
     from r2s.identification.contact.estimate import identify_contact
     from r2s.identification.contact.exchange import write_surface
     from r2s.identification.contact.surface_space import LOAD
+    from r2s.identification.contact.validation import KNOWN
     from r2s.physics.description import write_description
     from r2s.progress import Progress
     from r2s.reporting.identification.contact import contact_figure, contact_table, press_table
@@ -134,6 +135,10 @@ def identify_surface(cfg, run, arm, data):
     contact_figure(run.figure("contact"), found)
     print_table(console(), contact_table(found), "surface, 95 % intervals")
     print_table(console(), press_table(found), "surface against joint torques")
+    if not len(found.training.t):
+        print(
+            f"joint torques never determine the force to {100 * KNOWN:g} % of the largest force: friction errs too much"
+        )
     low, high = found.interval("slope")
     entry = {"slope_N_per_m": found.slope, "slope_interval95_N_per_m": [low, high], "at_N": LOAD}
     entry |= {"friction": found.surface.friction, "train": found.training.summary()}
