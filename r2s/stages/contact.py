@@ -136,9 +136,8 @@ def identify_surface(cfg, run, arm, data):
     print_table(console(), contact_table(found), "surface, 95 % intervals")
     print_table(console(), press_table(found), "surface against joint torques")
     if not len(found.training.t):
-        print(
-            f"joint torques never determine the force to {100 * KNOWN:g} % of the largest force: friction errs too much"
-        )
+        share = f"{100 * KNOWN:g} % of the largest force"
+        print(f"joint torques never determine the force to {share}: friction errs too much")
     low, high = found.interval("slope")
     entry = {"slope_N_per_m": found.slope, "slope_interval95_N_per_m": [low, high], "at_N": LOAD}
     entry |= {"friction": found.surface.friction, "train": found.training.summary()}
