@@ -1,25 +1,20 @@
-"""Figures show something, tables hold the numbers given, recordings open."""
+"""Figures show something, and tables and pages hold the numbers given."""
 
 import base64
 import json
-import os
 import re
-import subprocess
-import sys
-from contextlib import suppress
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
-import mujoco
 import numpy as np
 import pandas as pd
 import pytest
 import rerun as rr
+from made_content import entities, make_curve, make_episode, make_overlay
 from matplotlib.image import imread
-from rerun.chunk import RrdReader
 from rich.console import Console
 from scipy.stats import t as student
 
@@ -33,15 +28,13 @@ from r2s.identification.prediction import prediction_errors
 from r2s.identification.result import IdentificationResult
 from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import BRISTLE
-from r2s.physics.robot import Robot, load_robot
-from r2s.progress import Progress
+from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 from r2s.reporting import pages
 from r2s.reporting.document import KEPT, report_html, report_markdown
 from r2s.reporting.figures.colours import colours
 from r2s.reporting.figures.episodes import error_figure
 from r2s.reporting.figures.learning import learning_figure
-from r2s.reporting.figures.log_rows import without_pauses
 from r2s.reporting.identification.figures import (
     _running,
     convergence_figure,
@@ -56,55 +49,10 @@ from r2s.reporting.identification.whiteness import autocorrelation, whiteness_fi
 from r2s.reporting.measures import measures_of
 from r2s.reporting.run_list import run_rows
 from r2s.reporting.tables import diagnostic_rows, print_measures
-from r2s.reporting.viewer.data import Content, Episode, Overlay
-from r2s.reporting.viewer.layout import PAUSE, starts_of
-from r2s.reporting.viewer.recording import write_recording
 from r2s.tasks.measures import Measure, MeasureTable, write_measures
 from r2s.tasks.reach import REACH
 
 CURVES = [REACH[key] for key in REACH.curves]
-EVERY_SHAPE = """
-<mujoco model="shapes">
-  <asset><mesh name="wedge" vertex="0 0 0  0.1 0 0  0 0.1 0  0 0 0.1"/></asset>
-  <worldbody>
-    <geom type="plane" size="1 1 1"/>
-    <body name="goal"><joint axis="0 0 1" range="-2 2" actuatorfrcrange="-9 9"/>
-      <geom type="box" size="0.05 0.05 0.1"/><geom type="sphere" size="0.06" pos="0 0 0.2"/>
-      <body pos="0 0 0.2"><joint axis="0 1 0" range="-2 2" actuatorfrcrange="-9 9"/>
-        <geom type="ellipsoid" size="0.03 0.04 0.1"/><geom type="mesh" mesh="wedge"/>
-        <geom type="capsule" size="0.02 0.1"/><geom type="cylinder" size="0.03 0.01" rgba="0 0 0 1"/>
-        <site name="tip" pos="0 0 0.2"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
-def make_episode(robot: Robot, seed: int, rows: int = 60) -> Episode:
-    """A random walk about the home pose."""
-    rng = np.random.default_rng(seed)
-    q = robot.q_home + np.cumsum(0.01 * rng.normal(size=(rows, robot.n)), axis=0)
-    model = robot.model(gravity=False)
-    data, ee = mujoco.MjData(model), np.empty((rows, 3))
-    for k in range(rows):
-        data.qpos[:] = q[k]
-        mujoco.mj_kinematics(model, data)
-        ee[k] = data.site(robot.ee_site).xpos
-    return Episode(0.02 * np.arange(rows), q, ee, ee[-1] + 0.02, rng.normal(size=q.shape))
-
-
-def make_curve(rows: int = 12) -> pd.DataFrame:
-    steps, success = 1000 * np.arange(1, rows + 1), np.linspace(0, 1, rows)
-    table = {key: success for key in ("success_5cm", "success_2cm", "success_1cm", "success_5mm")}
-    extra = {"distance_median_m": 0.3 - 0.2 * success, "return_paper": -100 + 50 * success}
-    return pd.DataFrame({"env_steps": steps, "wall_clock_s": steps / 100, **table, **extra})
-
-
-def make_overlay(n: int, rows: int = 400) -> Overlay:
-    t = 0.01 * np.arange(rows)
-    measured = np.sin(t[:, None] * (1 + np.arange(n)))
-    return Overlay(t, measured, {"nominal": 0.7 * measured, "identified": measured + 0.01})
 
 
 def make_identified(robot: Robot, bounds: dict, family: str = "sigmoid") -> IdentificationResult:
@@ -164,10 +112,6 @@ def printed(console: Console) -> str:
     return console.file.getvalue()
 
 
-def entities(path: Path) -> set[str]:
-    return {chunk.entity_path for chunk in RrdReader(path).stream()}
-
-
 @pytest.fixture(autouse=True)
 def strict():
     """Let rerun raise where it would only log."""
@@ -207,95 +151,11 @@ def test_every_figure_is_written_and_shows_something(tmp_path, panda, identified
         assert len(np.unique(few)) > 20, f"{path.name} has no colours"
 
 
-def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
-    path = tmp_path / "recording.rrd"
-    picture = learning_figure(tmp_path / "learning.png", {"a": make_curve()}, CURVES)
-    labels = {"mujoco": 3, "twin, nominal": 2, "a/b": 1}
-    content = Content(
-        REACH,
-        {label: [make_episode(panda, k) for k in range(count)] for label, count in labels.items()},
-        {"validation": make_overlay(panda.n)},
-        {"tqc": make_curve()},
-        {"learning": picture},
-        np.full(panda.n, 5.0),
-    )
-    assert write_recording(path, panda, content) == path
-    assert [p.name for p in tmp_path.glob("*.rrd")] == ["recording.rrd"]
-    checked = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", path], capture_output=True, text=True)
-    assert checked.returncode == 0, checked.stderr
-    found = entities(path)
-    for label in labels:
-        base = rr.new_entity_path(["arms", label])
-        assert {f"{base}/goal", f"{base}/trail", f"{base}/links/link7"} <= found
-        for j in range(panda.n):
-            assert rr.new_entity_path(["command", f"joint {j + 1}", label]) in found
-    assert rr.new_entity_path(["command", "joint 7", "upper limit"]) in found
-    for name in ("1 measured", "2 nominal", "3 identified"):
-        assert rr.new_entity_path(["torque", "validation", "joint 7", name]) in found
-    assert rr.new_entity_path(["learning", "success at 1 cm", "tqc"]) in found
-    assert "/figures/learning" in found
-
-
-def test_the_drawn_links_are_where_the_arm_was(tmp_path, panda):
-    """The last link of every frame, in the recording, ends at the end effector of the episode."""
-    episode = make_episode(panda, 3)
-    path = write_recording(tmp_path / "r.rrd", panda, Content(REACH, {"arm": [episode]}))
-    chunks = [c for c in RrdReader(path).stream() if c.entity_path == "/arms/arm/links/link7" and not c.is_static]
-    assert sum(c.num_rows for c in chunks) == len(episode.t)
-    assert chunks[0].timeline_names == ["time"]
-    columns = chunks[0].to_record_batch().to_pydict()
-    origin = np.array(columns["Transform3D:translation"])[:, 0]
-    flange = np.linalg.norm(episode.ee - origin, axis=1)
-    assert np.allclose(flange, 0.107, atol=1e-5)
-
-
-def test_episodes_follow_one_another_and_all_arms_start_together(panda):
-    long, short = make_episode(panda, 0, rows=60), make_episode(panda, 1, rows=20)
-    starts = starts_of({"a": [short, long], "b": [long]})
-    assert starts.tolist() == pytest.approx([0, 1.18 + PAUSE, 2 * (1.18 + PAUSE)])
-
-
-def test_a_clock_that_stops_or_restarts_still_runs_forward():
-    clock, _ = without_pauses(np.array([5.0, 5.01, 9.0, 9.01, 0.0, 0.01]))
-    assert clock.tolist() == pytest.approx([0, 0.01, 0.11, 0.12, 0.22, 0.23])
-
-
-def test_every_kind_of_geom_is_drawn_and_other_arms_work(tmp_path):
-    """Even with a body named as one of our own entities; a plane is not part of an arm."""
-    (tmp_path / "arm.xml").write_text(EVERY_SHAPE)
-    robot = load_robot(str(tmp_path / "arm.xml"))
-    path = write_recording(tmp_path / "r.rrd", robot, Content(REACH, {"arm": [make_episode(robot, 0)], "none": []}))
-    found = entities(path)
-    assert not any(entity.startswith("/arms/none") for entity in found)
-    assert len([entity for entity in found if "/geom" in entity]) == 6
-    assert {"/arms/arm/goal", "/arms/arm/links/goal"} <= found
-
-
-def test_a_recording_that_fails_leaves_nothing(tmp_path, panda):
-    with pytest.raises(FileNotFoundError):
-        write_recording(tmp_path / "r.rrd", panda, Content(figures={"gone": tmp_path / "gone.png"}))
-    assert not list(tmp_path.iterdir())
-
-
 def test_colours_are_fixed_by_meaning_and_differ():
     labels = ["mujoco", "twin, identified", "twin, nominal", "measured", "arm, identified", "dart"]
     found = colours(labels)
     assert len(set(found.values())) == len(labels)
     assert found["twin, nominal"] == colours(["nominal"])["nominal"]
-
-
-def test_a_bar_goes_on_after_it_was_full(monkeypatch):
-    """An identification has several searches: each begins at zero, and the time goes on."""
-    monkeypatch.setenv("FORCE_COLOR", "1")  # makes rich see a terminal
-    progress = Progress("identify")
-    (task,) = progress._bar.tasks
-    progress(1.0)
-    assert task.finished
-    before = task.elapsed
-    progress(0.3)
-    assert not task.finished
-    assert task.elapsed > before
-    progress.close()
 
 
 SUMMARY = {
@@ -476,12 +336,6 @@ def test_seconds_of_a_resumed_run_go_on():
     assert _running(np.array([1.0, 2.0, 0.5, 1.5])).tolist() == [1.0, 2.0, 2.5, 3.5]
 
 
-def test_pauses_are_cut_short():
-    clock, pauses = without_pauses(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
-    assert clock.tolist() == pytest.approx([0, 0.01, 0.02, 0.12, 0.13, 0.23, 0.24])
-    assert pauses.tolist() == [3, 5]
-
-
 def test_a_measure_table_with_an_unknown_key_is_refused():
     """The message names the list, the key and the nearest match."""
     force = Measure("force_N", "force", "force error", "N")
@@ -522,55 +376,6 @@ def test_a_task_from_outside_r2s_shows_its_own_measures(tmp_path, panda, console
     )
     assert "It presses on a surface." in sections["tqc for panda, press"][1]
     assert sections["Measured"][0]["held, %"].to_list() == ["97.0"]
-
-
-PROGRESS = """
-from r2s.progress import Progress
-progress = Progress("train [tqc]")
-progress(0.25, "12k env steps, 50 % < 1 cm")
-"""
-
-
-def test_progress_is_plain_lines_where_nobody_watches():
-    """Share, elapsed and text; nothing that only a terminal understands."""
-    done = subprocess.run([sys.executable, "-c", PROGRESS + "progress.close('9 s')"], capture_output=True, text=True)
-    first, last = done.stderr.splitlines()
-    assert first.startswith("train [tqc]  25 %  0:00")
-    assert first.endswith("12k env steps, 50 % < 1 cm")
-    assert last == "train [tqc] done in 0:00  9 s"
-
-
-def test_the_time_left_is_that_of_the_share_since_the_begin(capsys, monkeypatch):
-    """A resumed run begins at a share that an earlier process has done."""
-    now = [100.0]
-    monkeypatch.setattr("r2s.progress.time", SimpleNamespace(perf_counter=lambda: now[0]))
-    progress = Progress("train", every_s=0.0)
-    progress(0.78)
-    now[0] += 20.0
-    progress(0.80)  # 0.02 in 20 s, so 0.2 more take 200 s
-    first, second = capsys.readouterr().err.splitlines()
-    assert "left" not in first
-    assert re.search(r"3:(19|20) left", second)  # rounded down
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
-@pytest.mark.parametrize("end", ["progress.close('9 s')", "raise SystemExit(2)"])
-def test_progress_is_a_bar_on_a_terminal_and_gives_the_cursor_back(end):
-    """Also where the work fails."""
-    ours, theirs = os.openpty()
-    environment = os.environ | {"COLUMNS": "100", "TERM": "xterm"}
-    subprocess.run([sys.executable, "-c", PROGRESS + end], stderr=theirs, env=environment)
-    os.close(theirs)
-    parts = []
-    with suppress(OSError):  # EIO: all has been read; one read may return a part
-        while part := os.read(ours, 100_000):
-            parts.append(part)
-    text = b"".join(parts).decode()
-    os.close(ours)
-    assert "25%" in text
-    assert "12k env steps" in text
-    assert ("done in" in text) == ("close" in end)
-    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
 
 
 class Page(HTMLParser):
