@@ -97,11 +97,12 @@ def judged_arm(folder: Path, words: list[str]) -> dict[str, str]:
     space, x = load_parameters(run, robot)
     recording = read(folder / "contact.npz", torque="commanded")
     before = identify_contact(Arm(space, x, load_posterior(run, space)), recording.select(recording.t < last))
+    assert before.rigid_gears is not None  # these arms have rigid gears
     smooth = recording.smooth(CUTOFF_HZ)
     tip = TipMotion.of(robot, smooth.q, smooth.derivative(smooth.q), SIM_DT, smooth.t == smooth.t[0], PLAY)
     with np.load(folder / "truth_contact.npz") as file:
         force, rate = file["normal_force"], file["penetration_rate"]
-    error, held_out = tip.contact(before.surface)[1] - force, (recording.t >= last) & (force > 0)
+    error, held_out = tip.contact(before.rigid_gears.surface)[1] - force, (recording.t >= last) & (force > 0)
     sides = {"loading": rate > 0, "unloading": rate < 0}
     rmse = {name: float(np.sqrt(np.mean(error[held_out & side] ** 2))) for name, side in sides.items()}
     missed = [name for name, inside in s.covered.items() if not inside]

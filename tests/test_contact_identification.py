@@ -81,20 +81,22 @@ def test_the_surface_that_was_pressed_is_identified(found, surface):
     assert all(found.identifiable.values())
 
 
-def test_elastic_gears_are_told_apart_from_the_surface(robot):
+def test_elastic_gears_are_separated_from_the_surface(robot):
     """Encoders on motors: gears that halve the stiffness are identified, with a surface and plane behind them."""
     arm, surface = estimated_arm(robot, SEED), replace(drawn_surface(SEED), stiffness=3e4, exponent=1.0)
     gears = 0.006 * np.linspace(0.85, 1.15, robot.n) / robot.tau_max
     plan = replace(QUICK, places=((0.0, 0.0), (0.10, 0.08), (-0.08, 0.10)))
     found = identify_contact(arm, press_recording(arm, surface, SEED, plan, gears=gears))
     low, high = np.percentile(found.draws["gears"] @ robot.tau_max, [2.5, 97.5])
-    assert low < gears @ robot.tau_max < high < 2 * low
+    assert low < gears @ robot.tau_max < high
+    assert found.identifiable["gears"]
     low, high = found.interval("slope")
     assert low < 3e4 < high < 2 * low
     rigid = found.rigid_gears
     assert rigid.interval("slope")[1] < low
-    height, wrong = ((surface.point - one.surface.point) @ surface.normal for one in (found, rigid))
-    assert abs(height) < 2e-4 < 5e-4 < abs(wrong)  # gravity moves the tip behind the encoders
+    height, wrong = ((surface.point - one.surface.point) @ one.surface.normal for one in (found, rigid))
+    assert found.height[0] < height < found.height[1]
+    assert abs(height) < 5e-4 < abs(wrong)  # gravity moves the tip behind the encoders
     assert found.validation.rmse() < rigid.validation.rmse()
 
 
@@ -199,6 +201,29 @@ def test_contact_friction_is_dahls(robot, surface):
     assert axis.shape == (3,)
 
 
+def test_a_press_behind_gears_keeps_friction_and_adds_none(robot, surface):
+    """The tip slides, stops, and goes deeper: friction stays mu F, and the force along the normal is the force."""
+    count, surface = 400, replace(surface, exponent=1.0, damping=0.0)
+    q = robot.q_home + np.zeros((count, robot.n))
+    tip = TipMotion.of(robot, q, 0.0 * q, SIM_DT, np.arange(count) == 0, 0.02 * surface.bristle)
+    along = np.cross(surface.normal, [1.0, 0.0, 0.0])
+    along /= np.linalg.norm(along)
+    slid, deep = np.linspace(0.0, 1.0, count // 2), np.linspace(0.0, 1.0, count - count // 2)
+    slid, deep = np.append(slid, np.ones(len(deep))), np.append(np.zeros(count // 2), deep)
+    point = tip.centre[0] - (tip.radius - 5e-4) * surface.normal
+    path = 3e-3 * slid[:, None] * along - 5e-4 * deep[:, None] * surface.normal
+    tip = replace(tip, centre=tip.centre[0] + path, compliance=np.full(robot.n, 2e-4))
+    jacobian = tip.jacobian(np.arange(count), surface.normal)
+    dq = np.stack([np.linalg.pinv(J) @ v for J, v in zip(jacobian, np.gradient(path, SIM_DT, axis=0), strict=True)])
+    tau, force, _, _ = replace(tip, dq=dq).contact(replace(surface, point=point))
+    acting = np.stack([np.linalg.pinv(J.T) @ x for J, x in zip(jacobian, tau, strict=True)])
+    normal = acting @ surface.normal
+    np.testing.assert_allclose(normal[1:], force[1:], rtol=1e-6)
+    across = np.linalg.norm(acting - normal[:, None] * surface.normal, axis=1)
+    np.testing.assert_allclose(across[count // 2 :], surface.friction * force[count // 2 :], rtol=0.01)
+    assert force[-1] > 1.5 * force[count // 2]
+
+
 def test_contact_yaml_loads_as_it_was_saved(tmp_path, robot, found):
     """Surface, intervals and draws come back; a damaged file gives one line."""
     save_contact(tmp_path / "contact.yaml", robot, found, {"recording": "x"})
@@ -209,9 +234,14 @@ def test_contact_yaml_loads_as_it_was_saved(tmp_path, robot, found):
     assert loaded.identifiable == found.identifiable
     assert len(loaded.draws) == len(found.draws["slope"])
     assert loaded.draws[3].friction == found.draws["friction"][3]
+    assert loaded.simulated.surface.stiffness == pytest.approx(found.rigid_gears.surface.stiffness, rel=1e-5)
+    assert loaded.simulated.draws[3].friction == found.rigid_gears.draws["friction"][3]
     with pytest.raises(UserError, match=r"contact: no contact\.yaml at .*nowhere"):
         load_contact(tmp_path / "nowhere")
     document = yaml.safe_load((tmp_path / "contact.yaml").read_text())
+    old = {key: value for key, value in document.items() if key != "rigid_gears"}  # before gears were estimated
+    (tmp_path / "contact.yaml").write_text(yaml.safe_dump(old))
+    assert load_contact(tmp_path).simulated.surface.stiffness == loaded.surface.stiffness
     document["parameters"]["stiffness"]["value"] = -1.0
     (tmp_path / "contact.yaml").write_text(yaml.safe_dump(document))
     with pytest.raises(UserError, match=r"not a contact\.yaml of r2s .*positive stiffness"):

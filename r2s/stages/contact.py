@@ -141,6 +141,8 @@ def identify_surface(cfg, run, arm, data):
     low, high = found.interval("slope")
     entry = {"slope_N_per_m": found.slope, "slope_interval95_N_per_m": [low, high], "at_N": LOAD}
     entry |= {"friction": found.surface.friction, "train": found.training.summary()}
+    if found.rigid_gears is not None:
+        entry["rigid_gears_slope_N_per_m"] = found.rigid_gears.slope
     return entry | ({} if found.validation is None else {"validation": found.validation.summary()})
 
 

@@ -61,7 +61,8 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     document |= _entries(found)
     ends = np.percentile(found.draws["gears"], COVERED, axis=0)
     rows = {"value": found.gears, "interval95_low": ends[0], "interval95_high": ends[1]}
-    document["gears"] = {"unit": "rad/Nm"} | {name: [_number(v) for v in row] for name, row in rows.items()}
+    gears = {"unit": "rad/Nm"} | {name: [_number(v) for v in row] for name, row in rows.items()}
+    document["gears"] = gears | {"identifiable": found.identifiable.get("gears", False)}
     document[RIGID_GEARS] = _entries(simulated)
     document["mujoco"] = mujoco_contact(simulated.surface, inverse_mass(robot))
     document["sdf"] = sdf_surface(simulated.surface)
@@ -130,6 +131,8 @@ def _parse(document: dict[str, Any], draws: dict[str, np.ndarray]) -> Identified
     identifiable = {n: bool(v["identifiable"]) for n, v in found.items()}
     identifiable["slope"] = identifiable.pop(f"slope_at_{LOAD:g}N")
     identifiable["plane"] = bool(plane["identifiable"])
+    if "gears" in document:
+        identifiable["gears"] = bool(document["gears"]["identifiable"])
     values = {n: float(found[n]["value"]) for n in UNITS}
     surface = _surface(values, np.array(plane["point_m"], dtype=float), np.array(plane["normal"], dtype=float))
     rows = zip(draws["point"], draws["normal"], *(draws[n] for n in UNITS), strict=True)

@@ -13,7 +13,7 @@ from r2s.errors import UserError
 from r2s.identification.arm_uncertainty import Arm
 from r2s.identification.contact.problem import SLOWEST, ContactProblem, contact_problem
 from r2s.identification.contact.start import LEAST_S, first_guesses
-from r2s.identification.contact.surface_space import LOWER, NAMES, SURFACE, UPPER, WIDTH
+from r2s.identification.contact.surface_space import DEFLECTION, LOWER, NAMES, SOFTEST, SURFACE, UPPER, WIDTH
 from r2s.identification.contact.validation import Press, press_errors, presses
 from r2s.identification.posterior import posterior
 from r2s.identification.result import SHARPER
@@ -41,6 +41,8 @@ class ContactEstimate:
         penetration: (2,) m, smallest and largest penetration depth in the recording.
         training: predicted and measured forces of fitted presses. validation: the same for unfitted presses, or None.
         gears: (n,) rad/Nm, compliance of the gears behind encoders on motors; 0: rigid gears or encoders on links.
+            Joints that contact and gravity hardly load have the mean deflection of all joints.
+        tau_max: (n,) Nm, largest torques of the joints.
         rigid_gears: the surface of the same recording for a simulation with rigid gears, which has the gears' springs
             in its own; None in an estimate with rigid gears.
     """
@@ -52,12 +54,17 @@ class ContactEstimate:
     training: Press
     validation: Press | None
     gears: np.ndarray
+    tau_max: np.ndarray
     rigid_gears: "ContactEstimate | None" = None
 
     def interval(self, name: str) -> tuple[float, float]:
         """Return the 95 % interval of the value `name` in `draws`."""
         low, high = np.percentile(self.draws[name], COVERED)
         return float(low), float(high)
+
+    def deflection(self, gears: np.ndarray) -> np.ndarray:
+        """Return the mean deflection (...), rad, of gears of compliance (..., n) rad/Nm by the largest torques."""
+        return (gears * self.tau_max).mean(-1)
 
     @property
     def slope(self) -> float:
@@ -86,7 +93,7 @@ def identify_contact(
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> ContactEstimate:
-    """Estimate the surface from a recording with contact.
+    """Estimate the surface from a recording with contact; the estimate contains one with `rigid_gears`.
 
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
@@ -135,7 +142,7 @@ def _fitted(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.
 
 
 def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
-    """Reweight and solve the problem repeatedly, starting at u (P,); return the problem and its solution (P,)."""
+    """Reweight and solve the problem repeatedly, starting at u (U,); return the problem and its solution (U,)."""
     for _ in range(ROUNDS):
         problem = problem.reweighted(u)
         u = problem.minimized(u, STEPS)[0]
@@ -159,7 +166,7 @@ def _check(problem: ContactProblem, u: np.ndarray) -> None:
 
 
 def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None, seed: int) -> ContactEstimate:
-    """Return the surface estimate at u (P,), with posterior draws."""
+    """Return the surface estimate at u (U,), with posterior draws."""
     steps = posterior(problem, problem.whole(u), seed).steps[:, : len(u)]
     steps[:, :SURFACE] += _systematic(np.random.default_rng(seed), len(steps))
     draws = np.clip(u + steps, 0.0, 1.0)
@@ -172,7 +179,11 @@ def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None,
     half = np.percentile(draws, COVERED[1], axis=0) - np.percentile(draws, COVERED[0], axis=0)
     known = half / 2 < 1 / np.sqrt(12.0) / SHARPER
     identifiable = dict(zip(NAMES[3:], known[3:SURFACE].tolist(), strict=True))
+    identifiable["slope"] &= bool(AT_BOUND < u[3] < 1 - AT_BOUND)  # gears may hide a stiff surface
     identifiable |= {"plane": bool(known[:3].all()), "stiffness": identifiable["slope"] and identifiable["exponent"]}
+    if len(u) > SURFACE:  # the mean deflection, against its prior
+        sure = half[SURFACE] / 2 < DEFLECTION / SOFTEST / SHARPER
+        identifiable["gears"] = bool(sure and u[SURFACE] < 1 - AT_BOUND)
     touched = problem.tip.centre[depth > 0].mean(0)
     at = touched - ((touched - surface.point) @ surface.normal) * surface.normal
     point = at + ((point - at) * normal).sum(-1, keepdims=True) * normal
@@ -184,6 +195,7 @@ def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None,
         training=press_errors(problem.reweighted(u), u, presses(problem, u)),
         validation=validation,
         gears=space.compliance(u),
+        tau_max=space.tau_max,
     )
 
 

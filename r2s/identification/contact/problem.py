@@ -28,21 +28,22 @@ PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least squares over u (P,), surface and gears, and the arm's uncertainty w (r,), with a standard normal prior.
+    """Least squares over u (U,), surface and gears, and the arm's uncertainty w (r,), with a standard normal prior.
 
     Each of the R rows is a window in which a joint slides in one direction (see `TorqueResidual`). Resting joints
     have no rows, since their friction may have any value between the breakaway torques. A closed form eliminates w,
     because w acts linearly on the residual (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
     If encoders are on the motors, gears deflect behind them: gravity moves the tip by the gears' `sag`, and the force
-    by a spring in series with the surface. Presses at places with different lever arms tell the two springs apart.
+    by a spring in series with the surface. Presses at places with different lever arms distinguish the two springs.
 
     Attributes:
         torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
         error: (T, n) Nm, residual torque of the arm with the parameters x, before subtraction of the contact torque.
         directions: (T, n, r) Nm, derivative of the residual torque with respect to w.
         sigma: (T, n) Nm, standard deviation of each residual torque, which the fit treats as independent.
-        space: the space of the vectors u. sag: (F, n, 3) m per rad/Nm, deflection of the tip by gravity on each gear.
+        space: the space of the vectors u.
+        sag: (F, n, 3) m per rad/Nm; gravity moves the tip by minus the sum over j of sag[:, j] and the compliance j.
     """
 
     torque: TorqueResidual
@@ -71,7 +72,7 @@ class ContactProblem:
         return np.unique(self.torque.clusters[self.rows.ravel()], return_inverse=True)[1]
 
     def contact(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return joint torque (F, n) Nm, normal force (F,) N, depth (F,) m and its rate (F,) m/s for u (P,)."""
+        """Return joint torque (F, n) Nm, normal force (F,) N, depth (F,) m and its rate (F,) m/s for u (U,)."""
         tip = self.tip
         if len(u) > SURFACE:
             soft = self.space.compliance(u)
@@ -79,15 +80,15 @@ class ContactProblem:
         return tip.contact_of(*self.space.plane(u), self.space.law(u))
 
     def contact_torque(self, u: np.ndarray) -> np.ndarray:
-        """Return the joint torque (T, n) Nm of contact for u (P,), averaged over each window."""
+        """Return the joint torque (T, n) Nm of contact for u (U,), averaged over each window."""
         return self.motion.filtered(self.contact(u)[0])
 
     def data(self, u: np.ndarray) -> np.ndarray:
-        """Return the residual (R,), in standard deviations, for u (P,) and model errors w = 0."""
+        """Return the residual (R,), in standard deviations, for u (U,) and model errors w = 0."""
         return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
 
     def slope(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative (R, P) of `data` with respect to u (P,)."""
+        """Return the derivative (R, U) of `data` with respect to u (U,)."""
         h, here = np.where(u > 0.5, -STEP, STEP), self.data(u)
         return np.stack([(self.data(stepped) - here) / s for stepped, s in zip(u + np.diag(h), h, strict=True)], 1)
 
@@ -101,7 +102,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return the errors w (r,) of the arm's model that minimize the cost of a given u (P,)."""
+        """Return the errors w (r,) of the arm's model that minimize the cost of a given u (U,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:
@@ -109,21 +110,21 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + r + P) of vectors u (C, P), each at its best w, with a normal prior on u."""
+        """Return residuals (C, R + r + U) of vectors u (C, U), each at its best w, with a normal prior on u."""
         center, weight = self.space.prior(trials.shape[1])
         return np.stack([np.concatenate([self._projected(self.data(u)), weight * (u - center)]) for u in trials])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative (R + r + P, P) of `residual` at u (P,)."""
+        """Return the derivative (R + r + U, U) of `residual` at u (U,)."""
         return np.concatenate([self._projected(self.slope(u)), np.diag(self.space.prior(len(u))[1])])
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-        """Return the vector u (P,) of a local minimum near u, and the sum of squares at this minimum."""
+        """Return the vector u (U,) of a local minimum near u, and the sum of squares at this minimum."""
         u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with each row's weight set from the size and correlation of the residual at u (P,)."""
+        """Return the problem with each row's weight set from the size and correlation of the residual at u (U,)."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
@@ -133,11 +134,11 @@ class ContactProblem:
         return replace(self, torque=self.torque.within(kept))
 
     def whole(self, u: np.ndarray) -> np.ndarray:
-        """Return u (P,) and the best w (r,) for u in one vector (P + r,) on the unit cube, for `linearize`."""
+        """Return u (U,) and the best w (r,) for u in one vector (U + r,) on the unit cube, for `linearize`."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return a list of one pair: the residual (R + P + r,) and its derivative at the vector `whole` (P + r,)."""
+        """Return a list of one pair: the residual (R + U + r,) and its derivative at the vector `whole` (U + r,)."""
         count = len(whole) - self.arm.shape[1]
         u, w = whole[:count], (whole[count:] - 0.5) * 2 * REACH
         center, weight = self.space.prior(count)

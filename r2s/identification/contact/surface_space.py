@@ -55,7 +55,7 @@ class SurfaceSpace:
         return np.stack([first, np.cross(self.normal, first)])
 
     def plane(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a point (..., 3) m and the normal (..., 3) of the plane that u (..., P) describes."""
+        """Return a point (..., 3) m and the normal (..., 3) of the plane that u (..., U) describes."""
         p = LOWER + u[..., :SURFACE] * WIDTH
         normal = self.normal + p[..., :2] @ self.axes
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -63,13 +63,13 @@ class SurfaceSpace:
         return self.origin + height[..., None] * normal, normal
 
     def law(self, u: np.ndarray) -> np.ndarray:
-        """Return the force law's five values (..., 5) for u (..., P), in the order that `contact_law` returns."""
+        """Return the force law's five values (..., 5) for u (..., U), in the order that `contact_law` returns."""
         p = LOWER + u[..., :SURFACE] * WIDTH
         K = LOAD / (LOAD * p[..., 4] / np.exp(p[..., 3])) ** p[..., 4]
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
 
     def compliance(self, u: np.ndarray) -> np.ndarray:
-        """Return the compliance (..., n) rad/Nm of the gears for u (..., P); without values for gears, zeros."""
+        """Return the compliance (..., n) rad/Nm of the gears for u (..., U); without values for gears, zeros."""
         if u.shape[-1] == SURFACE:
             return np.zeros((*u.shape[:-1], len(self.tau_max)))
         relative = 1.0 + FARTHEST * (2.0 * u[..., SURFACE + 1 :] - 1.0)
@@ -86,7 +86,7 @@ class SurfaceSpace:
         return center[:count], np.concatenate([np.full(SURFACE, FLAT), gears])[:count]
 
     def surface(self, u: np.ndarray) -> Surface:
-        """Return the surface that u (P,) describes."""
+        """Return the surface that u (U,) describes."""
         point, normal = self.plane(u)
         K, *rest = self.law(u).tolist()
         return Surface(point, normal, K * UNIT_DEPTH ** (rest[0] - 1.0), *rest)

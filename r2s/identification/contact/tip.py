@@ -12,7 +12,7 @@ from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface, normal_force
 
-NEWTON = 10  # iterations for two springs in series, which leave an error of 1e-12 for exponents of 1 to 2
+NEWTON = 10  # iterations for two springs in series; relative error below 1e-6 for exponents of 1 to 2
 SHALLOW = 1e-6  # share of the deflection that stays in the surface, so that its slope is defined
 
 
@@ -92,7 +92,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
     let bristles relax. Therefore a path shorter than `play` only bends bristles elastically.
 
     Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
-    with compliances C and the force's direction g, F g = F (n - mu z).
+    with compliances C and the force F g = F (n - mu z). Their deflection along the surface is part of `bristle`.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play, compliance = settings
@@ -121,7 +121,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
                 along_n += arm[j, k] * normal[k]
                 along_g += arm[j, k] * (normal[k] - friction * z[k])
             soft += compliance[j] * along_n * along_g
-        force, depth, rate = _in_series(soft, K, exponent, damping, depth, rate)
+        force, depth, own_rate = _in_series(soft, K, exponent, damping, depth, rate)
         if depth <= 0.0 or starts[t]:
             z[:], lead[:] = 0.0, 0.0
         else:
@@ -146,7 +146,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
         share = friction / max(np.sqrt(bent), 1.0)
         for k in range(3):
             f[k] = force * (normal[k] - share * f[k])
-        out[0, t], out[1, t], out[2, t] = force, depth, rate
+        out[0, t], out[1, t], out[2, t] = force, depth, own_rate
         for j in range(n):
             tau[t, j] = arm[j, 0] * f[0] + arm[j, 1] * f[1] + arm[j, 2] * f[2]
 
@@ -155,16 +155,16 @@ def _contact(motion, settings, point, normal, law, tau, out):
 def _in_series(soft, K, exponent, damping, depth, rate):
     """Return force, depth and its rate at a surface behind a spring of compliance `soft`, m/N, by Newton's method.
 
-    depth, rate: m, m/s, the sum of both deflections and its rate. The force rises from below to the solution, since
-    the force of the surface is convex in the depth.
+    depth, rate: m, m/s, the sum of both deflections and its rate. The rate of the surface's depth is that of two
+    springs without damping.
     """
-    force = normal_force(K, exponent, damping, depth, rate)
-    if soft <= 0.0 or force <= 0.0:
-        return force, depth, rate
-    total, force = depth, 0.0
+    if soft <= 0.0 or depth <= 0.0:
+        return normal_force(K, exponent, damping, depth, rate), depth, rate
+    total, force, own_rate = depth, 0.0, 0.0
     for _ in range(NEWTON):
         depth = max(total - soft * force, SHALLOW * total)
         slope = exponent * normal_force(K, exponent, 0.0, depth, 0.0) / depth
-        own = normal_force(K, exponent, damping, depth, rate / (1.0 + soft * slope))
-        force += (own - force) / (1.0 + soft * slope)
-    return force, total - soft * force, rate / (1.0 + soft * slope)
+        own_rate = rate / (1.0 + soft * slope)
+        own = normal_force(K, exponent, damping, depth, own_rate)
+        force += (own - force) / (1.0 + soft * slope * max(1.0 + damping * own_rate, 0.0))
+    return force, max(total - soft * force, SHALLOW * total), own_rate

@@ -42,7 +42,7 @@ class Press:
 
 
 def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
-    """Return a mask (T,) for each press on a surface u (P,), in order of time, including GUARD_S before and after."""
+    """Return a mask (T,) for each press on a surface u (U,), in order of time, including GUARD_S before and after."""
     motion = problem.motion
     at = motion.instants[_depth(problem, u) > 0]
     if not len(at):
@@ -53,7 +53,7 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 
 
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
-    """Return the forces that a surface u (P,) predicts and the forces from joint torques, in the masks `parts`.
+    """Return the forces that a surface u (U,) predicts and the forces from joint torques, in the masks `parts`.
 
     Assume that the measured force has the direction of the predicted force. A weighted least-squares fit to the
     torques of joints in motion then determines the ratio of the measured to the predicted force.

@@ -24,6 +24,11 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
     for name, unit in UNITS.items():
         value, known = getattr(found.surface, name), found.identifiable[name]
         rows[f"{WORDS.get(name, name)}{'' if unit == '1' else f', {unit}'}"] = value, found.interval(name), known
+    if (rigid := found.rigid_gears) is not None:
+        rows["slope with rigid gears, N/m"] = rigid.slope, rigid.interval("slope"), rigid.identifiable["slope"]
+        low, high = (1e3 * np.percentile(found.deflection(found.draws["gears"]), COVERED)).tolist()
+        mean = 1e3 * float(found.deflection(found.gears))
+        rows["gears at tau_max, mrad"] = mean, (low, high), found.identifiable["gears"]
     cells = {
         name: [number(value, FINE), f"[{number(low, FINE)}, {number(high, FINE)}]", "yes" if known else "no"]
         for name, (value, (low, high), known) in rows.items()
@@ -33,9 +38,6 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
     point, normal = (", ".join(f"{v:.5f}" for v in x) for x in (found.surface.point, found.surface.normal))
     cells["point, m"] = [point, f"along the normal\n[{number(low)}, {number(high)}] mm", plane]
     cells["normal"] = [normal, f"tilt below {number(found.tilt_deg, '{:.2g}')}°", plane]
-    low, high = 1e6 * np.percentile(found.draws["gears"].max(1), COVERED)
-    ends = f"[{number(low, FINE)}, {number(high, FINE)}]"
-    cells["softest gear, µrad/Nm"] = [number(1e6 * found.gears.max(), FINE), ends, "yes" if low > 0 else "no"]
     columns = ["value", "95 % interval", "determined"]
     return pd.DataFrame.from_dict(cells, orient="index", columns=columns).rename_axis("surface")
 
@@ -80,8 +82,6 @@ def contact_figure(path: Path, found: ContactEstimate) -> Path:
 
 
 def _curves(found: ContactEstimate, depth: np.ndarray) -> np.ndarray:
-    """Return the normal force (S, D) N of S posterior draws, at depths (D,) m below the estimated plane."""
+    """Return the normal force (S, D) N of S posterior draws, at depths (D,) m below the plane of each draw."""
     draws = found.draws
-    shift = (draws["point"] - found.surface.point) @ found.surface.normal
-    inside = 1e3 * np.maximum(depth + shift[:, None], 0.0)  # mm, the unit of the stiffness
-    return 1e-3 * draws["stiffness"][:, None] * inside ** draws["exponent"][:, None]
+    return 1e-3 * draws["stiffness"][:, None] * (1e3 * depth) ** draws["exponent"][:, None]  # stiffness at 1 mm
