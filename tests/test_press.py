@@ -276,3 +276,12 @@ def test_train_and_transfer_to_a_twin(task, tmp_path):
     assert {"mujoco", "predicted", "twin"} <= set(rows)
     assert rows["twin"]["contact"] > 0.9
     assert rows["twin"]["force_rmse_N"] < 5.0
+
+
+def test_a_training_says_that_contact_changes_the_stiction_model(capsys):
+    """Eq. (6) holds commands alone; a task without contact, and a smooth law, keep it."""
+    for words, changes in ((["task=press", "friction.family=coulomb"], True), (["task=press"], False), ([], False)):
+        cfg = composed("friction=gaz2019", *words)
+        dynamics = make_dynamics(cfg, load_robot(**conf("robot/panda")), announce=True)
+        assert (dynamics.stiction_model == "net") == changes
+        assert ("friction.stiction_model=net instead of command" in capsys.readouterr().out) == changes

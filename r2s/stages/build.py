@@ -54,13 +54,20 @@ def make_robot(cfg):
     return part(settings, "robot", beside=OF_TASKS)
 
 
-def make_dynamics(cfg, robot):
+def make_dynamics(cfg, robot, announce=False):
     """Return the dynamics of `base_dynamics`, prepared for contact if the task of conf/task touches a surface.
 
-    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`.
+    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. If this changes
+    the stiction model, print a line if `announce`.
     """
     dynamics = base_dynamics(cfg, robot)
-    return dynamics.holding_contact() if getattr(target(cfg.task, "task"), "touches", False) else dynamics
+    if not getattr(target(cfg.task, "task"), "touches", False):
+        return dynamics
+    held = dynamics.holding_contact()
+    if announce and held.stiction_model != dynamics.stiction_model:
+        models = f"{held.stiction_model} instead of {dynamics.stiction_model}"
+        print(f"friction.stiction_model={models}, so that friction at rest also holds contact forces")
+    return held
 
 
 def base_dynamics(cfg, robot):

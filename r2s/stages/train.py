@@ -90,7 +90,7 @@ def make_parts(cfg):
         n_envs, demonstrations, residual_l2, loop, settings = split_algo(cfg)
         budget = called(Budget, "budget", plain(cfg.budget))
     robot, model = make_robot(cfg), with_own_calibration(cfg)
-    center = make_dynamics(model, robot)
+    center = make_dynamics(model, robot, announce=True)
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
     if not learns:
         return Parts(robot, task, draw, episodes, make_controller(cfg, robot, task, center))

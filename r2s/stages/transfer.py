@@ -99,7 +99,7 @@ def make_request(cfg):
     source, trained = trained_config(cfg)
     check_number("evaluation.episodes", cfg.evaluation.episodes, "[1, inf)", whole=True)
     robot = make_robot(trained)
-    center = make_dynamics(trained, robot)
+    center = make_dynamics(trained, robot, announce=True)
     task = make_task(trained, robot, center, cfg.get("safety"))
     set_threads(cfg)
     learned = is_learner(trained)
