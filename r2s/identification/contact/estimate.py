@@ -27,6 +27,7 @@ COVERED = (2.5, 97.5)  # %, percentiles of a 95 % interval
 # damping s/m, height m, tilt rad; measured on simulated arms and surfaces (benchmarks/contact_identification.py).
 SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
 SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
+Fit = Callable[[ContactProblem, np.ndarray], tuple[ContactProblem, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,18 +115,22 @@ def identify_contact(
     report(0.6, "gears")
     elastic = with_gears(*rigid)
     report(0.8, "validation and intervals")
-    estimates = []
-    for fit, refit in ((elastic, _fitted), (rigid, refined)):
-        touched = presses(*fit)
-        if other is not None:
-            validation = press_errors(other.reweighted(fit[1]), fit[1], presses(other, fit[1]))
-        elif len(touched) > 1:
-            rest, u = refit(fit[0].within(~touched[-1]), fit[1])
-            validation = press_errors(replace(rest.reweighted(u), torque=problem.torque), u, touched[-1:])
-        else:
-            validation = None
-        estimates.append(_concluded(*fit, validation, seed))
-    return replace(estimates[0], rigid_gears=estimates[1])
+    behind_gears = _concluded(*elastic, _held_out(*elastic, other, _fitted), seed)
+    return replace(behind_gears, rigid_gears=_concluded(*rigid, _held_out(*rigid, other, refined), seed))
+
+
+def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | None, refit: Fit) -> Press | None:
+    """Return the errors of presses without influence on u (U,): those of `other`, else the last one after a `refit`.
+
+    None: there is a single press.
+    """
+    if other is not None:
+        return press_errors(other.reweighted(u), u, presses(other, u))
+    touched = presses(problem, u)
+    if len(touched) < 2:
+        return None
+    rest, without = refit(problem.within(~touched[-1]), u)
+    return press_errors(replace(rest.reweighted(without), torque=problem.torque), without, touched[-1:])
 
 
 def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
