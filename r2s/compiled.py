@@ -1,4 +1,4 @@
-"""Provide numba's `njit` and `cfunc` with a compilation cache that notices changes in other modules.
+"""Provide numba's `njit`, `cfunc` and `vectorize` with a compilation cache that notices changes in other modules.
 
 numba caches a compiled function and recompiles the function when its source file changes. But cached code also
 contains called functions from other files. After a change in physics/safety_filter.py, numba would therefore run
@@ -15,11 +15,11 @@ from functools import cache
 from pathlib import Path
 from threading import Timer
 
-from numba import cfunc, config, njit
+from numba import cfunc, config, njit, vectorize
 from numba.core import event
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 
-__all__ = ["cfunc", "njit"]
+__all__ = ["cfunc", "njit", "vectorize"]
 PACKAGE = Path(__file__).parent
 RELAYED = "R2S_RELAYED"  # environment variable, set if another process prints this process's output
 LONG_S = 2.0  # s, duration of a compilation after which the user gets a message

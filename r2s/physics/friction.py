@@ -10,12 +10,13 @@ from importlib import import_module
 
 import numpy as np
 
-from r2s.compiled import njit
+from r2s.compiled import njit, vectorize
 from r2s.errors import UserError, choices, nearest
 
 WIDTH_DQ = 0.01  # rad/s, speed over which Coulomb friction changes its sign; equal to the default dq_min of stiction
 PRESLIDING = 1e-3  # rad, presliding distance if it is not identified; typical of a Panda's joints
 MICRO_DAMPING = 5e-3  # s, ratio of the bristles' damping to stiffness; damps their oscillation within a few periods
+FALLEN = 40.0  # square of speed over Stribeck velocity, above which exp(-FALLEN) is below the rounding error of 1
 PHI = 8  # maximum number of parameters of a family
 VISCOUS = "viscous"  # name of the viscous parameter in every family that has one, Nm s/rad
 
@@ -160,8 +161,14 @@ SIGMOID = Family(
 )
 
 
+# Compiled elementwise functions: an identification evaluates friction some thousand times.
+@vectorize(cache=True)
+def _two_sided(x, factor, asymmetry):
+    return factor * (1.0 + np.sign(x) * asymmetry) * x
+
+
 def _coulomb_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    return p[0] * (1 + np.sign(sign) * p[1]) * sign + p[2] * (1 + np.sign(dq) * p[-1]) * dq
+    return _two_sided(sign, p[0], p[1]) + _two_sided(dq, p[2], p[-1])
 
 
 @njit(cache=True)
@@ -196,10 +203,17 @@ COULOMB = Family(
 )
 
 
+@vectorize(cache=True)
+def _stribeck_torque(dq, sign, coulomb, asymmetry, rise, stribeck_velocity, rise_asymmetry):
+    side, ratio = np.sign(sign), (dq / stribeck_velocity) ** 2
+    level = coulomb * (1.0 + side * asymmetry)
+    if ratio < FALLEN:
+        level *= 1.0 + rise * (1.0 + side * rise_asymmetry) * np.exp(-ratio)
+    return level * sign
+
+
 def _stribeck_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    side = np.sign(sign)
-    level = p[0] * (1 + side * p[1]) * (1 + p[3] * (1 + side * p[-2]) * np.exp(-((dq / p[4]) ** 2)))
-    return level * sign + p[2] * (1 + np.sign(dq) * p[-1]) * dq
+    return _stribeck_torque(dq, sign, p[0], p[1], p[3], p[4], p[-2]) + _two_sided(dq, p[2], p[-1])
 
 
 @njit(cache=True)
