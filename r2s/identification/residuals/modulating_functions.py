@@ -29,7 +29,8 @@ STEADY = 0.2  # relative change of velocity allowed over PRESLIDING, for a frict
 STEADY_ROWS = 101  # rows of the polynomial fit to test STEADY; over five rows, noise looks like acceleration
 MAX_LATENCY = 0.04  # s, longest latency of a command
 HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of eighths of the step for which a command is held
-LAG_POINTS, LAG_WEIGHTS = np.polynomial.laguerre.laggauss(16)  # quadrature of a first-order lag, over exp(-x)
+# quadrature of a first-order lag, over exp(-x); the last points have less than 1e-10 of the weight
+LAG_POINTS, LAG_WEIGHTS = (x[:12] for x in np.polynomial.laguerre.laggauss(16))
 
 
 @dataclass(frozen=True)
@@ -157,10 +158,11 @@ class SlidingMotion:
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
         at = late.astype(int)
-        weights = np.zeros(self.delayed.shape[1])
+        first = int(at.min()) - 1
+        weights = np.zeros(int(at.max()) + 3 - first)
         for k, weight in enumerate(cubic(late - at), start=-1):
-            np.add.at(weights, at + k, weight * LAG_WEIGHTS / len(HOLD_STEPS))
-        return np.einsum("tkn,k->tn", self.delayed, weights)
+            np.add.at(weights, at + k - first, weight * LAG_WEIGHTS / len(HOLD_STEPS))
+        return np.einsum("tkn,k->tn", self.delayed[:, first : first + len(weights)], weights)
 
 
 def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:

@@ -62,7 +62,6 @@ class TorqueResidual:
         self.space, self._period = space, None if isinstance(recording, PlannedMotion) else recording.period
         self.commanded, self.at_motor = recording.torque == "commanded", recording.torque == "motor"
         robot = space.robot
-        self._nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         if isinstance(recording, Recording):
             rate_hz = min(rate_hz, MOST_ROWS / recording.duration)
             slid = FULLY_BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
@@ -142,26 +141,36 @@ class TorqueResidual:
         # a link-side sensor's gain does not scale friction
         out = own.rigid.copy() if self.commanded or self.at_motor else own.rigid * (1.0 + d.gain)
         out += own.friction - d.offset
-        if self.commanded:  # error of the gravity compensation
-            out += own.compensation
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
         out += d.load * self._rigid.load * self._mean_sign[d.family.has_memory]
         return out * (1.0 + d.gain) if self.at_motor else out
 
-    def _known(self, d: Dynamics, like: "_Known | None" = None) -> "_Known":
-        """Return the parts of a prediction that are slow to compute, or parts of `like` with equal parameters."""
+    def _known(self, d: Dynamics, like: "_Known | None" = None, links: np.ndarray | None = None) -> "_Known":
+        """Return the parts of a prediction that are slow to compute, or parts of `like` with equal parameters.
+
+        links: (T, n) Nm, torque of the links of `d` if it is known.
+        """
         m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
         if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
-            torque, compensation = like.rigid, like.compensation
+            torque = like.rigid
         else:
-            torque = rigid.rest + rigid.y @ standard + d.armature * rigid.rotors
-            compensation = rigid.compensation @ (standard - self._nominal) if self.commanded else torque[:0]
+            links = rigid.y @ standard if links is None else links
+            torque = rigid.rest + links + d.armature * rigid.rotors
         if like and np.array_equal(d.phi, like.phi):
             friction = like.friction
         else:
             of = partial(self._friction, d)
             friction = m.filtered(of(slice(None))) if isinstance(m, PlannedMotion) else m.filtered(of)
-        return _Known(standard, d.armature, torque, compensation, d.phi, friction)
+        late = float(d.delay), float(d.lag), float(d.signal_delay)
+        recorded = like.recorded if like and late == like.late else self._recorded(*late)
+        return _Known(standard, d.armature, torque, d.phi, friction, late, recorded)
+
+    def _recorded(self, delay: float, lag: float, signal_delay: float) -> np.ndarray:
+        """Return the recorded torque (T, n) Nm: commands after hold, delay and lag; measured torque at its time."""
+        m = self.motion
+        if self.commanded:
+            return m.command(delay, lag)
+        return m.earlier(-signal_delay) if signal_delay and isinstance(m, SmoothMotion) else m.tau
 
     def _sign(self, memory: bool, rows: slice) -> np.ndarray:
         """Return the sign of friction at a slice of the F instants; memory: whether the friction law has a memory."""
@@ -186,18 +195,18 @@ class TorqueResidual:
 
     def error(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return predicted minus recorded torque (T, n) Nm, for commands after hold, delay and lag."""
-        m, free = self.motion, self.predict(dynamics, known) - self._external
-        if self.commanded:
-            return free - m.command(float(dynamics.delay), float(dynamics.lag))
-        late = float(dynamics.signal_delay)
-        return free - (m.earlier(-late) if late and isinstance(m, SmoothMotion) else m.tau)
+        own = self._known(dynamics, known)
+        return self.predict(dynamics, own) - self._external - own.recorded
 
     def errors(self, x: np.ndarray) -> np.ndarray:
         """Return the torque errors (C, T, n) Nm of candidates x (C, P)."""
         d = self.space.dynamics(x)
         out = np.empty((len(x), *self.seen.shape))
+        standard = _standard(d).reshape(-1, 10 * self.space.n)  # one row if x has no parameters of links
+        links = self._rigid.y @ np.broadcast_to(standard, (len(x), standard.shape[1])).T  # one pass over y
         for i in range(len(x)):
-            out[i] = self.error(d.one(i))
+            one = d.one(i)
+            out[i] = self.error(one, self._known(one, links=links[..., i]))
         return out
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
@@ -212,24 +221,30 @@ class TorqueResidual:
         """Yield residual (r,) and Jacobian (r, P) at u (P,) on the unit cube, in parts of r rows."""
         h = np.where(u > 0.5, -STEP, STEP)
         x, stepped = self.space.from_unit(u), self.space.from_unit(u + h)
-        r, changes = self(x[None])[0], self._changes(x, stepped)
+        error, changes = self._changes(x, stepped)
+        r = error * (self.seen / self.scale)
         for first in range(0, len(self.seen), PART):
             rows = slice(first, first + PART)
-            yield r[first * self.space.n :][: PART * self.space.n], self._assembled(changes, rows, len(x)) / h
+            yield r[rows].ravel(), self._assembled(changes, rows, len(x)) / h
 
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
         """Return changes (R, P) of the residual; for column k, only value k changes from x (P,) to `stepped` (P,)."""
-        return self._assembled(self._changes(x, stepped), slice(None), len(x))
+        return self._assembled(self._changes(x, stepped)[1], slice(None), len(x))
 
-    def _changes(self, x: np.ndarray, stepped: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return [(block, indices in x, change)]: changes (T, n) of torque, or (n, 10 n, L) of standard parameters.
+    def _changes(
+        self, x: np.ndarray, stepped: np.ndarray
+    ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
+        """Return the torque error (T, n) at x, and [(block, indices in x, change)] to `stepped`.
+
+        A change is that of torque (T, n), or that of standard parameters (n, 10 n, L) for L parameters of links.
 
         One evaluation per block suffices: friction acts on its joint only; torque is linear in standard parameters.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
         known = self._known(d)
-        base, before, out = self.error(d, known), known.standard, []
+        base, before = self.error(d, known), known.standard
+        out: list[tuple[str, np.ndarray, np.ndarray]] = []
         gain = np.zeros(n) if self.commanded else d.gain
         links = [at for block, at in zip(space.blocks, places, strict=True) if block in OF_LINKS]
         if links:
@@ -244,22 +259,21 @@ class TorqueResidual:
             trial[at] = stepped[at]
         moved = space.dynamics(trials)
         out += [(block, at, self.error(moved.one(k), known) - base) for k, (block, at) in enumerate(rest)]
-        return out
+        return base, out
 
     def _assembled(self, changes: list, rows: slice, count: int) -> np.ndarray:
         """Return changes (rows n, P) of the residual, in standard deviations, for the sample times `rows`."""
-        n, weight = self.space.n, (self.seen[rows] / self.scale[rows])[..., None]
-        reach = self._rigid.y[rows] + self._rigid.compensation[rows] if self.commanded else self._rigid.y[rows]
-        out = np.zeros((len(reach), n, count))
+        n, y, weight = self.space.n, self._rigid.y[rows], self.seen[rows] / self.scale[rows]
+        out = np.zeros((len(y), n, count))
         for block, at, change in changes:
             if block in OF_LINKS:
                 for j in range(n):
-                    out[:, j, at] = reach[:, j] @ change[j]
+                    out[:, j, at] = weight[:, j, None] * (y[:, j] @ change[j])
             elif block in WHOLE_ARM:
-                out[..., at[0]] = change[rows]
+                out[..., at[0]] = weight * change[rows]
             else:
-                out[:, np.arange(n), at] = change[rows]
-        return (out * weight).reshape(-1, count)
+                out[:, np.arange(n), at] = weight * change[rows]
+        return out.reshape(-1, count)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
         """Return a copy with rows divided by their standard deviation, estimated from the error at x (P,).
@@ -274,8 +288,7 @@ class TorqueResidual:
 
     def rigid_body_of_last_link(self) -> np.ndarray:
         """Return torque (T, n, 10) per unit of each standard parameter of an undeclared body on the last link."""
-        y, weight = self._rigid.y[..., -10:], self._rigid.compensation[..., -10:]
-        return y + weight if self.commanded else y
+        return self._rigid.y[..., -10:]
 
     def weighted_like(self, other: "TorqueResidual") -> "TorqueResidual":
         """Return a copy with the standard deviations of the residual `other`."""
@@ -297,14 +310,15 @@ class TorqueResidual:
 
 
 class _Known(NamedTuple):
-    """Rigid-body, compensation and friction torque (T, n) Nm, and the parameters on which these torques depend."""
+    """Rigid-body, friction and recorded torque (T, n) Nm, and the parameters on which these torques depend."""
 
     standard: np.ndarray
     armature: np.ndarray
     rigid: np.ndarray
-    compensation: np.ndarray
     phi: np.ndarray
     friction: np.ndarray
+    late: tuple[float, float, float]
+    recorded: np.ndarray
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
