@@ -18,8 +18,9 @@ and uses the parameters `Slide` of an identified arm; on the same arm the second
 r2s uses the second fit if this fit explains the motion as well as the free fit.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -31,6 +32,7 @@ from r2s.recordings.ramps import Ramps
 MOVED = 5e-3  # rad, largest motion of the rows in a fit; real joints and the twin creep 1 to 3 mrad before release
 MIN_ROWS = 10  # least number of rows in a fit
 ENCODER = 2e-5  # rad, standard deviation of position residuals: encoder noise of a Panda
+DIFFERENCE = 1e-3  # finite-difference step, relative to the scale of each parameter
 RELEASE_S = 2e-3  # s, accuracy of the fitted time of release
 STEP = 1e-3  # s, longest integration step
 # bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), rest (rad) and drift (rad/s)
@@ -199,9 +201,11 @@ def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, fl
     low, high = np.array([u[0] + 1e-3 * span, *LOW]), np.array([u[-1], *HIGH])
 
     def residuals(p: np.ndarray) -> np.ndarray:
-        motion = p[5] + p[6] * t + _slide(t, u, p[0], np.exp(p[1]), np.exp(p[2]), np.exp(p[3]), p[4], 0.0)
-        priors = (p[3] - DAMPING[0]) / DAMPING[1], p[6] / DRIFT
-        return np.concatenate([(motion - x)[used] / ENCODER, priors])
+        U, jump, rest, drift = p[:, [0, 4, 5, 6]].T
+        kappa, creep, damping = np.exp(p[:, 1:4].T)
+        motion = rest[:, None] + drift[:, None] * t + _slides(t, u, U, kappa, creep, damping, jump, 0.0)
+        priors = (p[:, 3] - DAMPING[0]) / DAMPING[1], drift / DRIFT
+        return np.column_stack([(motion - x)[:, used] / ENCODER, *priors])
 
     fits = []
     for creep, share in STARTS:
@@ -212,8 +216,7 @@ def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, fl
         first = np.array([U, np.log(kappa), np.log(creep), DAMPING[0], jump, rest, 0.0])
         first = np.clip(first, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         scale = np.array([0.02 * span, 0.3, 0.3, 0.5, 0.2 * jump, ENCODER, DRIFT])
-        step = [1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-3, 1e-3]
-        fits.append(least_squares(residuals, first, bounds=(low, high), x_scale=scale, diff_step=step, max_nfev=40))
+        fits.append(_solve(residuals, first, low, high, scale))
     best = min(fits, key=lambda fit: fit.cost)
     misfit = ENCODER * float(np.sqrt(np.mean(best.fun[:-2] ** 2)))
     return (float(best.x[0]) if best.x[0] > u[0] + 5e-3 * span else np.nan), misfit
@@ -229,24 +232,55 @@ def _fit_slide(
     near, used = _parts(x)
 
     def residuals(p: np.ndarray) -> np.ndarray:
-        k = kappa * np.exp(p[1])
-        motion = p[2] + p[3] * t + _slide(t, u, p[0], k, RIGID, k * viscous, k * max(p[0] - level, 0.0), fall)
-        return np.concatenate([(motion - x)[used] / ENCODER, [p[1] / KAPPA_SIGMA, p[3] / DRIFT]])
+        U, change, rest, drift = p.T
+        k = kappa * np.exp(change)
+        jump = k * np.maximum(U - level, 0.0)
+        motion = rest[:, None] + drift[:, None] * t + _slides(t, u, U, k, 0 * k + RIGID, k * viscous, jump, fall)
+        return np.column_stack([(motion - x)[:, used] / ENCODER, change / KAPPA_SIGMA, drift / DRIFT])
 
     fits = []
-    low, high = [u[0], -1.0, *LOW[-2:]], [u[-1], 1.0, *HIGH[-2:]]
+    low, high = np.array([u[0], -1.0, *LOW[-2:]]), np.array([u[-1], 1.0, *HIGH[-2:]])
     for back in BACK:
         first = np.array([u[-1] - (back + 1e-3) * span, 0.0, np.median(x[near // 4 : near + 1]), 0.0])
-        scale, step = [0.02 * span, 0.5 * KAPPA_SIGMA, ENCODER, DRIFT], [1e-5, 1e-4, 1e-3, 1e-3]
-        fits.append(least_squares(residuals, first, bounds=(low, high), x_scale=scale, diff_step=step, max_nfev=40))
+        fits.append(_solve(residuals, first, low, high, np.array([0.02 * span, 0.5 * KAPPA_SIGMA, ENCODER, DRIFT])))
     best = min(fits, key=lambda fit: fit.cost)
     return float(best.x[0]), ENCODER * float(np.sqrt(np.mean(best.fun[:-2] ** 2)))
+
+
+def _solve(
+    residuals: Callable[[np.ndarray], np.ndarray],
+    first: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    scale: np.ndarray,
+) -> Any:
+    """Minimize `residuals`, a function (C, P) -> (C, R), with all finite differences in one call."""
+
+    def at(p: np.ndarray) -> np.ndarray:
+        return residuals(p[None])[0]
+
+    def jacobian(p: np.ndarray) -> np.ndarray:
+        h = np.where(p + DIFFERENCE * scale > high, -DIFFERENCE, DIFFERENCE) * scale
+        r = residuals(np.concatenate([p[None], p + np.diag(h)]))
+        return ((r[1:] - r[0]) / h[:, None]).T
+
+    how: dict[str, Any] = {"bounds": (low, high), "x_scale": scale, "max_nfev": 40}
+    return least_squares(at, first, jac=jacobian, **how)
 
 
 def _parts(x: np.ndarray) -> tuple[int, slice]:
     """Return the index of the last row before clear motion in x (T,) rad, and the slice of rows to fit."""
     near = int(np.flatnonzero(x < x[-1] / 9)[-1])
     return near, slice(near // 4, None)  # in the first rows the joint may still settle
+
+
+@njit(cache=True)
+def _slides(t, u, U, kappa, z, damping, jump, fall):
+    """Return the positions (C, T) of `_slide` for parameters (C,), with one `fall`."""
+    out = np.empty((len(U), len(t)))
+    for c in range(len(U)):
+        out[c] = _slide(t, u, U[c], kappa[c], z[c], damping[c], jump[c], fall)
+    return out
 
 
 @njit(cache=True)
