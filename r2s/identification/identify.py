@@ -320,7 +320,10 @@ def fit_presliding(s: State) -> State:
     found = s.history.step("presliding", lambda: estimate_presliding(*given, **rest))
     data = torque_data.on(s.space).with_presliding(s.recording, found["presliding"])
     extra = (*s.problem.extra, Presliding(found["presliding"], found["sigma"]))
-    return replace(s, problem=replace(s.problem, data=data, torque_data=data, extra=extra))
+    x = s.space.from_unit(s.u)
+    x[s.space.where(PRESLIDING)] = found["presliding"]
+    u, problem = s.space.to_unit(x), replace(s.problem, data=data, torque_data=data, extra=extra)
+    return replace(s, problem=problem.reweighted(u, fitted=True), u=u)
 
 
 def reweight(s: State) -> State:

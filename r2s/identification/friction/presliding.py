@@ -21,7 +21,7 @@ from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
 WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, because friction reverses within about 50 ms
-ROUNDS, STEPS, FTOL = 2, 4, 1e-3  # reweighted fits; per fit, most steps and least relative gain
+STEPS, FTOL = 4, 1e-3  # most steps of the fit, and least relative gain of a step
 MIN_SIGMA = 1e-3  # lower limit of the logarithm's standard deviation
 
 
@@ -48,11 +48,10 @@ def estimate_presliding(
     windows = cut_windows(recording, WINDOW_S)
     data = ReplayResidual(space, recording, windows, stride=STRIDE, batch=robot.n + 1, nthread=nthread)
     problem = Problem.of(data, torque_data.on(space), prior)
-    u, search = problem.start, LeastSquares(max_evaluations=STEPS, ftol=FTOL)
-    for _ in range(ROUNDS):
-        u = search(problem, u, report)
-        problem = problem.reweighted(u, fitted=True)
-    steps = posterior(problem, u, seed).steps
+    # all other parameters are fitted, so the weights can come from the residual before the fit
+    problem = problem.reweighted(problem.start, fitted=True)
+    u = LeastSquares(max_evaluations=STEPS, ftol=FTOL)(problem, problem.start, report)
+    steps = posterior(problem.reweighted(u, fitted=True), u, seed).steps
     return {NAME: space.from_unit(u), "sigma": steps.std(0) * space.width}
 
 
