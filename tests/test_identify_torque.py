@@ -35,9 +35,18 @@ from r2s.identification.structure.cross_validation import held_out
 from r2s.identification.terms import search_space
 from r2s.learning.randomization import PosteriorRandomization as Draws
 from r2s.learning.randomization import physical
-from r2s.physics.dynamics import with_family
-from r2s.physics.friction import FAMILIES, family
+from r2s.physics.dynamics import Dynamics, with_family
+from r2s.physics.friction import COULOMB, FAMILIES, family
+from r2s.physics.robot import load_robot
 from r2s.recordings.recording import Recording
+
+WITH_HAND = """<mujoco><compiler angle="radian"/><worldbody>
+<body pos="0 0 0.3"><inertial pos="0.02 0 0.1" mass="2" diaginertia="0.02 0.02 0.01"/>
+<joint axis="0 0 1" range="-2 2" actuatorfrcrange="-20 20"/>
+<body pos="0 0 0.2"><inertial pos="0.1 0 0.1" mass="1" diaginertia="0.01 0.01 0.002"/>
+<joint axis="0 1 0" range="-2 2" actuatorfrcrange="-10 10"/><site name="tip" pos="0 0 0.2"/>
+<body name="hand" pos="0.05 0 0.2"><inertial pos="0 0 0.05" mass="0.7" diaginertia="0.001 0.001 0.001"/></body>
+</body></body></worldbody></mujoco>"""
 
 
 def measured(robot, dynamics, scale, seconds, noise=0.0, seed=0, moving=(1, 1, 1), mass=1.0, shift=0.0):
@@ -109,6 +118,31 @@ def test_predicted_torque_is_inverse_dynamics(arm, truth, wrong):
             expected.append(data.qfrc_inverse - (torque == "commanded") * compensated.qfrc_inverse)
         expected += m.filtered(truth.friction(m.friction_dq)) - truth.offset
         np.testing.assert_allclose(residual.predict(other), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("torque", ["measured", "commanded"])
+def test_a_welded_body_has_weight_only_in_measured_torque(tmp_path, torque):
+    """MuJoCo's inverse dynamics contain the welded hand; the arm's gravity compensation holds it, too."""
+    path = tmp_path / "arm.xml"
+    path.write_text(WITH_HAND)
+    robot = load_robot(str(path))
+    dynamics = Dynamics.of(robot, np.zeros((2, 3)), COULOMB)
+    t = 1e-3 * np.arange(2000)
+    wave = np.array([0.3, 0.4]) * np.sin(np.array([3.0, 5.0]) * t[:, None])
+    residual = TorqueResidual(
+        parameter_space(robot, dynamics, {"offset": BOUNDS["offset"]}),
+        Recording(t, wave, np.gradient(wave, t, axis=0), 0 * wave, torque),
+        cutoff_hz=50.0,
+    )
+    m, model, expected = residual.motion, robot.model(gravity=True), []
+    data, still = mujoco.MjData(model), mujoco.MjData(model)
+    for q, dq, ddq in zip(m.q, m.dq, m.ddq, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, dq, ddq
+        still.qpos[:] = q
+        mujoco.mj_inverse(model, data)
+        mujoco.mj_inverse(model, still)
+        expected.append(data.qfrc_inverse - (torque == "commanded") * still.qfrc_inverse)
+    np.testing.assert_allclose(residual.predict(dynamics), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("torque", ["measured", "commanded"])

@@ -320,9 +320,10 @@ def fit_presliding(s: State) -> State:
     found = s.history.step("presliding", lambda: estimate_presliding(*given, **rest))
     data = torque_data.on(s.space).with_presliding(s.recording, found["presliding"])
     extra = (*s.problem.extra, Presliding(found["presliding"], found["sigma"]))
-    x = s.space.from_unit(s.u)
-    x[s.space.where(PRESLIDING)] = found["presliding"]
-    u, problem = s.space.to_unit(x), replace(s.problem, data=data, torque_data=data, extra=extra)
+    x, u, at = s.space.start.copy(), s.u.copy(), s.space.where(PRESLIDING)
+    x[at] = found["presliding"]
+    u[at] = np.clip(s.space.to_unit(x)[at], 0.0, 1.0)
+    problem = replace(s.problem, data=data, torque_data=data, extra=extra)
     return replace(s, problem=problem.reweighted(u, fitted=True), u=u)
 
 

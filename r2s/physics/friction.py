@@ -1,6 +1,6 @@
 """Joint friction laws, called families; r2s contains four families, and users can add families.
 
-A friction family contains a law in NumPy and, for the physics step (mujoco_callback.py), a compiled version.
+A friction family contains a law for arrays and, for the physics step (mujoco_callback.py), a compiled version.
 `friction.family=` selects a built-in family by name, or a user's family by a dotted path such as my_module.MY_FAMILY.
 """
 
@@ -207,7 +207,7 @@ COULOMB = Family(
 def _stribeck_torque(dq, sign, coulomb, asymmetry, rise, stribeck_velocity, rise_asymmetry):
     side, ratio = np.sign(sign), (dq / stribeck_velocity) ** 2
     level = coulomb * (1.0 + side * asymmetry)
-    if ratio < FALLEN:
+    if not ratio > FALLEN:
         level *= 1.0 + rise * (1.0 + side * rise_asymmetry) * np.exp(-ratio)
     return level * sign
 

@@ -5,6 +5,7 @@ bristles bend, so replays determine the presliding distance. The torque fit dete
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +50,7 @@ def estimate_presliding(
     data = ReplayResidual(space, recording, windows, stride=STRIDE, batch=robot.n + 1, nthread=nthread)
     problem = Problem.of(data, torque_data.on(space), prior)
     # all other parameters are fitted, so the weights can come from the residual before the fit
-    problem = problem.reweighted(problem.start, fitted=True)
+    problem = replace(problem, data=data.reweighted(space.start, fitted=True))
     u = LeastSquares(max_evaluations=STEPS, ftol=FTOL)(problem, problem.start, report)
     steps = posterior(problem.reweighted(u, fitted=True), u, seed).steps
     return {NAME: space.from_unit(u), "sigma": steps.std(0) * space.width}

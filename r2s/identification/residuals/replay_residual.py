@@ -140,7 +140,7 @@ class ReplayResidual:
             parts.append(self._simulate(d, delayed + push[at], q0[at], dq0[at]))
         at_x = np.concatenate(parts)
         steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
-        return at_x[0], ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)
+        return at_x[0].copy(), ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)
 
     def _window_rms(self, error: np.ndarray) -> np.ndarray:
         """Return the RMS (W,) of each window's whitened residual, without padding rows."""

@@ -18,9 +18,9 @@ class RigidBodyRows:
 
     Attributes:
         q: (T, n) rad, joint angles.
-        rest: (T, n) Nm, torque without links: damping and springs in the robot's file and, for commanded torque,
-            minus the nominal gravity torque, which the arm's gravity compensation adds.
-        y: (T, n, 10 n), regressor of rigid-body torque for the links' standard parameters.
+        rest: (T, n) Nm, torque of the damping, the springs and the welded bodies in the robot's file; for commanded
+            torque, minus the links' nominal gravity torque, which the arm's gravity compensation adds.
+        y: (T, n, 10 n), regressor of rigid-body torque, gravity included, for the links' standard parameters.
         load: (T, n) Nm, magnitude of the nominal gravity torque.
         rotors: (T, n) rad/s^2, rotor acceleration; 0 if recorded torque excludes the torque on the rotors.
         encoder: (T, n) Nm per unit of `SlidingMotion.noise`, torque error due to encoder noise.
@@ -37,18 +37,19 @@ class RigidBodyRows:
     def of(robot: Robot, m: SmoothMotion | SlidingMotion, torque: str) -> "RigidBodyRows":
         """Compute the rigid-body torque for a motion m, recorded with the kind of torque `torque`."""
         still, shape = np.zeros_like(m.q), (*m.q.shape, -1)
-        rest, y = rigid_body(robot, m.q, m.dq, m.ddq, robot.gravity)
+        commanded = torque == "commanded"
+        rest, y = rigid_body(robot, m.q, m.dq, m.ddq, None if commanded else robot.gravity)
         rest = m.rows(rest - robot.armature * m.ddq)  # candidates add their own rotor torque
         nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
-        weight = m.rows(regressor(robot, m.q, still, still, robot.gravity).reshape(shape)) @ nominal
+        weight = m.rows(regressor(robot, m.q, still, still, robot.gravity).reshape(shape))
         encoder = np.zeros_like(rest)
         if isinstance(m, SlidingMotion):
             encoder = np.sqrt(m.rows(mass_matrix(robot, m.q) ** 2) @ m.encoder**2)
         return RigidBodyRows(
             q=m.rows(m.q),
-            rest=rest - weight if torque == "commanded" else rest,
-            y=m.rows(y.reshape(shape)),
-            load=np.abs(weight),
+            rest=rest - weight @ nominal if commanded else rest,
+            y=m.rows(y.reshape(shape)) + weight if commanded else m.rows(y.reshape(shape)),
+            load=np.abs(weight @ nominal),
             # a link-side sensor does not measure the torque that accelerates the rotors
             rotors=np.zeros_like(rest) if torque == "measured" else m.rows(m.ddq),
             encoder=encoder,

@@ -31,6 +31,7 @@ MAX_CORRELATION = 40  # rows, longest correlation length: a slowly drifting resi
 MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 30_000  # longer recordings (from 5 min at 100 Hz) get fewer rows per s; the cutoff needs 20 per s
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
+AT_ONCE = 8  # candidates whose link torques are computed in one pass over the regressor
 PART = 2048  # number of moments whose Jacobian is in memory at once
 FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
 
@@ -135,7 +136,7 @@ class TorqueResidual:
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: parts of an earlier prediction, of which parts with equal parameters are reused.
+        known: parts of an earlier evaluation, of which parts with equal parameters are reused.
         """
         d, own = dynamics, self._known(dynamics, known)
         # a link-side sensor's gain does not scale friction
@@ -146,7 +147,7 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None, links: np.ndarray | None = None) -> "_Known":
-        """Return the parts of a prediction that are slow to compute, or parts of `like` with equal parameters.
+        """Return the parts of an error that are slow to compute, or parts of `like` with equal parameters.
 
         links: (T, n) Nm, torque of the links of `d` if it is known.
         """
@@ -203,10 +204,11 @@ class TorqueResidual:
         d = self.space.dynamics(x)
         out = np.empty((len(x), *self.seen.shape))
         standard = _standard(d).reshape(-1, 10 * self.space.n)  # one row if x has no parameters of links
-        links = self._rigid.y @ np.broadcast_to(standard, (len(x), standard.shape[1])).T  # one pass over y
         for i in range(len(x)):
-            one = d.one(i)
-            out[i] = self.error(one, self._known(one, links=links[..., i]))
+            one, k = d.one(i), i % AT_ONCE
+            if k == 0 and i < len(standard):
+                links = self._rigid.y @ standard[i : i + AT_ONCE].T
+            out[i] = self.error(one, self._known(one, links=links[..., min(k, len(standard) - 1)]))
         return out
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
