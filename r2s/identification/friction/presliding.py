@@ -5,7 +5,6 @@ bristles bend, so replays determine the presliding distance. The torque fit dete
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +21,9 @@ from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
 WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, because friction reverses within about 50 ms
-STEPS, FTOL = 4, 1e-3  # most steps of the fit, and least relative gain of a step
+# reweighted fits; per fit, most steps and least relative gain. A first fit with weights from the residual would give
+# little weight to reversals if the true distance is several times the nominal one
+ROUNDS, STEPS, FTOL = 2, 4, 1e-3
 MIN_SIGMA = 1e-3  # lower limit of the logarithm's standard deviation
 
 
@@ -49,10 +50,11 @@ def estimate_presliding(
     windows = cut_windows(recording, WINDOW_S)
     data = ReplayResidual(space, recording, windows, stride=STRIDE, batch=robot.n + 1, nthread=nthread)
     problem = Problem.of(data, torque_data.on(space), prior)
-    # all other parameters are fitted, so the weights can come from the residual before the fit
-    problem = replace(problem, data=data.reweighted(space.start, fitted=True))
-    u = LeastSquares(max_evaluations=STEPS, ftol=FTOL)(problem, problem.start, report)
-    steps = posterior(problem.reweighted(u, fitted=True), u, seed).steps
+    u, search = problem.start, LeastSquares(max_evaluations=STEPS, ftol=FTOL)
+    for _ in range(ROUNDS):
+        u = search(problem, u, report)
+        problem = problem.reweighted(u, fitted=True)
+    steps = posterior(problem, u, seed).steps
     return {NAME: space.from_unit(u), "sigma": steps.std(0) * space.width}
 
 

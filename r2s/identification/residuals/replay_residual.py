@@ -59,7 +59,6 @@ class ReplayResidual:
         self._noise, start = state.noise / np.sqrt(stride), state.sigma.ravel()
         self._min_sigma = np.concatenate([start, np.full(n, MIN_TORQUE_SIGMA)])
         self._sigma = np.concatenate([start, np.full(n, TORQUE_SIGMA)])
-        self._effects: tuple[np.ndarray, ...] = (np.zeros(0),) * 3  # parameters of the last reweighting, error, Z
         self._reweigh(space.start, fitted=False)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
@@ -103,32 +102,8 @@ class ReplayResidual:
         return other
 
     def _reweigh(self, x: np.ndarray, fitted: bool) -> None:
-        w = self.windows
-        if not np.array_equal(x, self._effects[0]):
-            self._effects = x.copy(), *self._start_effects(x)
-        _, at_x, z = self._effects
-        if fitted:
-            seconds = SIM_DT * w.tau.shape[1]
-            mean = at_x.reshape(self._target.shape).mean(1) / self._noise
-            block = blocks_of(w.t, w.q0, self._period, mean, seconds)
-            self.clusters = np.repeat(block, self._target[0].size)
-        self._trust = np.ones(self.count)
-        moves = self._seen.any((1, 2))  # windows without a seen row are all padding
-        if fitted and moves.any():
-            usual = moves
-            for _ in range(2):  # an outlier window must not raise the noise of other windows
-                self._sigma, self._noise = _random_effects(
-                    z[usual], at_x[usual], self._seen[usual], self._sigma, self._noise, self._min_sigma
-                )
-                self._whiten(z)
-                size = self._window_rms(at_x)
-                usual = moves & (size <= np.quantile(size[moves], USUAL))
-            self._trust = np.minimum(1.0, HUBER * np.median(size[moves]) / np.maximum(size, 1e-9))
-        self._whiten(z)
-
-    def _start_effects(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the angle error (W, R') at x (P,), and its slopes Z (W, R', 3 n)."""
-        w, n, d = self.windows, self.space.n, self.space.dynamics(x)
+        w, n = self.windows, self.space.n
+        d = self.space.dynamics(x)
         delayed, eye = w.delayed(d.delay, d.lag), np.eye(n)[:, None]
         zero = np.zeros((n, 1, n))
         q0 = np.concatenate([w.q0[None], w.q0 + Q_STEP * eye, w.q0 + zero, w.q0 + zero])
@@ -140,7 +115,25 @@ class ReplayResidual:
             parts.append(self._simulate(d, delayed + push[at], q0[at], dq0[at]))
         at_x = np.concatenate(parts)
         steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
-        return at_x[0].copy(), ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)
+        z = ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)  # (W, R', 3 n)
+        if fitted:
+            seconds = SIM_DT * w.tau.shape[1]
+            mean = at_x[0].reshape(self._target.shape).mean(1) / self._noise
+            block = blocks_of(w.t, w.q0, self._period, mean, seconds)
+            self.clusters = np.repeat(block, self._target[0].size)
+        self._trust = np.ones(self.count)
+        moves = self._seen.any((1, 2))  # windows without a seen row are all padding
+        if fitted and moves.any():
+            usual = moves
+            for _ in range(2):  # an outlier window must not raise the noise of other windows
+                self._sigma, self._noise = _random_effects(
+                    z[usual], at_x[0, usual], self._seen[usual], self._sigma, self._noise, self._min_sigma
+                )
+                self._whiten(z)
+                size = self._window_rms(at_x[0])
+                usual = moves & (size <= np.quantile(size[moves], USUAL))
+            self._trust = np.minimum(1.0, HUBER * np.median(size[moves]) / np.maximum(size, 1e-9))
+        self._whiten(z)
 
     def _window_rms(self, error: np.ndarray) -> np.ndarray:
         """Return the RMS (W,) of each window's whitened residual, without padding rows."""
