@@ -32,7 +32,7 @@ STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spli
 
 
 class ResidualState(NamedTuple):
-    """State that `update_residual` needs from cycle to cycle, for n joints."""
+    """The state that `update_residual` keeps from cycle to cycle, for n joints."""
 
     counts: np.ndarray  # (3,): CYCLE, COMMAND, ENDED
     commands: np.ndarray  # (SLOTS, n) Nm, delay line

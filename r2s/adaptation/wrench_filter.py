@@ -207,7 +207,7 @@ def _wrench_variance(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _measure(state):
-    """Correct the state by the measured momenta of the joints in motion, one after the other."""
+    """Update the state sequentially with the measured momentum of each moving joint."""
     n, N = state.joints.shape[1], len(state.x)
     square, count = 0.0, 0
     gain = np.zeros(N)

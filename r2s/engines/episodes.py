@@ -1,4 +1,4 @@
-"""Run episodes one by one in an engine other than MuJoCo, with the same goals, starts and random arms."""
+"""Run episodes one by one in an engine other than MuJoCo, with the same goals, start states and drawn arms."""
 
 from collections.abc import Callable
 

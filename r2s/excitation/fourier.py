@@ -277,7 +277,10 @@ class Candidates:
 
 
 def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return time t, the series' own time s, the pace ds/dt and d2s/dt2 (T,); raised cosines blend the paces."""
+    """Return time t, the argument s of the series, its rate ds/dt and d2s/dt2 (T,).
+
+    Between segments of different rates, ds/dt changes along a raised cosine.
+    """
     t = SIM_DT * np.arange(round(duration / SIM_DT) + 1)
     levels, shares, fixed = [0.0], [0.0], [ENDS_S]  # a level lasts `fixed` s plus its share of the remaining time
     rungs = _rungs(duration)

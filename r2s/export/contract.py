@@ -229,7 +229,7 @@ def width(of: str, joints: int, preview: int) -> int:
 
 
 def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the entry `goal` for point goals: the format of a goal, and the region of the training's goals."""
+    """Return the entry `goal` for point goals: their format, and the region from which the training drew them."""
     out: dict[str, Any] = {"kind": "point", "shape": [3], "unit": "m", "frame": "the arm's base"}
     if hasattr(task, "region"):
         low, high = task.region(robot)

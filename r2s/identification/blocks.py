@@ -1,7 +1,8 @@
 """Divide a recording into blocks with independent errors, which are the clusters in the posterior's covariance.
 
-Model error lasts longer than noise: torque ripple at low speed lasts seconds, and recurs when motion is repeated. So
-each block spans several correlation times of the residual. If residuals recur, repetitions belong to the same block.
+Unlike noise, model error is correlated in time: torque ripple at low speed lasts seconds. It recurs if the motion is
+repeated. So each block spans several correlation times of the residual. If residuals recur, repetitions belong to the
+same block.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
 """Represent prior knowledge of an arm's parameters as a normal distribution of named values.
 
 Prior knowledge comes from an earlier identification, of any kind of torque, or from the user (stated.py). Between two
-dates, friction and offsets x drift by w ~ N(0, drift^2), so x_now = x_then + w. The prior has the covariance of the
-earlier posterior plus diag(drift^2), as in the prediction step of a Kalman filter (Kalman 1960). r2s reports an
-estimate of the drift w from the data of both dates.
+dates, friction and offsets x drift by w ~ N(0, drift^2), so x_now = x_then + w. The prior covariance is the
+earlier posterior covariance plus diag(drift^2), as in the prediction step of a Kalman filter (Kalman 1960). From the
+recordings of both dates, r2s also estimates w.
 """
 
 from collections.abc import Callable, Iterable, Sequence

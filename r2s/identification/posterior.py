@@ -42,9 +42,9 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     1980; clusters: Liang and Zeger, Biometrika 73(1), 1986) minus the mean score, which is not 0 at a bound. If there
     are few blocks, the fit makes each block's residual too small; a factor from the block's share of the information
     corrects the score (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). For few blocks, Student's t widens
-    the draws. The covariance is at least the covariance for independent rows, because scores vary too little in a
-    direction that one block determines. A bootstrap over blocks would yield unrealistic tails if few blocks determine
-    a value, because many bootstrap samples would lack these blocks.
+    the draws. If one block alone determines a direction, the scatter of the scores underestimates the variance in
+    this direction, so the covariance is at least that for independent rows. A bootstrap over blocks would yield
+    unrealistic tails if few blocks determine a value, because many bootstrap samples would lack these blocks.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)

@@ -235,7 +235,7 @@ def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray,
 
 
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
-    """Return whether the recording comes from a simulator with implicit friction; u (P,) is a fit to torque.
+    """Return whether the recording comes from a simulator with implicit friction, given u (P,) fitted to torque.
 
     Implicit integration evaluates friction at the velocity half a step ahead; a physical arm does not. The effect of
     implicit friction must exceed `significant` standard deviations. The effect must also have about the expected

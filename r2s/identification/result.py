@@ -173,7 +173,8 @@ def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) 
     """Reset poorly determined values of u (P,) to `start`; return the new u, and a mask (P,) of the reset values.
 
     Data may determine only a combination of values, such as the summed mass of two consecutive links. A value is
-    therefore reset only if all resets, after a refit of all other values, raise the sum of squares by at most 1.
+    therefore reset only if this reset and all earlier ones together raise the sum of squares by at most 1, after a
+    refit of the remaining values.
 
     Args:
         u, start: (P,) fitted and nominal values on the unit cube. h: (P, P), half the Hessian of the sum of squares.

@@ -1,6 +1,6 @@
 """Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet files and meta/info.json.
 
-`write_dataset` stores commanded torque as `action`, measured and motor torque as `observation.effort`.
+`write_dataset` stores commanded torque as `action`, and measured torque or motor torque as `observation.effort`.
 `lerobot_table` finds angles, velocities and torques by words in the names of features and of feature elements.
 """
 

@@ -194,7 +194,7 @@ def is_simulated(cfg):
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is a twin in this process and without operator; such twins can run in parallel."""
+    """Return whether conf/arm is a simulated twin that needs no operator; such twins can run in parallel."""
     return is_simulated(cfg) and "operator" not in cfg.arm
 
 

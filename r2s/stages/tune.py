@@ -293,7 +293,7 @@ def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize",
 
 
 def tune(cfg, overrides):
-    """Search settings with Optuna trials, each of which is a training; write trials.csv and the page."""
+    """Tune settings with Optuna, one training per trial; write trials.csv and the report page."""
     optional_import("optuna", "stage=tune", "sweeps")
     from r2s.reporting.tuning import against_table, read_grid, trials_table, tuning_page
     from r2s.runs import read_summary

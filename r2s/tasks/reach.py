@@ -160,7 +160,7 @@ class ReachTask(BaseTask):
         return goals
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (6 n + 12,) that normalize observations: fixed scales of the task.
+        """Return mean and standard deviation (6 n + 12,) that normalize observations, both constants of the task.
 
         Scales from random motion would be too large: random torques spin the wrist at 10 rad/s, but near a goal even
         0.1 rad/s matters.

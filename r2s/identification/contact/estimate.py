@@ -136,8 +136,8 @@ def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | No
 def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
     """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution for rigid gears u (8,).
 
-    The weights remain those of rigid gears. Weights from the smaller residual of elastic gears would be too large for
-    the errors of the friction law: on elastic twins 0 to 9, 23 of 80 intervals would miss the truth instead of 9.
+    The weights remain those of rigid gears. The residual of elastic gears is smaller; weights from it would ignore
+    the error of the friction law: on elastic twins 0 to 9, 23 of 80 intervals would miss the truth instead of 9.
     """
     return _fitted(problem, problem.space.with_gears(u))
 

@@ -58,7 +58,7 @@ class SmoothMotion:
     ) -> "SmoothMotion":
         """Resample to 1 kHz, filter forward and backward, differentiate, remove the ends, and sample at `rate_hz`.
 
-        rate_hz: rows per second, at most FRICTION_HZ. late: lateness by which dq is corrected; None: no correction.
+        rate_hz: rows per second, at most FRICTION_HZ. late: delay of dq, which is compensated; None: no delay.
 
         Raises:
             UserError: no trajectory is longer than 2 EDGE_S.

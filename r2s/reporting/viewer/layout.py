@@ -1,4 +1,4 @@
-"""Lay out a rerun recording: tabs for the arms, the learning curves, each torque overlay and each figure."""
+"""Set the viewer layout of a Rerun recording: tabs for arms, learning curves, each torque overlay and each figure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
