@@ -42,13 +42,17 @@ class RigidBodyRows:
         rest = m.rows(rest - robot.armature * m.ddq)  # candidates add their own rotor torque
         nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         weight = m.rows(regressor(robot, m.q, still, still, robot.gravity).reshape(shape))
+        y = m.rows(y.reshape(shape))
+        if commanded:  # in place, because an hour of these rows takes hundreds of MB
+            rest -= weight @ nominal
+            y += weight
         encoder = np.zeros_like(rest)
         if isinstance(m, SlidingMotion):
             encoder = np.sqrt(m.rows(mass_matrix(robot, m.q) ** 2) @ m.encoder**2)
         return RigidBodyRows(
             q=m.rows(m.q),
-            rest=rest - weight @ nominal if commanded else rest,
-            y=m.rows(y.reshape(shape)) + weight if commanded else m.rows(y.reshape(shape)),
+            rest=rest,
+            y=y,
             load=np.abs(weight @ nominal),
             # a link-side sensor does not measure the torque that accelerates the rotors
             rotors=np.zeros_like(rest) if torque == "measured" else m.rows(m.ddq),
