@@ -315,7 +315,9 @@ def fit_presliding(s: State) -> State:
     if s.problem.uses_replays or not s.commanded or PRESLIDING not in s.space.blocks:
         return s
     how, torque_data = s.settings, s.problem.torque_data
-    given = s.fitted(), spread(s.recording, REPLAYED_S), torque_data, how.bounds, s.prior
+    draws = s.u + posterior(s.problem, s.u, how.seed).steps
+    known = Known.of(s.space, s.space.from_unit(s.u), s.space.from_unit(draws))
+    given = s.fitted(), spread(s.recording, REPLAYED_S), torque_data, known, s.prior
     rest: dict[str, Any] = {"report": s.history.add, "seed": how.seed, "nthread": how.nthread}
     found = s.history.step("presliding", lambda: estimate_presliding(*given, **rest))
     data = torque_data.on(s.space).with_presliding(s.recording, found["presliding"])

@@ -1,14 +1,17 @@
 """Estimate the presliding distance, over which the bristles of friction with memory bend after a reversal.
 
 The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
-bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters.
+bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters. Between
+some of them, such as offset and asymmetry, only reversals decide, so the last step of the search changes them, too.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from r2s.identification.known import Known, block_of
 from r2s.identification.parameters import ParameterSpace, parameter_space
 from r2s.identification.posterior import posterior
 from r2s.identification.problem import Problem, Report
@@ -21,17 +24,20 @@ from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
 WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, because friction reverses within about 50 ms
-# reweighted fits; per fit, most steps and least relative gain. A first fit with weights from the residual would give
-# little weight to reversals if the true distance is several times the nominal one
-ROUNDS, STEPS, FTOL = 2, 4, 1e-3
-MIN_SIGMA = 1e-3  # lower limit of the logarithm's standard deviation
+TRIED = 9  # distances, evenly spaced in their logarithm within the bounds: neighbors differ by a factor of 1.8
+STEPS, FTOL = 4, 1e-2  # of the search for the distance alone: most steps, least relative gain
+# parameters whose errors change the estimated distance; viscous friction, inertia and delay change it by 1 % or less
+WITH = ("coulomb", "asymmetry", "rise", "offset")
+# lower limit of the logarithm's standard deviation: windows start with bristles that bent along a smoothed velocity,
+# so even with true values of all other parameters, injected distances were found with errors of up to 1.5 %
+MIN_SIGMA = 0.02
 
 
 def estimate_presliding(
     dynamics: Dynamics,
     recording: Recording,
     torque_data: TorqueResidual,
-    bounds: Mapping[str, Sequence[ArrayLike]],
+    known: Known,
     prior: Mapping[str, ArrayLike],
     *,
     report: Report,
@@ -42,27 +48,75 @@ def estimate_presliding(
 
     Args:
         dynamics: dynamics of the arm fitted to torque. torque_data: torque residual that `dynamics` minimizes.
-        bounds, prior: bounds and prior of all parameters; only those of the presliding distance are used.
+        known: posterior of the torque fit, which is the prior of the parameters in WITH.
+        prior: prior of all parameters; only that of the presliding distance is used.
         seed: seed of the random draws from the posterior.
     """
-    robot = torque_data.space.robot
-    space = parameter_space(robot, dynamics, {NAME: bounds[NAME]})
     windows = cut_windows(recording, WINDOW_S)
-    data = ReplayResidual(space, recording, windows, stride=STRIDE, batch=robot.n + 1, nthread=nthread)
-    problem = Problem.of(data, torque_data.on(space), prior)
-    u, search = problem.start, LeastSquares(max_evaluations=STEPS, ftol=FTOL)
-    for _ in range(ROUNDS):
-        u = search(problem, u, report)
-        problem = problem.reweighted(u, fitted=True)
-    steps = posterior(problem, u, seed).steps
-    return {NAME: space.from_unit(u), "sigma": steps.std(0) * space.width}
+    space = _part(torque_data.space, dynamics, (NAME,))
+    data = ReplayResidual(space, recording, windows, stride=STRIDE, batch=space.n + 1, nthread=nthread)
+    u = nearest_distance(data)
+    problem = Problem.of(data, torque_data.on(space), prior).reweighted(u, fitted=True)
+    u = LeastSquares(max_evaluations=STEPS, ftol=FTOL)(problem, u, report)
+    data = problem.reweighted(u, fitted=True).data  # type: ignore[assignment]
+    names = tuple(name for name in WITH if name in torque_data.space.blocks)
+    both = _part(torque_data.space, space.dynamics(space.from_unit(u)), (NAME, *names))
+    known = known.where(lambda value: block_of(value) in names)
+    problem = Problem.of(data.on(both), torque_data.on(both), {NAME: prior.get(NAME, np.inf)}, [known])
+    step = GaussNewton.at(problem, problem.start)
+    at = both.where(NAME)
+    sigma = posterior(step, step.end, seed).steps[:, at].std(0) * both.width[at]
+    return {NAME: both.from_unit(step.end)[at], "sigma": np.maximum(sigma, MIN_SIGMA)}
+
+
+def nearest_distance(data: ReplayResidual) -> np.ndarray:
+    """Return the distance (n,), on the unit cube, that fits each joint best among a few, the same for all joints.
+
+    Weights from the residual at a distance several times too small would suppress all reversals, so a search must not
+    start there.
+    """
+    u = np.tile(np.linspace(0.0, 1.0, TRIED)[:, None], data.space.n)
+    cost = (data(data.space.from_unit(u)) ** 2).reshape(TRIED, -1, data.space.n).sum(1)
+    return u[cost.argmin(0), range(data.space.n)]
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """One step of a search from `start` (P,) to `end`, with residual r (R + B,) and Jacobian j (R + B, P) at `start`.
+
+    `linearize` yields the linear prediction of the residual, so that a posterior costs no further replays.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    r: np.ndarray
+    j: np.ndarray
+    clusters: np.ndarray
+
+    @staticmethod
+    def at(problem: Problem, u: np.ndarray) -> "GaussNewton":
+        """Linearize the problem at u (P,); the step ends inside the unit cube, or at u if it raises the cost."""
+        r, j = (np.concatenate(parts) for parts in zip(*problem.linearize(u), strict=True))
+        end = np.clip(u - np.linalg.lstsq(j, r, rcond=None)[0], 0.0, 1.0)
+        return GaussNewton(u, end if problem.cost(end) < r @ r else u, r, j, problem.clusters)
+
+    def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield residual and Jacobian at u (P,)."""
+        yield self.r + self.j @ (u - self.start), self.j
+
+
+def _part(space: ParameterSpace, dynamics: Dynamics, names: Sequence[str]) -> ParameterSpace:
+    """Return the space of the blocks `names` alone, with the bounds of `space` and other values from `dynamics`."""
+    at = {name: space.where(name) for name in names}
+    bounds = {name: [space.lower[k], space.upper[k]] for name, k in at.items()}
+    return replace(parameter_space(space.robot, dynamics, bounds), fixed=space.fixed)
 
 
 class Presliding:
     """Residual of the log presliding distance about the result of `estimate_presliding`, in standard deviations."""
 
     def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
-        self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)
+        self._value, self._sigma = np.log(presliding), sigma
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
         """Return the residual (C, n) of candidates x (C, P)."""

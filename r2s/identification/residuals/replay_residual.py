@@ -83,7 +83,8 @@ class ReplayResidual:
         shape = (count, *self.windows.q0.shape)
         self._sim.set_dynamics(d, ids, repeat=self.count)
         n = q0.shape[-1]
-        q0, dq0, bristle = (np.broadcast_to(a, shape).reshape(-1, n) for a in (q0, dq0, self.windows.bristle))
+        start = q0, dq0, self.windows.bristles(d)
+        q0, dq0, bristle = (np.broadcast_to(a, shape).reshape(-1, n) for a in start)
         self._sim.reset(q0, dq0, ids, bristle)
         q = self._sim.rollout(tau.reshape(-1, *tau.shape[2:]), ids=ids)["qpos"]
         error = (self._means(q).reshape(count, *self._target.shape) - self._target) * self._seen
@@ -94,6 +95,12 @@ class ReplayResidual:
         whole = q.shape[-2] // self._stride
         parts = q[..., : whole * self._stride, :].reshape(*q.shape[:-2], whole, self._stride, q.shape[-1])
         return parts.mean(-2)
+
+    def on(self, space: ParameterSpace) -> "ReplayResidual":
+        """Return a copy for the parameter space `space`, with the same weights."""
+        other = copy(self)
+        other.space = space
+        return other
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "ReplayResidual":
         """Return a copy with Z computed at x (P,) and, if x was `fitted`, with d and s estimated from the errors."""

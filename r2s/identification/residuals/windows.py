@@ -35,9 +35,10 @@ class Windows:
 
     Attributes:
         t: (W,) s, start time. q0, dq0: (W, n) rad, rad/s, start state. tau: (W, S, n) Nm, commands, one per ms.
-        before: (W, HISTORY, n) Nm, commands before a window. bristle: (W, n), presliding state at a window's start.
-        q: (W, S, n) rad, recorded angles after each step.
+        before: (W, HISTORY, n) Nm, commands before a window. q: (W, S, n) rad, recorded angles after each step.
         length: (W,) number of steps per window; `tau` and `q` have padding after this number of rows.
+        at: (W,) start row of each window in `dq`. dq: (T, n) rad/s, velocity of the whole recording, one row per ms.
+        begins: rows of `dq` at which trajectories begin.
     """
 
     t: np.ndarray
@@ -46,14 +47,31 @@ class Windows:
     tau: np.ndarray
     before: np.ndarray
     q: np.ndarray
-    bristle: np.ndarray
     length: np.ndarray
+    at: np.ndarray
+    dq: np.ndarray
+    begins: tuple[int, ...]
 
     def delayed(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
         """Return the torques (W, S, n) Nm that act on the joints after a `delay` and a `lag`, both in s."""
         motors = Motors(len(self.t), self.tau.shape[-1], delay, lag)
         motors.reset(tau=self.before[:, 0])
         return motors(np.concatenate([self.before, self.tau], 1))[:, HISTORY:]
+
+    def bristles(self, d: Dynamics) -> np.ndarray:
+        """Return the presliding state (..., W, n) at the start of each window, for dynamics with batch axes (...).
+
+        The recorded velocity determines the state, up to a window's start; it is 0 for friction without memory.
+        """
+        if not d.family.has_memory:
+            return np.zeros((len(self.at), self.dq.shape[1]))
+        named = "presliding" in d.family.names  # a user's law may lack it
+        distance = d.phi[..., d.family.names.index("presliding")] if named else np.full(d.phi.shape[:-1], PRESLIDING)
+        kinds, kind = np.unique(distance.reshape(-1, distance.shape[-1]), axis=0, return_inverse=True)
+        ends = pairwise([*self.begins, len(self.dq)])
+        pieces = [self.dq[a:b] for a, b in ends]
+        own = [np.concatenate([presliding(p, SIM_DT, kind) for p in pieces])[self.at] for kind in kinds]
+        return np.stack(own)[kind.ravel()].reshape(*distance.shape[:-1], len(self.at), -1)
 
 
 def cut_windows(
@@ -83,7 +101,7 @@ def cut_windows(
             f"no trajectory is as long as a window of {seconds:g} s; the longest is {longest * SIM_DT:g} s"
         )
     still = np.ptp(grid.q, axis=0) < MOVED
-    dq, bristle, start_state = np.empty_like(grid.q), np.empty_like(grid.q), StartState.of(grid)
+    dq, start_state = np.zeros_like(grid.q), StartState.of(grid)
     first = np.empty(len(grid.t), dtype=int)
     starts: list[int] = []
     lengths: list[int] = []
@@ -92,7 +110,6 @@ def cut_windows(
         if s.stop - s.start <= STATE_SAMPLES:
             continue
         dq[s] = savgol_filter(grid.q[s], STATE_SAMPLES, 3, deriv=1, delta=SIM_DT, axis=0)
-        bristle[s] = presliding(dq[s], SIM_DT, PRESLIDING)
         if not slowest:
             whole = list(range(s.start + HALF, s.stop - max(steps, HALF), steps))
             starts += whole
@@ -118,7 +135,9 @@ def cut_windows(
     rows = np.minimum(at[:, None] + np.arange(steps), (at + length - 1)[:, None])
     q0, dq0 = start_state(grid, at)
     earlier = np.maximum(at[:, None] - np.arange(HISTORY, 0, -1), first[at][:, None])
-    return Windows(grid.t[at], q0, dq0, grid.tau[rows], grid.tau[earlier], grid.q[rows + 1], bristle[at], length)
+    begins = tuple(s.start for s in grid.stretches)
+    of_windows = grid.t[at], q0, dq0, grid.tau[rows], grid.tau[earlier], grid.q[rows + 1], length, at
+    return Windows(*of_windows, dq, begins)
 
 
 def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, int]]:
@@ -194,5 +213,5 @@ def windows_or_none(recording: Recording, seconds: float, limit: int | None = No
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
     """Simulate an arm with `dynamics` over each window, and return its angles q (W, S, n) rad."""
     sim = Simulator(robot, dynamics, len(windows.q0), nthread)
-    sim.reset(windows.q0, windows.dq0, bristle=windows.bristle)
+    sim.reset(windows.q0, windows.dq0, bristle=windows.bristles(dynamics))
     return sim.rollout(windows.delayed(dynamics.delay, dynamics.lag))["qpos"]
