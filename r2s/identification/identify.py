@@ -179,9 +179,9 @@ def identify(
         give_back(recording)
         s = step(s)
     sure = history.step("posterior", lambda: posterior(s.problem, s.u, settings.seed)._asdict())
-    wide = {} if s.commanded else history.step("intervals of all terms", lambda: widest_intervals(s))
+    full = {} if s.commanded else history.step("draws of all terms", lambda: draw_full_model(s))
     story = {"families": s.families, "edges": s.edges, "refused": s.refused}
-    return conclude(s.problem, s.space, sure, wide, history=pd.DataFrame(history.rows), **story)
+    return conclude(s.problem, s.space, sure, full, history=pd.DataFrame(history.rows), **story)
 
 
 def select_family(s: State) -> State:
@@ -229,19 +229,18 @@ def prune_terms(s: State) -> State:
     return replace(s, terms=kept, unpruned=s.terms if len(kept) < len(s.terms) else ())
 
 
-def widest_intervals(s: State) -> dict[str, np.ndarray]:
-    """Return 95 % intervals of the kept values with all terms and usual priors: low, high (P,) on the unit cube.
+def draw_full_model(s: State) -> dict[str, np.ndarray]:
+    """Return posterior draws (S, P) of the kept values on the unit cube, from a fit with all terms and usual priors.
 
     Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
     replaces a removed one, for example a payload replaces the error of a link's mass. The fit's priors serve
-    prediction and can be narrower than the scatter among arms, so they alone may decide between two values.
+    prediction and can be narrower than the scatter among arms, so they alone may decide between two values. The
+    result's intervals are those of both models with equal weights (Hoeting et al., Statistical Science 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
     u, problem = fit_torque(full.problem.with_usual_prior())
     draws = u + posterior(problem.reweighted(u, fitted=True), u, s.settings.seed).steps
-    at = [full.space.names.index(name) for name in s.space.names]
-    low, high = np.quantile(draws[:, at], [0.025, 0.975], axis=0)
-    return {"low": low, "high": high}
+    return {"draws": draws[:, [full.space.names.index(name) for name in s.space.names]]}
 
 
 def formulate(s: State) -> State:

@@ -238,7 +238,7 @@ class ParameterEstimate:
 
     Attributes:
         x: estimated values. low, high: ends of 95 % intervals of the values, for measured and motor torque wider than
-            the scatter of `samples` (`widest_intervals`). identifiable: whether the data determine a value.
+            the scatter of `samples` (`draw_full_model`). identifiable: whether the data determine a value.
         samples: (S, P) random draws from the posterior.
     """
 

@@ -129,7 +129,7 @@ def conclude(
     problem: Problem,
     space: ParameterSpace,
     sure: Mapping[str, Any],
-    wide: Mapping[str, Any] | None = None,
+    full: Mapping[str, Any] | None = None,
     **story: Any,
 ) -> IdentificationResult:
     """Reset the values that the data hardly determine to nominal, and return the result of the identification.
@@ -138,7 +138,7 @@ def conclude(
         problem: the solved problem.
         space: the parameter space, with the breakaway torques and the stiction model estimated after the fit.
         sure: the posterior, as a dict with the fields of `Posterior`.
-        wide: {"low": (P,), "high": (P,)}, intervals on the unit cube that the result's intervals must contain.
+        full: {"draws": (S, P)}, draws on the unit cube from a second model, which count as much as those of `sure`.
         story: further fields of `IdentificationResult`: history, families, edges, refused.
     """
     u = np.array(sure["u"], dtype=float)
@@ -146,9 +146,9 @@ def conclude(
     prior, h = problem.prior_width, information + problem.prior_information(u)
     u, unseen = _settle(u, problem.start, h + RIDGE * np.eye(len(u)), steps.std(0) / prior)
     steps = np.clip(u + steps, 0.0, 1.0) - u
-    low, high = (np.minimum(0.0, np.quantile(sign * steps, 0.025, axis=0)) for sign in (1.0, -1.0))
-    if wide:  # `low` and `high` are distances below and above u, both at most 0
-        low, high = np.minimum(low, wide["low"] - u), np.minimum(high, u - wide["high"])
+    both = np.concatenate([steps, full["draws"] - u]) if full else steps
+    # distances below and above u, both at most 0
+    low, high = (np.minimum(0.0, np.quantile(sign * both, 0.025, axis=0)) for sign in (1.0, -1.0))
     inside = (u > EDGE) & (u < 1.0 - EDGE)  # at a bound, the interval is cut off on one side
     seen = inside & (-0.5 * (low + high) < prior / SHARPER)
     ends = space.from_unit(u + low), space.from_unit(u - high)
