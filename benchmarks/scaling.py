@@ -409,9 +409,9 @@ def main() -> None:
     lines = {f"{n}: {k}": {"before": before.get(n, {}).get(k, ""), "now": v} for n, k, v in pairs}
     text = (
         f"Arms of {', '.join(f'{n} joints and up to {t:g} Nm' for n, t in ARMS)}; friction, offsets and links are "
-        "drawn and known; link-side torque: links as its prior states, motor torque: nominal links, except in "
-        f"`3 masses`. `before`: commit 8bc76fa. Row 11, new arms of an independent simulator: independent.md.\n\n"
-        f"{COVERED}, all rows: {covered(lines, 'now')}; before: {covered(lines, 'before')}."
+        "drawn and known; link-side torque: links as its prior states; motor torque in rows 3 and 4: nominal links, "
+        "except in `3 masses`. `before`: commit 8bc76fa. Row 11, new arms of an independent simulator: "
+        f"independent.md.\n\n{COVERED}, all rows: {covered(lines, 'now')}; before: {covered(lines, 'before')}."
     )
     table = markdown_rows(lines, "row")
     print(table)

@@ -20,7 +20,7 @@ from r2s.identification.friction.repeatability import certainty
 from r2s.identification.friction.stiction import choose_stiction
 from r2s.identification.identify import identify
 from r2s.identification.link_inertia import inertia_scale
-from r2s.identification.posterior import _inside, posterior
+from r2s.identification.posterior import inside_cube, posterior
 from r2s.identification.prediction import prediction_errors
 from r2s.identification.residuals.replay_residual import ReplayResidual
 from r2s.identification.residuals.windows import cut_windows, replay
@@ -365,7 +365,7 @@ def test_of_two_values_that_are_both_out_one_comes_back():
     """Only a difference is identifiable; a draw that leaves the cube with both values clips one and keeps it."""
     weights = np.array([1e3, -1e3])
     u, step = np.array([1.0, 0.5]), np.array([0.7, 0.6])
-    kept = _inside(u, step[None], np.outer(weights, weights) + np.eye(2))[0]
+    kept = inside_cube(u, step[None], np.outer(weights, weights) + np.eye(2))[0]
     assert (np.abs(u + kept - 0.5) <= 0.5).all()
     assert kept[0] - kept[1] == pytest.approx(step[0] - step[1], abs=1e-5)
 

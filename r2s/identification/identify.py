@@ -314,17 +314,21 @@ def fit_presliding(s: State) -> State:
     if s.problem.uses_replays or not s.commanded or PRESLIDING not in s.space.blocks:
         return s
     how, torque_data = s.settings, s.problem.torque_data
-    draws = s.u + posterior(s.problem, s.u, how.seed).steps
-    known = Known.of(s.space, s.space.from_unit(s.u), s.space.from_unit(draws))
-    given = s.fitted(), spread(s.recording, REPLAYED_S), torque_data, known, s.prior
-    rest: dict[str, Any] = {"report": s.history.add, "seed": how.seed, "nthread": how.nthread}
-    found = s.history.step("presliding", lambda: estimate_presliding(*given, **rest))
+
+    def estimate() -> dict[str, np.ndarray]:
+        draws = s.u + posterior(s.problem, s.u, how.seed).steps
+        known = Known.of(s.space, s.space.from_unit(s.u), s.space.from_unit(draws))
+        given = s.fitted(), spread(s.recording, REPLAYED_S), torque_data, known, s.prior
+        return estimate_presliding(*given, how.seed, how.nthread, s.history.add)
+
+    found = s.history.step("presliding", estimate)
     data = torque_data.on(s.space).with_presliding(s.recording, found["presliding"])
     extra = (*s.problem.extra, Presliding(found["presliding"], found["sigma"]))
     x, u, at = s.space.start.copy(), s.u.copy(), s.space.where(PRESLIDING)
     x[at] = found["presliding"]
     u[at] = np.clip(s.space.to_unit(x)[at], 0.0, 1.0)
     problem = replace(s.problem, data=data, torque_data=data, extra=extra)
+    problem = problem.without_prior([s.space.names[k] for k in at])  # `Presliding` contains it
     return replace(s, problem=problem.reweighted(u, fitted=True), u=u)
 
 

@@ -237,8 +237,9 @@ class ParameterEstimate:
     """Estimated parameter vector with arrays (P,) in SI units.
 
     Attributes:
-        x: estimated values. low, high: ends of 95 % intervals of the values, for measured and motor torque wider than
-            the scatter of `samples` (`draw_full_model`). identifiable: whether the data determine a value.
+        x: estimated values. identifiable: whether the data determine a value.
+        low, high: ends of 95 % intervals of the values; for measured and motor torque, the intervals also count draws
+            from a second model (`draw_full_model`), which `samples` does not contain.
         samples: (S, P) random draws from the posterior.
     """
 

@@ -60,7 +60,7 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     normal -= normal.mean(0)
     normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / DRAWS), normal.T).T  # of covariance 1, exactly
     steps = normal @ _at_least(least, robust).T
-    return Posterior(u, _inside(u, steps, information + prior), information)
+    return Posterior(u, inside_cube(u, steps, information + prior), information)
 
 
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
@@ -94,7 +94,7 @@ def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
     return least @ (axes * np.maximum(seen, 1.0))
 
 
-def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
+def inside_cube(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return `steps` (S, P) with values changed so that u + steps lies in the unit cube.
 
     Values outside the cube are clipped. All other values are adapted to minimize the sum of squares with Hessian

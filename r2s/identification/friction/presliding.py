@@ -2,7 +2,8 @@
 
 The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
 bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters. Between
-some of them, such as offset and asymmetry, only reversals decide, so the last step of the search changes them, too.
+some of them, such as offset and asymmetry, only reversals decide. The last steps of the search therefore vary them
+together with the distance, but only the distance is returned.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,24 +14,27 @@ from numpy.typing import ArrayLike
 
 from r2s.identification.known import Known, block_of
 from r2s.identification.parameters import ParameterSpace, parameter_space
-from r2s.identification.posterior import posterior
+from r2s.identification.posterior import inside_cube, posterior
 from r2s.identification.problem import Problem, Report
 from r2s.identification.residuals.replay_residual import ReplayResidual
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.residuals.windows import cut_windows
 from r2s.identification.search.least_squares import LeastSquares
+from r2s.identification.search.levenberg_marquardt import normal_equations
 from r2s.physics.dynamics import Dynamics
 from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
 WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, because friction reverses within about 50 ms
-TRIED = 9  # distances, evenly spaced in their logarithm within the bounds: neighbors differ by a factor of 1.8
+TRIED = 9  # distances, evenly spaced in their logarithm; within the usual bounds, neighbors differ by a factor of 1.8
 STEPS, FTOL = 4, 1e-2  # of the search for the distance alone: most steps, least relative gain
+JOINT_STEPS, SMALL = 4, 0.05  # steps of the joint search: most; change of the distance (relative) after which it ends
 # parameters whose errors change the estimated distance; viscous friction, inertia and delay change it by 1 % or less
 WITH = ("coulomb", "asymmetry", "rise", "offset")
 # lower limit of the logarithm's standard deviation: windows start with bristles that bent along a smoothed velocity,
 # so even with true values of all other parameters, injected distances were found with errors of up to 1.5 %
 MIN_SIGMA = 0.02
+RIDGE = 1e-6  # information added to every value on the unit cube, as a distance may have a flat prior and no data
 
 
 def estimate_presliding(
@@ -39,10 +43,9 @@ def estimate_presliding(
     torque_data: TorqueResidual,
     known: Known,
     prior: Mapping[str, ArrayLike],
-    *,
-    report: Report,
     seed: int,
     nthread: int,
+    report: Report,
 ) -> dict[str, np.ndarray]:
     """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of its logarithm}, estimated from replays.
 
@@ -50,7 +53,7 @@ def estimate_presliding(
         dynamics: dynamics of the arm fitted to torque. torque_data: torque residual that `dynamics` minimizes.
         known: posterior of the torque fit, which is the prior of the parameters in WITH.
         prior: prior of all parameters; only that of the presliding distance is used.
-        seed: seed of the random draws from the posterior.
+        seed: seed of the random draws from the posterior. nthread: threads of the physics. report: see `identify`.
     """
     windows = cut_windows(recording, WINDOW_S)
     space = _part(torque_data.space, dynamics, (NAME,))
@@ -62,15 +65,21 @@ def estimate_presliding(
     names = tuple(name for name in WITH if name in torque_data.space.blocks)
     both = _part(torque_data.space, space.dynamics(space.from_unit(u)), (NAME, *names))
     known = known.where(lambda value: block_of(value) in names)
-    problem = Problem.of(data.on(both), torque_data.on(both), {NAME: prior.get(NAME, np.inf)}, [known])
-    step = GaussNewton.at(problem, problem.start)
-    at = both.where(NAME)
-    sigma = posterior(step, step.end, seed).steps[:, at].std(0) * both.width[at]
-    return {NAME: both.from_unit(step.end)[at], "sigma": np.maximum(sigma, MIN_SIGMA)}
+    if NAME in prior:
+        sigma = np.broadcast_to(prior[NAME], space.n)
+        known = known.beside(Known(tuple(space.names), np.log(space.start), np.diag(sigma**2), 0.0 * sigma))
+    problem = Problem.of(data.on(both), torque_data.on(both), {}, [known])
+    at, u, change = both.where(NAME), problem.start, np.inf
+    for _ in range(JOINT_STEPS):
+        if change > SMALL:
+            step = GaussNewton.at(problem, u)
+            change, u = np.abs((step.end - u)[at] * both.width[at]).max(), step.end
+    steps = posterior(step, step.end, seed).steps[:, at]
+    return {NAME: both.from_unit(step.end)[at], "sigma": steps.std(0) * both.width[at]}
 
 
 def nearest_distance(data: ReplayResidual) -> np.ndarray:
-    """Return the distance (n,), on the unit cube, that fits each joint best among a few, the same for all joints.
+    """Simulate TRIED distances, each in all joints at once; return each joint's best distance (n,) on the unit cube.
 
     Weights from the residual at a distance several times too small would suppress all reversals, so a search must not
     start there.
@@ -82,27 +91,29 @@ def nearest_distance(data: ReplayResidual) -> np.ndarray:
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """One step of a search from `start` (P,) to `end`, with residual r (R + B,) and Jacobian j (R + B, P) at `start`.
+    """One step of a search from `start` (P,) to `end`, with `parts` of residual and Jacobian at `start`.
 
     `linearize` yields the linear prediction of the residual, so that a posterior costs no further replays.
     """
 
     start: np.ndarray
     end: np.ndarray
-    r: np.ndarray
-    j: np.ndarray
+    parts: list[tuple[np.ndarray, np.ndarray]]
     clusters: np.ndarray
 
     @staticmethod
     def at(problem: Problem, u: np.ndarray) -> "GaussNewton":
-        """Linearize the problem at u (P,); the step ends inside the unit cube, or at u if it raises the cost."""
-        r, j = (np.concatenate(parts) for parts in zip(*problem.linearize(u), strict=True))
-        end = np.clip(u - np.linalg.lstsq(j, r, rcond=None)[0], 0.0, 1.0)
-        return GaussNewton(u, end if problem.cost(end) < r @ r else u, r, j, problem.clusters)
+        """Linearize the problem at u (P,); `end` is inside the unit cube, or u if the step would raise the cost."""
+        parts = list(problem.linearize(u))
+        gradient, hessian = normal_equations(parts)
+        hessian += RIDGE * np.eye(len(u))
+        end = u + inside_cube(u, -np.linalg.solve(hessian, gradient)[None], hessian)[0]
+        return GaussNewton(u, end if problem.cost(end) < problem.cost(u) else u, parts, problem.clusters)
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield residual and Jacobian at u (P,)."""
-        yield self.r + self.j @ (u - self.start), self.j
+        """Yield residual and Jacobian at u (P,), part by part."""
+        for r, j in self.parts:
+            yield r + j @ (u - self.start), j
 
 
 def _part(space: ParameterSpace, dynamics: Dynamics, names: Sequence[str]) -> ParameterSpace:
@@ -116,7 +127,7 @@ class Presliding:
     """Residual of the log presliding distance about the result of `estimate_presliding`, in standard deviations."""
 
     def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
-        self._value, self._sigma = np.log(presliding), sigma
+        self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
         """Return the residual (C, n) of candidates x (C, P)."""

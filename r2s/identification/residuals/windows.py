@@ -61,16 +61,15 @@ class Windows:
     def bristles(self, d: Dynamics) -> np.ndarray:
         """Return the presliding state (..., W, n) at the start of each window, for dynamics with batch axes (...).
 
-        The recorded velocity determines the state, up to a window's start; it is 0 for friction without memory.
+        The recorded velocity determines the state, from 0 at the trajectory's start. Without memory, the state is 0.
         """
         if not d.family.has_memory:
             return np.zeros((len(self.at), self.dq.shape[1]))
-        named = "presliding" in d.family.names  # a user's law may lack it
+        named = "presliding" in d.family.names[: d.phi.shape[-1]]  # a user's law may lack it
         distance = d.phi[..., d.family.names.index("presliding")] if named else np.full(d.phi.shape[:-1], PRESLIDING)
         kinds, kind = np.unique(distance.reshape(-1, distance.shape[-1]), axis=0, return_inverse=True)
-        ends = pairwise([*self.begins, len(self.dq)])
-        pieces = [self.dq[a:b] for a, b in ends]
-        own = [np.concatenate([presliding(p, SIM_DT, kind) for p in pieces])[self.at] for kind in kinds]
+        pieces = [self.dq[a:b] for a, b in pairwise([*self.begins, len(self.dq)])]
+        own = [np.concatenate([presliding(p, SIM_DT, z) for p in pieces])[self.at] for z in kinds]
         return np.stack(own)[kind.ravel()].reshape(*distance.shape[:-1], len(self.at), -1)
 
 
