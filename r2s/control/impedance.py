@@ -171,7 +171,7 @@ def cartesian_impedance(
         force_clip: N, largest spring force at the largest stiffness, at most the force F that the torque limit allows
             in all directions in the home posture; None: CLIP F. moment_clip: Nm, largest spring moment, likewise.
         null_stiffness: 1/rad, each joint's null-space stiffness towards home as a multiple of its torque limit.
-        hybrid: whether a force acts along a surface normal, and the impedance only across this normal. An action
+        hybrid: whether a force acts along a surface normal, and the impedance in tangential directions. An action
             that displaces the target against the normal adds a force stiffness * displacement. If `task.approaches`,
             the target moves into the surface; the spring limits the force, so the tip is no faster than the target.
         normal: (3,) in the base frame, out of the surface. force: N, against the normal. None: the task's contact.
