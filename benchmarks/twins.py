@@ -24,6 +24,7 @@ from common import (
     searches,
     stamp,
 )
+from twin_judge import WatchedTwin, covered
 
 from r2s.arm.twins.make_twin import make_twin
 from r2s.identification.identify import identify
@@ -33,7 +34,10 @@ from r2s.identification.prediction import prediction_errors
 def evaluate(variant: str, seed: int) -> dict:
     """Return the results of one twin."""
     arms = [make_twin(ROBOT, variant=variant, seed=seed, noise=s) for s in range(3)]
-    train, validation = (record(arms[s], fourier(ROBOT, duration=20.0, seed=s)) for s in (0, 1))
+    watched = WatchedTwin(arms[0])
+    train, validation = (
+        record(arm, fourier(ROBOT, duration=20.0, seed=s)) for s, arm in enumerate((watched, arms[1]))
+    )
     ramps = ramp(arms[2], poses_about(ROBOT, 2))
     began = time.perf_counter()
     found = identify(ROBOT, OLD, train, searches("staged"), identify_settings(family="auto"), ramps=ramps)
@@ -49,6 +53,7 @@ def evaluate(variant: str, seed: int) -> dict:
         "torque": torque,
         "delay": 1e3 * float(found.dynamics.delay),
         "lag": 1e3 * float(found.dynamics.lag),
+        "within": covered(watched, train.q, found),
         "seconds": seconds,
     }
 
@@ -58,6 +63,7 @@ def cells(r: dict) -> dict[str, str]:
     pairs = {h: f"{r['nominal'][h]:.1f} → {r['ee'][h]:.1f}" for h in ("0.1", "0.5", "2")}
     row = {"family": r["family"], "0.1 s, mm": pairs["0.1"], "0.5 s, mm": pairs["0.5"]}
     row |= {"ratio": f"1/{r['ratio']:.1f}", "2 s, mm": pairs["2"], "worst joint": f"{r['joints'].max():.2f}"}
+    row |= {"friction within, %": f"{100 * r['within']:.0f}"}
     return row | {"delay + lag, ms": f"{r['delay']:.1f} + {r['lag']:.1f}", "seconds": f"{r['seconds']:.0f}"}
 
 
