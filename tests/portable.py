@@ -17,7 +17,7 @@ from pathlib import Path
 # tests that compare bits, or numbers within a tolerance, through linear algebra, sums or torch
 NUMERIC = (
     *("physics", "regressor", "driver", "engines", "oracle", "twin", "breakaway", "identify", "tqc", "algorithms"),
-    *("identify_torque", "env", "excitation", "contact_physics", "push_limit"),
+    *("identify_torque", "env", "excitation", "contact_physics", "push_limit", "presliding"),
 )
 # What is no matter of rounding: a million cycles, what torch compiles for the processor that it finds, and mistakes
 LEFT_OUT = (
