@@ -76,7 +76,7 @@ def covered(twin: WatchedTwin, q: np.ndarray, found: IdentificationResult) -> fl
 
 
 class Means:
-    """Means (7, 2, BINS) over the rows of a motion q (T, 7) rad, by joint, direction and range of speed."""
+    """Means (14 BINS,) over the rows of a motion q (T, 7) rad: by joint, then direction, then range of speed."""
 
     def __init__(self, q: np.ndarray):
         dq = savgol_filter(q, 31, 3, deriv=1, delta=SIM_DT, axis=0)

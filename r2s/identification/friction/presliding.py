@@ -69,11 +69,12 @@ def estimate_presliding(
         sigma = np.broadcast_to(prior[NAME], space.n)
         known = known.beside(Known(tuple(space.names), np.log(space.start), np.diag(sigma**2), 0.0 * sigma))
     problem = Problem.of(data.on(both), torque_data.on(both), {}, [known])
-    at, u, change = both.where(NAME), problem.start, np.inf
+    at, u = both.where(NAME), problem.start
     for _ in range(JOINT_STEPS):
-        if change > SMALL:
-            step = GaussNewton.at(problem, u)
-            change, u = np.abs((step.end - u)[at] * both.width[at]).max(), step.end
+        step = GaussNewton.at(problem, u)
+        change, u = np.abs((step.end - u)[at] * both.width[at]).max(), step.end
+        if change <= SMALL:
+            break
     steps = posterior(step, step.end, seed).steps[:, at]
     return {NAME: both.from_unit(step.end)[at], "sigma": steps.std(0) * both.width[at]}
 
