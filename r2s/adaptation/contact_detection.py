@@ -3,34 +3,65 @@
 import numpy as np
 
 from r2s.adaptation import tuning
-from r2s.adaptation.wrench_state import ABOVE, BELOW, FAST, HANGING, REST, SQUARE, TOUCHES
+from r2s.adaptation.wrench_state import (
+    ABOVE,
+    BELOW,
+    FAST,
+    HANGING,
+    IMPACT_ABOVE,
+    IMPACT_SQUARE,
+    REST,
+    SQUARE,
+    SURPRISE,
+    SURPRISED,
+    TOUCHES,
+)
 from r2s.compiled import njit
 from r2s.physics.robot import SIM_DT
 
 
 @njit(cache=True, error_model="numpy")
-def detect(threshold, floor, state):
-    """Test whether a contact begins or ends, if any joint moves; friction of resting joints hides forces."""
-    x, P, contact = state.x, state.P, state.contact
-    square = floor**2
-    a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]
-    d, e, f = P[1, 1] + square, P[2, 1], P[2, 2] + square
-    l21, l31 = b / a, c / a  # L D L^T of the force's covariance
-    d2 = d - l21 * b
-    l32 = (e - l31 * b) / d2
-    d3 = f - l31 * c - l32 * l32 * d2
-    y2 = x[1] - l21 * x[0]
-    y3 = x[2] - l31 * x[0] - l32 * y2
+def detect(thresholds, floor, state):
+    """Test whether a contact begins or ends, if any joint moves; friction of resting joints hides forces.
+
+    Two tests of the hypothesis that no force acts, each with its own threshold: of the force, and of an impact. An
+    impact raises the filter's variances, which would hide the impact from the first test. The second test keeps the
+    covariance from before the innovations exceeded their variances, but not for longer than an impact lasts. It
+    low-passes the force, whose sign a vibration of the gears changes.
+    """
+    x, P, contact, calm, smooth = state.x, state.P, state.contact, state.calm, state.smooth
     n = state.joints.shape[1]
     moves = n - state.joints[REST].sum() >= 1
-    contact[SQUARE] = x[0] * x[0] / a + y2 * y2 / d2 + y3 * y3 / d3 if moves else 0.0
-    contact[ABOVE] = contact[ABOVE] + 1.0 if contact[SQUARE] > threshold else 0.0
+    contact[SURPRISED] = contact[SURPRISED] + 1.0 if contact[SURPRISE] > 1.0 else 0.0
+    if contact[SURPRISED] == 0.0 or contact[SURPRISED] > tuning.IMPACT:
+        calm[:] = P[:3, :3]
+    for c in range(3):
+        smooth[c] += SIM_DT * tuning.IMPACT_RATE * (x[c] - smooth[c])
+    contact[SQUARE] = _square(P, floor, x) if moves else 0.0
+    contact[IMPACT_SQUARE] = _square(calm, floor, smooth) if moves else 0.0
+    contact[ABOVE] = contact[ABOVE] + 1.0 if contact[SQUARE] > thresholds[0] else 0.0
+    contact[IMPACT_ABOVE] = contact[IMPACT_ABOVE] + 1.0 if contact[IMPACT_SQUARE] > thresholds[1] else 0.0
     if moves:
-        contact[BELOW] = contact[BELOW] + 1.0 if contact[SQUARE] < tuning.RELEASE * threshold else 0.0
-    if contact[ABOVE] >= tuning.CONFIRMED:
+        contact[BELOW] = contact[BELOW] + 1.0 if contact[SQUARE] < tuning.RELEASE * thresholds[0] else 0.0
+    if max(contact[ABOVE], contact[IMPACT_ABOVE]) >= tuning.CONFIRMED:
         contact[TOUCHES], contact[BELOW] = 1.0, 0.0
     elif contact[BELOW] >= tuning.RELEASED:
         contact[TOUCHES] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _square(P, floor, force):
+    """Return the squared force, in units of the covariance P[:3, :3] with floor^2 added to each axis."""
+    square = floor**2
+    a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]
+    d, e, f = P[1, 1] + square, P[2, 1], P[2, 2] + square
+    l21, l31 = b / a, c / a  # L D L^T of the covariance
+    d2 = d - l21 * b
+    l32 = (e - l31 * b) / d2
+    d3 = f - l31 * c - l32 * l32 * d2
+    y2 = force[1] - l21 * force[0]
+    y3 = force[2] - l31 * force[0] - l32 * y2
+    return force[0] * force[0] / a + y2 * y2 / d2 + y3 * y3 / d3
 
 
 @njit(cache=True, error_model="numpy")

@@ -6,11 +6,12 @@
 
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
 tool (wrench_filter.py). A contact begins when the squared force, in units of its covariance, exceeds a threshold for
-15 ms while a joint moves, in a chi-square test of the hypothesis that no force acts. The threshold aims at one false
-alarm per hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors,
-`contact_threshold` computes the threshold from recordings without contact: the largest squared force of each half
-second has an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch,
-Modelling Extremal Events, 1997, section 3.3), which the function extrapolates to an hour.
+15 ms while a joint moves, in a chi-square test of the hypothesis that no force acts. A second test detects impacts
+(contact_detection.py). The thresholds of both tests aim at one false alarm per hour together. The least threshold,
+GAUSSIAN, assumes independent normal errors in each cycle. For larger errors, `contact_thresholds` computes the
+thresholds from recordings without contact: the largest squared force of each half second has an exponential tail
+(extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997,
+section 3.3), which the function extrapolates to an hour. Without such recordings, only the first test is used.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimate, Estimator
 from r2s.adaptation.offline_estimation import LEAST_HZ, at_rate, pauses
 from r2s.adaptation.wrench_filter import update_wrench
-from r2s.adaptation.wrench_state import HANGING, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
+from r2s.adaptation.wrench_state import HANGING, IMPACT_SQUARE, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
 from r2s.errors import UserError
 from r2s.identification.posterior import Z_95
 from r2s.physics.dynamics import Dynamics
@@ -32,7 +33,9 @@ from r2s.physics.payload import ee_pose
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
-GAUSSIAN = float(chi2.isf(tuning.ALARMS_PER_HOUR * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
+ALARMS_PER_HOUR = tuning.ALARMS_PER_HOUR / 2  # of each test
+GAUSSIAN = float(chi2.isf(ALARMS_PER_HOUR * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
+SQUARES = ["square", "impact_square"]  # columns of the tests
 BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; fewest blocks for a threshold
 
 
@@ -40,20 +43,23 @@ class WrenchObserver:
     """Observer that estimates the wrench on one arm, cycle by cycle.
 
     Attributes:
-        threshold: squared force, in units of its covariance, above which the arm is in contact.
+        thresholds: (2,), squared forces, in units of their covariances, above which the arm is in contact: of the
+            force, and of an impact.
         tool: tool of the robot; None for a robot without a tool.
 
     Args:
-        robot, dynamics: the identified arm. threshold: contact threshold; None: twice GAUSSIAN.
+        robot, dynamics: the identified arm. thresholds: contact thresholds; None: twice GAUSSIAN, without the test
+            for impacts.
     """
 
-    def __init__(self, robot: Robot, dynamics: Dynamics, threshold: float | None = None):
+    def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):
         self._arm, self.tool = make_arm_model(robot, dynamics), robot.tool
         position, axes = ee_pose(robot)
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
         self._noise = wrench_noise(robot, dynamics)
-        self.threshold = tuning.UNCALIBRATED * GAUSSIAN if threshold is None else threshold
+        uncalibrated = np.array([tuning.UNCALIBRATED * GAUSSIAN, np.inf])
+        self.thresholds = uncalibrated if thresholds is None else thresholds
         self._q, self._dq, self._tau = np.zeros((3, robot.n))
         self.begin()
         zero = np.zeros(robot.n)
@@ -79,7 +85,7 @@ class WrenchObserver:
             self.begin()
             return False
         self._q[:], self._dq[:], self._tau[:] = q, dq, tau  # arrays of one type, so that numba compiles once
-        update_wrench(self._arm, self._tip, self._noise, self.threshold, self._state, self._q, self._dq, self._tau)
+        update_wrench(self._arm, self._tip, self._noise, self.thresholds, self._state, self._q, self._dq, self._tau)
         return self.in_contact
 
     def carry(self, payload: np.ndarray) -> None:
@@ -129,9 +135,9 @@ class WrenchObserver:
         return self._state.place
 
     @property
-    def square(self) -> float:
-        """Squared force, in units of its covariance; a contact begins once it exceeds `threshold` for 15 ms."""
-        return float(self._state.contact[SQUARE])
+    def squares(self) -> np.ndarray:
+        """(2,), squared forces of both tests; a contact begins once one exceeds its threshold for 15 ms."""
+        return self._state.contact[[SQUARE, IMPACT_SQUARE]]
 
     @property
     def rests(self) -> np.ndarray:
@@ -166,7 +172,7 @@ def observe_recording(
     """
     recording = at_rate(robot, recording)
     touch = 1 + 2 * len(observer.wrench)  # column of `in_contact`
-    rows = np.empty((len(recording.t), touch + 5))
+    rows = np.empty((len(recording.t), touch + 6))
     for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         observer.begin()
         if estimator is not None:
@@ -182,14 +188,14 @@ def observe_recording(
                     if report is not None:
                         report(estimator.now)
             values = np.stack([observer.wrench, observer.wrench_half], -1).ravel()
-            rows[k] = np.concatenate([[recording.t[k]], values, [touches, observer.square], observer.tip])
+            rows[k] = np.concatenate([[recording.t[k]], values, [touches], observer.squares, observer.tip])
             if touches and not (k > stretch.start and rows[k - 1, touch]):
                 begun = k
             if observer.hangs:  # a payload's weight: no contact since `begun`
                 rows[begun:k, touch] = 0.0
     names = [f"force_{c}_N" for c in "xyz"] + [f"moment_{c}_Nm" for c in "xyz"]
     columns = [c for name in names[: len(observer.wrench)] for c in (name, f"{name}_half")]
-    table = pd.DataFrame(rows, columns=["t", *columns, "in_contact", "square", "tip_x_m", "tip_y_m", "tip_z_m"])
+    table = pd.DataFrame(rows, columns=["t", *columns, "in_contact", *SQUARES, "tip_x_m", "tip_y_m", "tip_z_m"])
     return table.astype({"in_contact": int})
 
 
@@ -205,7 +211,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why rate or length makes the recordings unfit for `contact_threshold`; None if they are fit."""
+    """Return why rate or length makes the recordings unfit for `contact_thresholds`; None if they are fit."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]
@@ -214,8 +220,8 @@ def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
     return None
 
 
-def contact_threshold(robot: Robot, observer: WrenchObserver, free: Sequence[Recording]) -> float:
-    """Return the contact threshold for one false alarm per hour, determined from recordings without contact.
+def contact_thresholds(robot: Robot, observer: WrenchObserver, free: Sequence[Recording]) -> np.ndarray:
+    """Return the contact thresholds (2,) for one false alarm per hour, determined from recordings without contact.
 
     Raises:
         UserError: the recordings are shorter than 5 s, or their rate is below 200 Hz.
@@ -224,10 +230,15 @@ def contact_threshold(robot: Robot, observer: WrenchObserver, free: Sequence[Rec
         raise UserError(f"contact threshold: {why}")
     maxima = []
     for recording in free:
-        squares = observe_recording(robot, observer, recording)["square"]
-        square = squares.rolling(tuning.CONFIRMED).min().fillna(0.0).to_numpy()
-        maxima += [square[k : k + BLOCK].max() for k in range(0, len(square) - BLOCK + 1, BLOCK)]
+        squares = observe_recording(robot, observer, recording)[SQUARES].rolling(tuning.CONFIRMED).min()
+        square = squares.fillna(0.0).to_numpy()
+        maxima += [square[k : k + BLOCK].max(0) for k in range(0, len(square) - BLOCK + 1, BLOCK)]
+    return np.array([max(GAUSSIAN, _exceeded_hourly(column)) for column in np.transpose(maxima)])
+
+
+def _exceeded_hourly(maxima: np.ndarray) -> float:
+    """Return the squared force that maxima of blocks (N,) exceed ALARMS_PER_HOUR times an hour, from their tail."""
     level = np.quantile(maxima, 1.0 - tuning.TAIL)
-    excess = np.mean([m - level for m in maxima if m >= level])
+    excess = np.mean(maxima[maxima >= level] - level)
     blocks_per_hour = 3600.0 / tuning.BLOCK_S
-    return max(GAUSSIAN, float(level + excess * np.log(tuning.TAIL * blocks_per_hour / tuning.ALARMS_PER_HOUR)))
+    return float(level + excess * np.log(tuning.TAIL * blocks_per_hour / ALARMS_PER_HOUR))

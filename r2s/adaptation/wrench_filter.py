@@ -48,12 +48,12 @@ from r2s.physics.robot import SIM_DT
 
 
 @njit(cache=True, error_model="numpy")
-def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
+def update_wrench(arm, tip, noise, thresholds, state, q, dq, tau):
     """Process one cycle; `state.x` and `state.P` begin with the wrench and its covariance.
 
     Args:
         arm: `ArmModel`. tip: (3,) m, position of the tip in the last link's frame. noise: `WrenchNoise`.
-        threshold: squared force, in units of its covariance, above which the arm is in contact.
+        thresholds: (2,), squared forces above which the arm is in contact, see `detect`.
         q, dq: (n,) rad, rad/s, measured in this cycle. tau: (n,) Nm, command of this cycle, without gravity.
     """
     joints, counts, n = state.joints, state.counts, len(q)
@@ -89,7 +89,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
         _predict(noise, state)
         _measure(state)
     _keep_within_edges(noise, state)
-    detect(threshold, noise.floor, state)
+    detect(thresholds, noise.floor, state)
     weigh(arm, state)
     counts[CYCLE] += 1
     state.commands[counts[COMMAND] % SLOTS] = tau

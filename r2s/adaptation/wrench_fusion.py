@@ -59,13 +59,13 @@ class FusedWrench(WrenchObserver):
         dynamics: Dynamics,
         surface: Surface,
         draws: Sequence[Surface] = (),
-        threshold: float | None = None,
+        thresholds: np.ndarray | None = None,
     ):
         if robot.tool is None:
             raise UserError("robot.tool: a force from a surface needs the tip that touches it, got none")
         self._law = surface_law(surface, draws, robot.tool.radius, tuning.ANGLE_NOISE)
         self._fused, self._fused_covariance = np.zeros(3), np.zeros((3, 3))
-        super().__init__(robot, dynamics, threshold)
+        super().__init__(robot, dynamics, thresholds)
 
     def begin(self) -> None:
         """Start a motion from rest, and trust the surface again if an earlier motion refused it."""

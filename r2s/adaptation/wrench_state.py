@@ -12,8 +12,9 @@ from r2s.physics.newton_euler import WORK
 COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
 # indices of `WrenchState.contact`: low-passed mean of the joints' squared innovations, in variances; squared force in
 # variances, 0 if no joint moves; 1 in contact; cycles of the squared force above the contact threshold, below the
-# release threshold; path of the tip, m, along which the force pointed down
-SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING = range(6)
+# release threshold; path of the tip, m, along which the force pointed down; squared force of the impact test, cycles
+# above its threshold; cycles in which the innovations exceeded their variances
+SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, SURPRISED, ENTRIES = range(10)
 # rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; slow cycles; angle where it came to rest,
 # motion since, creep of this cycle, rad; friction model now, a cycle ago, Nm; known torque without motor or friction,
 # its mean in the last cycle with both, motor torque, its mean in the coming cycle, Nm; variance of the measured
@@ -41,7 +42,9 @@ class WrenchState(NamedTuple):
     P: np.ndarray  # (N, N), covariance
     joints: np.ndarray  # (ROWS, n), see ANGLE to SHAKE
     counts: np.ndarray  # (2,), COMMAND, CYCLE
-    contact: np.ndarray  # (6,), see SURPRISE to HANGING
+    contact: np.ndarray  # (ENTRIES,), see SURPRISE to SURPRISED
+    calm: np.ndarray  # (3, 3) N^2, covariance of the force in the impact test
+    smooth: np.ndarray  # (3,) N, low-passed force in the impact test
     payload: np.ndarray  # (10,), payload beyond the model, in the payload frame (momentum.py)
     commands: np.ndarray  # (SLOTS, n) Nm, the last commands
     place: np.ndarray  # (3,) m, tip in the base frame
@@ -61,7 +64,9 @@ class WrenchState(NamedTuple):
         joints = np.zeros((ROWS, n))
         joints[REST] = 1.0
         arrays = (
-            np.zeros(6),
+            np.zeros(ENTRIES),
+            np.zeros((3, 3)),
+            np.zeros(3),
             np.zeros(BODY),
             np.zeros((SLOTS, n)),
             np.zeros(3),

@@ -54,7 +54,7 @@ def estimate(cfg, overrides):
             recording, stopped = record_arm(cfg, robot)
             recording.save(run.folder / ("recording_until_stop.npz" if stopped else "recording.npz"))
         estimator = Estimator(*AdapterContext(robot, dynamics, posterior, unloaded).corrected)
-        observer, threshold_from = wrench_observer(cfg, robot, dynamics, surface)
+        observer, thresholds_from = wrench_observer(cfg, robot, dynamics, surface)
         print(
             "compensated payload: up to {:g} kg at {:g} m (robot.payload_max, robot.payload_far)".format(
                 *robot.payload_max
@@ -84,7 +84,8 @@ def estimate(cfg, overrides):
             {"seconds": recording.duration}
             | summary(last, estimator.changes)
             | {"noise_from": source}
-            | {"contacts": touched, "contact_threshold": observer.threshold, "threshold_from": threshold_from}
+            | {"contacts": touched, "contact_thresholds": observer.thresholds.tolist()}
+            | {"thresholds_from": thresholds_from}
             | ({} if surface is None else {"surface_trusted": observer.trusted})
         )
         draw_estimate(run.figure("payload"), run.figure("friction"), rows, estimator.changes)
@@ -109,8 +110,8 @@ def identified_surface(cfg, robot):
 
 
 def wrench_observer(cfg, robot, dynamics, surface):
-    """Return the wrench observer, and what determines its contact threshold: "recordings" or "noise"."""
-    from r2s.adaptation.wrench import WrenchObserver, contact_threshold
+    """Return the wrench observer, and what determines its contact thresholds: "recordings" or "noise"."""
+    from r2s.adaptation.wrench import WrenchObserver, contact_thresholds
     from r2s.adaptation.wrench_fusion import FusedWrench
 
     observer = WrenchObserver(robot, dynamics)
@@ -118,7 +119,7 @@ def wrench_observer(cfg, robot, dynamics, surface):
         observer = FusedWrench(robot, dynamics, surface.surface, surface.draws)
     free = free_recordings(cfg.calibration) if cfg.calibration else []
     if free:
-        observer.threshold = contact_threshold(robot, observer, free)
+        observer.thresholds = contact_thresholds(robot, observer, free)
     return observer, "recordings" if free else "noise"
 
 
