@@ -1,10 +1,9 @@
-"""Estimates of a working arm: residual and estimate are exact, intervals widen at rest, payload changes are found."""
+"""Estimates of a working arm are exact, intervals widen at rest, and payload changes are found."""
 
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pandas as pd
 import pytest
 from conftest import conf
 
@@ -12,23 +11,11 @@ from r2s.adaptation import tuning
 from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimator, nearest_body
 from r2s.adaptation.kalman import Filter, update
-from r2s.adaptation.model_correction import (
-    ModelCorrection,
-    apply_correction,
-    corrected_residuals,
-    fit_model_correction,
-)
+from r2s.adaptation.model_correction import apply_correction
 from r2s.adaptation.momentum import BODY, MOMENTUM_WORK, MomentumTerms, momentum
 from r2s.adaptation.momentum_residual import MomentumResidual
 from r2s.adaptation.noise_model import default_noise, fit_noise, momentum_residuals
-from r2s.adaptation.offline_estimation import (
-    UNKNOWN_PAUSE_S,
-    at_rate,
-    estimate_recording,
-    fit_correction,
-    pauses,
-    table,
-)
+from r2s.adaptation.offline_estimation import estimate_recording
 from r2s.adaptation.payload_jump import MEAN
 from r2s.adaptation.tuning import HUBER, SPAN
 from r2s.adaptation.wrench import wrench_noise
@@ -36,8 +23,7 @@ from r2s.errors import UserError
 from r2s.identification.link_inertia import pseudo_inertia
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.newton_euler import MASS, WORK, equations, links_of
-from r2s.physics.payload import dynamics_with_payload, mass_and_moment, payload_of, with_payload
+from r2s.physics.payload import dynamics_with_payload, payload_of
 from r2s.physics.rigid_body import LinkInertia
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.simulator import Simulator
@@ -118,36 +104,6 @@ def accurate():
     return arm, default._replace(**small, prior=prior)
 
 
-def test_momentum_is_mass_times_speed_and_linear_in_the_payload():
-    """Momentum p = M dq, C^T dq = dM/dt dq - C dq; the payload's columns are the difference to the loaded arm."""
-    r, rng = robot(), np.random.default_rng(0)
-    arm = make_arm_model(r, truth())._replace(armature=np.zeros(7))
-    alone = links_of(r, r.mass, r.com, r.inertia)
-    full = links_of(r, *with_payload(r, PAYLOAD, (r.mass, r.com, r.inertia)))
-    q, dq = r.q_home + 0.3 * rng.normal(size=7), rng.normal(size=7)
-
-    def of(links, q):
-        mass, bias = np.empty((7, 7)), np.empty(7)
-        equations(links, r.gravity, q, dq, mass, bias, np.empty((7, WORK)))
-        still = np.empty(7)
-        equations(links, r.gravity, q, 0 * dq, np.empty((7, 7)), still, np.empty((7, WORK)))
-        return mass, bias - still, still
-
-    without, loaded_arm = (terms_of(arm._replace(links=links), q, dq) for links in (alone, full))
-    mass, coriolis, still = of(full, q)
-    step = 1e-6
-    rate = (of(full, q + step * dq)[0] - of(full, q - step * dq)[0]) / (2 * step)
-    np.testing.assert_allclose(loaded_arm.p, mass @ dq, atol=1e-12)
-    np.testing.assert_allclose(
-        loaded_arm.coriolis, rate @ dq - coriolis, atol=1e-7
-    )  # error of the difference: step^2
-    np.testing.assert_allclose(without.uncompensated, 0.0, atol=1e-12)
-    np.testing.assert_allclose(without.compensated + loaded_arm.uncompensated, still, atol=1e-12)
-    np.testing.assert_allclose(without.p + without.payload_p @ standard(PAYLOAD), loaded_arm.p, atol=1e-12)
-    added, torque = without.payload_torque @ standard(PAYLOAD), loaded_arm.coriolis - loaded_arm.uncompensated
-    np.testing.assert_allclose(without.coriolis - without.uncompensated + added, torque, atol=1e-12)
-
-
 def test_the_estimate_from_data_of_known_truth_is_exact():
     """A time step of h s causes errors of h / 2 times each joint's torque rate; no estimate is off by correction."""
     arm, noise = accurate()
@@ -204,108 +160,6 @@ def test_a_payload_attached_at_rest_is_detected_as_soon_as_the_arm_moves(on):
     estimate_recording(robot(), estimator, recording(on=on, noise=2e-3))
     assert len(estimator.changes) == (on is not None)
     assert all(since < at < since + 0.2 for at in estimator.changes)
-
-
-def test_a_vibrating_gear_is_no_torque():
-    """A vibration of the speeds at 55 Hz, as of motors behind elastic gears, passes three means over T s.
-
-    Between two moments T apart a vibration of v rad/s changes the momentum by up to 2 M v, a torque of 2 M v / T. A
-    mean over T leaves sinc(f T) of a vibration at f; three leave pi f T sinc(f T)^3 = 0.0025. Friction adds its
-    slope, about 1 Nm s/rad, times v.
-    """
-    arm, data, v = make_arm_model(robot(), truth()), recording(), 0.03
-    swings = replace(data, dq=data.dq + v * np.sin(2 * np.pi * 55 * data.t)[:, None] * np.eye(7)[0])
-    plain, swung = (np.array([b.y[0] for b in momentum_residuals(arm, d)]) for d in (data, swings))
-    mass, bias = np.empty((7, 7)), np.empty(7)
-    own = links_of(robot(), robot().mass, robot().com, robot().inertia)
-    equations(own, np.zeros(3), robot().q_home, np.zeros(7), mass, bias, np.empty((7, WORK)))
-    left = np.pi * 55 * SPAN * SIM_DT * np.abs(np.sinc(55 * SPAN * SIM_DT)) ** 3
-    assert np.abs(swung - plain).max() < 2 * left * 2 * mass[0, 0] * v / (SPAN * SIM_DT) + 1.0 * v
-
-
-@cache
-def other(seed):
-    """Return the motion of an arm with other links, cables and load-dependent friction than its model."""
-    n = 7
-    found = replace(truth(), load=np.full(n, 0.01), drag=np.tile([0.1, -0.05], (n, 1)))
-    found = replace(found, mass=1.01 * found.mass, com=found.com + 1e-3)
-    rng = np.random.default_rng(seed)
-    sim, motors = Simulator(robot(), found, 1, 1), Motors(1, n, DELAY)
-    sim.reset(robot().q_home[None], np.zeros((1, n)))
-    spring, phase, rate = np.array([60, 120, 60, 60, 10, 10, 5.0]), rng.uniform(0, 6, n), rng.uniform(2, 5, n)
-    rows = []
-    for k in range(6000):
-        t = k * SIM_DT
-        goal = robot().q_home + 0.7 * np.sin(rate * t + phase) * min(1.0, t)
-        tau = spring * (goal - sim.q[0]) - 0.15 * spring * sim.dq[0]
-        rows.append((sim.q[0].copy(), sim.dq[0] + 1e-3 * rng.normal(size=n), tau))
-        sim.rollout(motors(tau[None, None]), record=())
-    q, dq, tau = (np.array(x) for x in zip(*rows, strict=True))
-    return Recording(t=SIM_DT * np.arange(len(q)), q=q, dq=dq, tau=tau, torque="commanded")
-
-
-def unexplained(arm, rows):
-    """Return (7,) Nm, root mean square of residuals beside a share of friction and a constant."""
-    out = []
-    for j in range(7):
-        own = np.array([[b.friction[j], 1.0, b.y[j]] for b in rows if b.sliding[j] > 0])
-        found = np.linalg.lstsq(own[:, :2], own[:, 2], rcond=None)[0]
-        out.append(np.sqrt(np.mean((own[:, 2] - own[:, :2] @ found) ** 2)))
-    return np.array(out)
-
-
-def test_motion_without_a_payload_corrects_the_model():
-    """It finds load-dependent friction, cables and other links: residuals of other motion shrink to a fraction.
-
-    With the true model only the error of the time step and the noise of the speeds remain.
-    """
-    arm = make_arm_model(robot(), truth())
-    found = replace(truth(), load=np.full(7, 0.01), drag=np.tile([0.1, -0.05], (7, 1)))
-    found = replace(found, mass=1.01 * found.mass, com=found.com + 1e-3)
-    correction = fit_model_correction(robot(), arm, momentum_residuals(arm, other(1)))
-    before, after = (
-        unexplained(arm, momentum_residuals(arm, other(2))),
-        unexplained(arm, momentum_residuals(apply_correction(arm, correction), other(2))),
-    )
-    floor = unexplained(arm, momentum_residuals(make_arm_model(robot(), found), other(2)))
-    assert ((after**2 - floor**2) < 0.25**2 * (before**2 - floor**2)).all()
-
-
-def test_motor_motion_gives_the_compliance_of_gears():
-    """Links behind springs of K Nm/rad follow their motors less tau / K; motors so far ahead give 1 / K.
-
-    The prior, of the size of 1 / K, shrinks the result by up to a quarter.
-    """
-    arm, data, K = make_arm_model(robot(), truth()), other(1), 1e4
-    late = round(DELAY / SIM_DT)
-    felt = np.concatenate([np.zeros((late, 7)), data.tau[:-late]])
-    felt = np.apply_along_axis(np.convolve, 0, felt, np.full(5, 0.2), "same")  # removes the noise of the commands
-    ahead = replace(data, q=data.q + felt / K, dq=data.dq + np.gradient(felt, SIM_DT, axis=0) / K)
-    found = [fit_model_correction(robot(), arm, momentum_residuals(arm, d)).compliance for d in (data, ahead)]
-    np.testing.assert_allclose((found[1] - found[0])[:4], 1 / K, rtol=0.25)  # the wrist's links are too light
-
-
-def test_corrected_residuals_are_those_of_the_corrected_arm():
-    """Corrections of means over 60 ms equal a run through all cycles, to a twentieth of the correction."""
-    arm, data = make_arm_model(robot(), truth()), other(1)
-    rows = momentum_residuals(arm, data)
-    correction = fit_model_correction(robot(), arm, rows)
-    correction = correction._replace(inertia=np.zeros((7, 7)), latency=np.zeros((7, 7)))
-    quick = corrected_residuals(robot(), arm, correction, rows)
-    exact = momentum_residuals(apply_correction(arm, correction), data)
-    sliding = np.array([b.sliding > 0 for b in rows])
-    for name in ("y", "friction"):
-        plain, means, cycles = (np.array([getattr(b, name) for b in x])[sliding] for x in (rows, quick, exact))
-        assert np.sqrt(np.mean((means - cycles) ** 2)) < 0.05 * np.sqrt(np.mean((plain - cycles) ** 2))
-    none = arm.links.copy()
-    none[4, MASS] = 0.0
-    for part in apply_correction(
-        arm._replace(links=none), fit_model_correction(robot(), arm._replace(links=none), rows)
-    ):
-        assert np.isfinite(part).all()
-    nothing = apply_correction(arm, ModelCorrection.none(7))
-    for one, two in zip(arm, nothing, strict=True):
-        np.testing.assert_allclose(one, two, atol=1e-15)
 
 
 @pytest.mark.parametrize(("times", "low", "high"), [(1.0, 1.0, 1.5), (3.0, 6.0, 12.0)])
@@ -374,17 +228,6 @@ def test_an_interval_is_wide_at_rest_and_narrow_in_motion():
     assert abs(resting.mass - 1.0) < resting.mass_half
 
 
-def test_a_declared_payload_changes_no_noise():
-    """The recordings of an identification come from an arm without a declared payload."""
-    free = recording(noise=2e-3)
-    plain, declared = (
-        fit_correction(robot(), replace(truth(), declared_payload=load), None, (free, free))
-        for load in (np.zeros(4), mass_and_moment(robot(), PAYLOAD))
-    )
-    for one, other in zip((*plain[0], *plain[1]), (*declared[0], *declared[1]), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_the_reported_payload_is_a_physical_body():
     """For any filter state, the pseudo-inertia of the report is not negative."""
     rng = np.random.default_rng(0)
@@ -400,92 +243,6 @@ def test_the_reported_payload_is_a_physical_body():
             assert np.linalg.eigvalsh(j).min() > -1e-9
     np.testing.assert_allclose(nearest_body(standard(PAYLOAD))[2], PAYLOAD.inertia, atol=1e-12)
     assert np.linalg.eigvalsh(pseudo_inertia(PAYLOAD.mass, PAYLOAD.centre, PAYLOAD.inertia)).min() > 0
-
-
-def test_the_same_data_give_the_same_estimate():
-    arm, noise = accurate()
-    first, second = (table(estimate_recording(robot(), Estimator(arm, noise), recording(on=0.0))) for _ in range(2))
-    assert first.equals(second)
-
-
-def test_an_unsuitable_recording_gets_one_line():
-    data = recording()
-    with pytest.raises(UserError, match="expected commanded, got measured"):
-        at_rate(robot(), replace(data, torque="measured"))
-    slow = Recording(t=data.t[::10], q=data.q[::10], dq=data.dq[::10], tau=data.tau[::10], torque="commanded")
-    with pytest.raises(UserError, match="expected at least 200 Hz, got 100 Hz"):
-        at_rate(robot(), slow)
-    with pytest.raises(UserError, match="expected 7 joints of panda, got 6"):
-        at_rate(
-            robot(), Recording(t=data.t, q=data.q[:, :6], dq=data.dq[:, :6], tau=data.tau[:, :6], torque="commanded")
-        )
-    arm, noise = accurate()
-    estimator = Estimator(arm, noise)
-    with pytest.raises(UserError, match=r"expected q, dq and tau of 7 joints, got \(6,\)"):
-        estimator(np.zeros(6), np.zeros(6), np.zeros(6))
-    assert not estimator(np.full(7, np.nan), np.zeros(7), np.zeros(7))
-
-
-@pytest.mark.slow
-def test_the_stage_estimates_from_a_recording(tmp_path, capsys):
-    """stage=estimate data=recording writes lines, estimate.csv, figures and a summary; mistakes get one line."""
-    from hydra import compose, initialize_config_dir
-
-    from r2s.stages.build import CONF
-    from r2s.stages.estimate import estimate
-
-    recording(on=1.0, off=2.0, noise=2e-3).save(tmp_path / "work.npz")
-    words = ["stage=estimate", "data=recording", f"data.path={tmp_path / 'work.npz'}", f"root={tmp_path}", "name=w"]
-
-    def config(*others):
-        with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-            return compose("config", [*words, *others])
-
-    with pytest.raises(UserError, match=r"data\.torque: expected commanded for stage=estimate, got measured"):
-        estimate(config("data.torque=measured"), [])
-    with pytest.raises(UserError, match=r"no file .*wrk.npz; did you mean 'work.npz'"):
-        estimate(config("data.torque=commanded", f"data.path={tmp_path / 'wrk.npz'}"), [])
-    assert not (tmp_path / "estimate").exists()
-    estimate(config("data.torque=commanded"), [])
-    folder = tmp_path / "estimate" / "w"
-    assert "kg" in capsys.readouterr().out
-    written = ("estimate.csv", "wrench.csv", "recording.rrd", "figures/payload.png", "figures/wrench.png")
-    assert all((folder / name).is_file() for name in written)
-    with pytest.raises(UserError, match=r"^robot\.tool: estimate\.surface needs the tip that touches"):
-        estimate(config("data.torque=commanded", f"estimate.surface={tmp_path}"), [])
-    rows = pd.read_csv(folder / "estimate.csv")
-    before = rows.iloc[round(1.9 / (SPAN * SIM_DT))]
-    # without calibration= no delay is known: 3 ms of it cause torque errors in every acceleration
-    assert abs(before["mass_kg"] - 1.0) < 2 * before["mass_kg_half"]
-
-
-@pytest.mark.slow
-def test_the_old_name_of_the_stage_gives_the_new_one():
-    from r2s.override_checks import check_overrides
-
-    with pytest.raises(UserError, match=r"^stage=watch is now stage=estimate$"):
-        check_overrides(["stage=watch"], None)
-
-
-def test_a_pause_widens_the_estimate_by_the_clock():
-    """Ten seconds without rows add the drift of ten seconds, a restarted clock that of a minute, and `t` has both."""
-    data, half = recording(noise=2e-3), round(1.5 / SIM_DT)
-    arm = make_arm_model(robot(), truth())
-    noise, trajectory = default_noise(arm), np.arange(len(data.t)) // half
-    offset, after = BODY + 7, {}
-    for pause in (0.0, 10.0, -1.5):  # s
-        cut = replace(data, t=data.t + pause * trajectory, trajectory=trajectory)
-        assert pauses(cut)[1] == pytest.approx(max(pause + SIM_DT, 0.0) or UNKNOWN_PAUSE_S)
-        estimator = Estimator(arm, noise)
-        estimates = estimate_recording(robot(), estimator, cut.select(cut.trajectory == 0))
-        before = estimator.internals[0].P.diagonal().copy()
-        estimator.begin(pauses(cut)[1])
-        after[pause] = estimator.internals[0].P.diagonal() - before
-        assert estimator.now.t == pytest.approx(estimates[-1].t + pauses(cut)[1], abs=2 * SPAN * SIM_DT)
-    for pause, seconds in ((10.0, 10.0 + SIM_DT), (-1.5, UNKNOWN_PAUSE_S)):
-        np.testing.assert_allclose(after[pause][offset : offset + 7], seconds * noise.offset_drift**2, rtol=1e-9)
-        np.testing.assert_allclose(after[pause][BODY:offset], seconds * noise.friction_drift**2, rtol=1e-9)
-    assert after[10.0][0] > 0.1 * noise.prior[0] ** 2  # the payload may have been changed unseen
 
 
 def test_what_counts_as_nothing_is_in_proportion_to_the_arm():

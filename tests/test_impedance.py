@@ -1,34 +1,24 @@
-"""Impedance and hybrid control: equilibrium, stiffness, damping, null space, passivity, and errors of the user."""
+"""Impedance control: equilibrium, stiffness, damping, null space, orientation, and errors of the user."""
 
 import copy
-import subprocess
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import conf
-from test_export import COMPILER, LAW_NM, LIBFRANKA, POLICY, compare, drawn, hostile, loaded
 
-from r2s import commands
 from r2s.arm.driver import Driver
 from r2s.arm.interface import ArmState
 from r2s.control.impedance import cartesian_impedance, joint_impedance
 from r2s.control.torque import torque
 from r2s.errors import UserError
-from r2s.export.bundle import law_source
-from r2s.export.contract import check_exportable
 from r2s.physics import impedance as law
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
-from r2s.physics.friction import BRISTLE, presliding
-from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.newton_euler import WORK, equations, links_of
 from r2s.physics.robot import load_robot
 from r2s.physics.surface import Tool
 from r2s.tasks.reach import ReachTask
-from r2s.tasks.track import TrackTask
-from r2s.tasks.wipe import WipeTask
 
 PANDA = load_robot(**conf("robot/panda"))
 N = PANDA.n
@@ -36,13 +26,6 @@ FRICTIONLESS = Dynamics.of(PANDA, np.zeros((N, 3)))
 REACH = ReachTask()
 DT = 1e-3  # s, cycle
 SUBSTEPS = 5  # of the simulation; semi-implicit Euler of 0.2 ms
-
-
-def random_model():
-    """Return dynamics with every error that the feedforward knows."""
-    rng, d = np.random.default_rng(5), nominal_dynamics(PANDA, **conf("friction/paper"))
-    errors = {"offset": rng.normal(size=N), "drag": rng.normal(size=(N, 2)), "com": d.com + 0.01}
-    return replace(d, mass=1.1 * d.mass, **errors)
 
 
 class Pose(ReachTask):
@@ -98,16 +81,6 @@ def target_at(control, place):
     """Return the command (c,) with this target (3,) m, and an action of zero."""
     rest = np.zeros(control.target_size - 3)
     return np.concatenate([control.action_offset, place, rest])
-
-
-def energy(control, K, error):
-    """Return the energy, J, of clipped springs with stiffness K; see `spring`."""
-    p = control.parameters
-    if control.name == "joint_impedance":
-        limit, s = p[law.HEAD :].reshape(-1, law.ROW)[:, law.JOINT_LIMIT], 0.5 * K * error**2
-    else:
-        limit, s = p[law.FORCE_LIMIT], 0.5 * (K[:3] * error**2).sum()
-    return np.where(s <= limit, s, 2 * np.sqrt(np.maximum(s * limit, 0)) - limit).sum()
 
 
 @pytest.mark.parametrize("turns", [0.0, 5.0])
@@ -185,227 +158,6 @@ def test_damping_is_the_geometric_mean_of_mass_and_stiffness():
     np.testing.assert_allclose(D, D.T, atol=1e-12)
 
 
-def test_joints_rest_where_the_command_says():
-    """With a wrong model of the compensation, the feedforward holds the arm: the law gives the model's torque."""
-    control = joint_impedance(PANDA, REACH, random_model())
-    q = PANDA.q_home + np.linspace(-0.3, 0.4, N)
-    tau = control.torque(q[None], np.zeros((1, N)), (q - PANDA.q_home)[None])[0]
-    np.testing.assert_allclose(
-        tau, InverseDynamics(PANDA, random_model())(q[None], *np.zeros((3, 1, N)))[0], atol=1e-9
-    )
-    np.testing.assert_allclose(tau, control.holding_torque(q), atol=1e-9)
-
-
-@pytest.mark.parametrize("speed", [0.32, -0.08, 0.02])
-def test_friction_of_the_reference_is_fed_forward(speed):
-    """At the speeds of its table the torque is the model's friction, or the breakaway torque of a joint at rest."""
-    model = replace(nominal_dynamics(PANDA, **conf("friction/paper")), offset=np.zeros(N))
-    q, dq = PANDA.q_home, np.full(N, speed)
-    command = np.concatenate([np.zeros(N), q, dq])
-    edges, friction = model.breakaway[:, int(speed > 0)], model.friction(dq)
-    farther = np.where(np.abs(edges) > np.abs(friction), edges, friction)
-    for rest, wanted in ((True, farther), (False, friction)):
-        control = joint_impedance(PANDA, TrackTask(pool=2), model)
-        memory, tau = np.zeros(control.memory_size), np.empty(N)
-        for k in range(60):  # the low-pass of the speed settles; a joint that moves is at q and dq in the last cycle
-            there = q if rest else q + (k - 59) * DT * dq
-            control.law(there, dq, command, control.parameters, memory, tau)
-        np.testing.assert_allclose(tau, wanted, rtol=1e-4)
-
-
-def bristle_model(**changes):
-    """Return dynamics whose friction has bristles, with nothing else that the feedforward knows."""
-    rows = np.tile([1.0, 0.1, 0.3, 0.2, 0.1, 6e-4, 0.0, 0.0], (N, 1)) * np.linspace(0.5, 1.5, N)[:, None]
-    rows[:, 5] = np.linspace(4e-4, 1e-3, N)
-    return replace(Dynamics.of(PANDA, rows, BRISTLE), **changes)
-
-
-def ahead(control, angles):
-    """Return the torque (m, n) Nm along angles (m, n) rad of a joint impedance that holds each of them at rest."""
-    memory, out = np.zeros(control.memory_size), np.empty(angles.shape)
-    for k, q in enumerate(angles):
-        control.law(q, np.zeros(N), q - PANDA.q_home, control.parameters, memory, out[k])
-    return out
-
-
-def test_bristles_are_fed_forward_as_they_deflect():
-    """Forth by 2 mrad and back by a part of the presliding distance: their friction is the family's, to a step."""
-    model = bristle_model()
-    control = joint_impedance(PANDA, REACH, model, action="target", displacement=3.0)
-    path = np.concatenate([np.linspace(0, 2e-3, 400), np.linspace(2e-3, 1.7e-3, 400), np.full(100, 1.7e-3)])
-    got = ahead(control, PANDA.q_home + path[:, None])[-1]
-    moves = np.gradient(path, DT)[:, None] * np.ones(N)
-    z = presliding(moves, DT, model.phi[:, 5])[-1]
-    level = np.abs(model.friction(law.FIRST_DQ * np.sign(z), np.sign(z)))
-    # a step of the law: STEP of the distance behind, and as much of the deflection that is left to go
-    assert (np.abs(got - level * z) <= 2.0 * law.STEP * level * (1.0 + np.abs(z))).all()
-    assert (np.abs(z) < 0.9).all()
-
-
-@pytest.mark.parametrize("distance", [1e-4, 3e-4, 1e-3])
-def test_noise_of_the_encoders_does_not_move_the_bristles(distance):
-    """While joints rest for ten seconds under a Panda's noise, they deflect at most by a step that a motion began."""
-    model = bristle_model()
-    model.phi[:, 5] = distance
-    control = joint_impedance(PANDA, REACH, model, action="target", displacement=3.0)
-    noise = np.random.default_rng(0).normal(size=(10_000, N))
-    rest = 2e-5 * np.round((2 * distance + 1.5e-5 * noise) / 2e-5)
-    moves = np.linspace(0, 2 * distance, 400)[:, None] * np.ones(N)
-    tau = ahead(control, PANDA.q_home + np.concatenate([moves, rest]))
-    step = 1.1 * max(law.STEP, law.ENCODER / distance)  # of the distance; what noise adds to it, a tenth
-    left = np.exp(step - 2)  # of the deflection when the motion ends, a step behind
-    np.testing.assert_allclose(tau[-1], tau[500], rtol=left * -np.expm1(-step) / (1 - left))
-
-
-def test_bristles_are_not_fed_forward_above_their_friction():
-    """At speed the falling friction of the measured speed counts, and load-dependent friction that of the posture."""
-    model, q = bristle_model(load=np.full(N, 0.05)), PANDA.q_home + np.linspace(-0.3, 0.4, N)
-    control = joint_impedance(PANDA, REACH, model, action="target", displacement=3.0)
-    for speed in (0.02, 0.08, 0.32, -0.32):
-        dq = np.full(N, speed)
-        got = ahead(control, q + DT * np.arange(-300, 1)[:, None] * dq)[-1]
-        level = InverseDynamics(PANDA, model).load_friction(q[None])[0]
-        wanted = model.friction(dq, np.sign(dq)) + np.sign(dq) * level
-        slow = model.friction(law.FIRST_DQ * np.sign(dq), np.sign(dq)) + np.sign(dq) * level
-        assert (np.abs(got) <= np.abs(wanted) * (1 + 1e-6)).all()
-        np.testing.assert_allclose(np.abs(got), np.minimum(np.abs(wanted), np.abs(slow)), rtol=0.01)
-
-
-def hostile_stiffness(control, rng, cycles):
-    """Return stiffnesses (cycles, s) between their bounds that jump in every fifth cycle."""
-    low, high = control.action_offset - control.action_scale, control.action_offset + control.action_scale
-    rows = np.where(rng.random((cycles // 5, len(low))) < 0.5, low, high)
-    return np.repeat(rows, 5, axis=0)
-
-
-@pytest.mark.parametrize("kind", ["cartesian", "joint"])
-def test_the_tank_pays_for_what_stiffness_adds(kind):
-    """Over random postures at rest, where damping refills nothing: net energy out of the tank is at most its fill.
-
-    1e-9 J: sums of thousands of terms of 10 J, each to 1e-16.
-    """
-    rng, fill = np.random.default_rng(1), 1.5
-    if kind == "joint":
-        control = joint_impedance(PANDA, TrackTask(pool=2), FRICTIONLESS, action="stiffness", tank=[fill, fill])
-    else:
-        control = cartesian_impedance(PANDA, REACH, FRICTIONLESS, action="stiffness", tank=[fill, fill])
-    memory, out, s = np.zeros(control.memory_size), np.empty(N), N if kind == "joint" else law.SPRINGS
-    net, worst, before, asked = 0.0, -np.inf, None, 0.0
-    for K in hostile_stiffness(control, rng, 4000):
-        q, target = PANDA.q_home + rng.uniform(-0.4, 0.4, N), np.array([0.4, 0.1, 0.5])
-        command = np.concatenate([K, PANDA.q_home, np.zeros(N)] if kind == "joint" else [K, target])
-        control.law(q, np.zeros(N), command, control.parameters, memory, out)
-        error = PANDA.q_home - q if kind == "joint" else target - place_of(control, q)[0]
-        K_now = memory[law.STIFFNESS : law.STIFFNESS + s].copy()
-        if before is not None:
-            change = energy(control, K_now, error) - energy(control, before, error)
-            net, asked = net + change, asked + max(energy(control, K, error) - energy(control, before, error), 0.0)
-        before, worst = K_now, max(worst, net)
-        assert 0.0 <= memory[law.LEVEL] <= fill
-    assert worst <= fill + 1e-9
-    assert asked > 10 * fill  # what was asked for would have been much more
-
-
-@pytest.mark.parametrize(("fill", "grows"), [(0.5, False), (1e3, True)])
-def test_hostile_switching_cannot_pump_energy(fill, grows):
-    """Stiff while the joints approach their targets, soft while they leave: energy and tank together never rise.
-
-    With an endless tank the same switching makes the arm's own energy grow. Damping is a hundredth of critical. A
-    torque that is held for 1 ms adds up to K dq^2 dt / 2 per s and joint: 5 % of the energy at 60 Nm/rad and 1 rad/s.
-    """
-    control = joint_impedance(
-        PANDA, TrackTask(pool=2), FRICTIONLESS, action="stiffness", damping=0.01, tank=[fill, fill], softest=0.3
-    )
-    low, high = control.action_offset - control.action_scale, control.action_offset + control.action_scale
-    goal, last = PANDA.q_home, [PANDA.q_home]
-
-    def switch(k, q, memory):
-        nearer = np.abs(goal - q) < np.abs(goal - last[0])
-        last[0] = q
-        return np.concatenate([np.where(nearer, high, low), goal, np.zeros(N)])
-
-    own, tank = [], []
-    for q, dq, memory, mass in simulate(control, switch, goal + np.array([0, 0.2, 0, 0.2, 0, 0.2, 0]), 1500):
-        own.append(0.5 * dq @ mass @ dq + energy(control, memory[law.STIFFNESS : law.STIFFNESS + N], goal - q))
-        tank.append(memory[law.LEVEL])
-    total = np.array(own) + tank
-    assert min(tank) >= 0.0
-    if grows:
-        assert max(own) > 2 * own[0]
-    else:
-        assert total.max() <= 1.05 * total[0]
-        assert max(own) <= own[0] + fill + 0.05 * total[0]
-
-
-def test_an_empty_tank_lets_the_stiffness_fall_but_not_rise():
-    control = cartesian_impedance(PANDA, REACH, FRICTIONLESS, action="stiffness", tank=[0.0, 1.0])
-    K_low, K_high = (control.action_offset + side * control.action_scale for side in (-1, 1))
-    memory, out, start = np.zeros(control.memory_size), np.empty(N), place_of(control, PANDA.q_home)[0]
-    seen = []
-    for K, off in ((K_high, 0.02), (K_low, 0.02), (K_high, 0.02), (K_high, 0.0)):
-        memory[law.LEVEL] = 0.0
-        command = np.concatenate([K, start + np.array([off, 0, 0])])
-        control.law(PANDA.q_home, np.zeros(N), command, control.parameters, memory, out)
-        seen.append(memory[law.STIFFNESS])
-    np.testing.assert_allclose(seen, [K_high[0], K_low[0], K_low[0], K_high[0]])  # without error a rise is free
-
-
-def wall(stiffness, height):
-    """Return the force (3,) N of an elastic floor."""
-    return lambda place: np.array([0.0, 0.0, stiffness * max(height - place[2], 0.0)])
-
-
-@pytest.mark.parametrize("measured", [False, True])
-def test_hybrid_control_pushes_with_its_force(measured):
-    """On an elastic floor the force is the reference, and across it the tip moves to its target.
-
-    With a measured force the integral removes a load of 2 N that the model does not know; without one it stays.
-    """
-    control = cartesian_impedance(
-        PANDA, REACH, FRICTIONLESS, hybrid=True, normal=[0, 0, 2], force=8.0, integral_rate=5.0
-    )
-    start = place_of(control, PANDA.q_home)[0]
-    floor, goal = wall(5e3, start[2] + 0.001), start + np.array([0.03, 0.0, 0.2])
-    command = control.command(np.zeros((1, 3)), REACH, np.zeros(1), goal[None])
-    load = np.array([0.0, 0.0, -2.0])
-
-    def now(k, q, memory):
-        force = floor(place_of(control, q)[0])[2]
-        return control.with_force(command, np.array([force]))[0] if measured else command[0]
-
-    q = settled(control, now, PANDA.q_home, 2500, lambda place: floor(place) + load)
-    place = place_of(control, q)[0]
-    assert floor(place)[2] == pytest.approx(8.0 if measured else 10.0, abs=0.05)
-    np.testing.assert_allclose(place[:2], goal[:2], atol=5e-4)
-
-
-def test_the_integral_does_not_wind_up():
-    """A force that never arrives fills the integral to its clamp; the force stays below force_clip."""
-    control = cartesian_impedance(
-        PANDA, REACH, FRICTIONLESS, hybrid=True, normal=[0, 0, 1], force=25.0, force_clip=26.0
-    )
-    start, jacobian = place_of(control, PANDA.q_home)
-    command = control.command(np.zeros((1, 3)), REACH, np.zeros(1), start[None])
-    memory, out = np.zeros(control.memory_size), np.empty(N)
-    for _ in range(5000):
-        control.law(
-            PANDA.q_home, np.zeros(N), control.with_force(command, np.zeros(1))[0], control.parameters, memory, out
-        )
-    np.testing.assert_allclose(out, jacobian[:3].T @ [0, 0, -26.0], atol=1e-9)
-    assert memory[law.INTEGRAL] <= 1.0 + 25.0 * 5.0 * DT  # it stops where the force saturates
-
-
-def test_a_displacement_against_the_normal_adds_force():
-    control = cartesian_impedance(
-        PANDA, REACH, FRICTIONLESS, hybrid=True, normal=[0, 0, 1], force=5.0, displacement=0.02
-    )
-    start, jacobian = place_of(control, PANDA.q_home)
-    command = control.command(np.array([[0, 0, -0.5]]), REACH, np.zeros(1), start[None])
-    tau = control.torque(PANDA.q_home[None], np.zeros((1, N)), command)[0]
-    force = 5.0 + 0.01 * control.parameters[law.K_DEFAULT]
-    np.testing.assert_allclose(tau, jacobian[:3].T @ [0, 0, -force], atol=1e-9)
-
-
 def test_the_controlled_point_is_the_tip_of_the_tool():
     robot = copy.copy(PANDA)
     object.__setattr__(robot, "tool", Tool(np.array([0.01, 0.02, 0.1]), 0.01))
@@ -453,133 +205,6 @@ def test_the_safety_filter_is_the_same_behind_it():
         control.law(q, dq, target_at(control, np.array([0.3, 0.5, 0.3])), control.parameters, memory, tau)
         sent = own(state, target_at(control, np.array([0.3, 0.5, 0.3])))
         np.testing.assert_array_equal(sent, plain(state, tau))
-
-
-CONTROLS = {
-    "cartesian": lambda model: cartesian_impedance(PANDA, REACH, model),
-    "pose": lambda model: cartesian_impedance(PANDA, Pose(), model, action="both", rotational_stiffness=5.0),
-    "hybrid": lambda model: cartesian_impedance(
-        PANDA, Pose(), model, action="both", hybrid=True, normal=[0, 0, 1], force=5.0
-    ),
-    "sliding": lambda model: cartesian_impedance(PANDA, WipeTask(), model, hybrid=True, integral_rate=8.0),
-    "joint": lambda model: joint_impedance(PANDA, REACH, model, action="both"),
-    "joint path": lambda model: joint_impedance(PANDA, TrackTask(pool=2), model, action="stiffness"),
-    "bristles": lambda model: cartesian_impedance(PANDA, WipeTask(), bristle_model(mass=model.mass), hybrid=True),
-}
-
-
-def stream(control, cycles=1000):
-    """Return q, dq, command (cycles, ...), new commands each 20 cycles, and where motions begin."""
-    rng, rows = np.random.default_rng(3), cycles // 20
-    action = control.action_offset + control.action_scale * rng.uniform(-1.2, 1.2, (rows, control.action_dim))
-    given = rng.normal(0, 0.4, (rows, control.setpoint_size))
-    if control.hybrid:
-        contact = slice(control.target_size, control.target_size + 6)
-        given[:, contact] = [0.0, 0.6, 0.8, 5.0, 3.0, 1.0] + np.array([0, 0, 0, 1, 3, 0]) * rng.normal(size=(rows, 1))
-    command = np.repeat(np.concatenate([action, given], axis=1), 20, axis=0)
-    q = PANDA.q_home + rng.uniform(-0.1, 0.1, (cycles, N)) + np.repeat(rng.uniform(-0.5, 0.5, (rows, N)), 20, axis=0)
-    return q, 0.3 * rng.normal(size=(cycles, N)), command, np.arange(cycles) % 400 == 0
-
-
-def by_law(run, control, motion):
-    """Return torque and level of the tank (cycles, n + 1) of a law over a stream."""
-    memory, rows = np.zeros(control.memory_size), np.empty((len(motion[0]), N + 1))
-    for k, (q, dq, command, begin) in enumerate(zip(*motion, strict=True)):
-        memory[:] = 0.0 if begin else memory
-        run(q, dq, command, control.parameters, memory, rows[k, :N])
-        rows[k, N] = memory[law.LEVEL]
-    return rows
-
-
-MAIN = """
-}} }}
-int main() {{
-  double x[2 * contract::n + {c} + 1], memory[{k}] = {{}}, out[contract::n];
-  while (std::fread(x, sizeof *x, 2 * contract::n + {c} + 1, stdin) == 2 * contract::n + {c} + 1) {{
-    if (x[2 * contract::n + {c}] > 0) for (double& m : memory) m = 0.0;
-    contract::control_law(x, x + contract::n, x + 2 * contract::n, memory, out);
-    std::fwrite(out, sizeof *out, contract::n, stdout);
-    std::fwrite(memory + {level}, sizeof *out, 1, stdout);
-  }}
-}}
-"""
-
-
-@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
-@pytest.mark.parametrize("name", CONTROLS)
-def test_the_law_in_cpp_is_that_of_python(name, tmp_path):
-    """Torque and tank over a random stream, to round-off."""
-    control = CONTROLS[name](random_model())
-    motion = stream(control)
-    parameters = ", ".join(repr(float(x)) for x in control.parameters)
-    head = f"#include <cmath>\n#include <cstdio>\nnamespace contract {{\nconstexpr int n = {N};\n"
-    head += f"constexpr double parameters[] = {{{parameters}}};\ninline void control_law("
-    head += "const double* q, const double* dq, const double* command, double* memory, double* out) {\n"
-    end = MAIN.format(c=control.command_size, k=control.memory_size, level=law.LEVEL)
-    (tmp_path / "check.cpp").write_text(head + control.cpp + end)
-    words = [
-        str(COMPILER),
-        "-std=c++17",
-        "-O1",
-        "-Wall",
-        "-Wextra",
-        "-Wpedantic",
-        "-Werror",
-        "check.cpp",
-        "-o",
-        "check",
-    ]
-    subprocess.run(words, cwd=tmp_path, check=True)
-    rows = np.ascontiguousarray(np.column_stack(motion), dtype=float)
-    done = subprocess.run([tmp_path / "check"], input=rows.tobytes(), capture_output=True, check=True)
-    got, wanted = np.frombuffer(done.stdout).reshape(len(rows), -1), by_law(control.law, control, motion)
-    assert np.ptp(wanted[:, N]) > 0.1 or control.action == "target"
-    assert np.abs(got - wanted).max() < LAW_NM
-
-
-@pytest.mark.parametrize("name", CONTROLS)
-def test_the_law_of_a_bundle_is_that_of_r2s(name):
-    """Its source needs NumPy alone."""
-    control = CONTROLS[name](random_model())
-    motion, names = stream(control, 60), {"np": np}
-    call, source = law_source(control.law)
-    exec(source, names)
-    assert np.abs(by_law(eval(call, names), control, motion) - by_law(control.law, control, motion)).max() < LAW_NM
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    """The bundle of a policy that sets target and stiffness of reaching."""
-    run = tmp_path_factory.mktemp("runs") / "train" / "impedance"
-    made = drawn(run, "control=cartesian_impedance", "control.action=both")
-    commands.run_command(["export", str(run)])
-    return made
-
-
-def test_a_bundle_does_what_r2s_does(exported):
-    assert compare(exported, loaded(exported.folder), hostile(exported.robot, exported.task, 300)) < POLICY
-
-
-@pytest.mark.slow
-def test_it_does_so_for_ten_thousand_cycles(exported):
-    assert compare(exported, loaded(exported.folder), hostile(exported.robot, exported.task, 10_000)) < POLICY
-
-
-@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
-def test_the_header_of_a_bundle_compiles(exported, tmp_path):
-    (tmp_path / "check.cpp").write_text(
-        '#include "law.hpp"\nstatic_assert(contract::setpoints == 3);\nint main() { law::Driver driver; }\n'
-    )
-    words = [str(COMPILER), "-std=c++17", "-fsyntax-only", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
-    subprocess.run([*words, "-I", str(LIBFRANKA), "-I", str(exported.folder), "check.cpp"], cwd=tmp_path, check=True)
-
-
-def test_hybrid_control_is_not_exported():
-    task = REACH.controlled_by(
-        cartesian_impedance(PANDA, REACH, FRICTIONLESS, hybrid=True, normal=[0, 0, 1], force=5.0)
-    )
-    with pytest.raises(UserError, match="export: control=hybrid takes setpoints"):
-        check_exportable(PANDA, task)
 
 
 @pytest.mark.parametrize(
