@@ -15,6 +15,7 @@ from r2s.adaptation.wrench_state import (
     SURPRISE,
     SURPRISED,
     TOUCHES,
+    USUAL,
 )
 from r2s.compiled import njit
 from r2s.physics.robot import SIM_DT
@@ -26,22 +27,24 @@ def detect(thresholds, floor, state):
 
     Two tests of the hypothesis that no force acts, each with its own threshold: of the force, and of an impact. An
     impact raises the filter's variances, which would hide the impact from the first test. The second test keeps the
-    covariance from before the innovations exceeded their variances, but not for longer than an impact lasts. It
-    low-passes the force, whose sign a vibration of the gears changes.
+    covariance from before a sudden rise of the innovations, for at most IMPACT cycles, and low-passes the force,
+    because vibrating gears make the estimated force oscillate.
     """
     x, P, contact, calm, smooth = state.x, state.P, state.contact, state.calm, state.smooth
     n = state.joints.shape[1]
     moves = n - state.joints[REST].sum() >= 1
-    contact[SURPRISED] = contact[SURPRISED] + 1.0 if contact[SURPRISE] > 1.0 else 0.0
+    sudden = moves and contact[SURPRISE] > max(1.0, tuning.SUDDEN * contact[USUAL])
+    contact[SURPRISED] = contact[SURPRISED] + 1.0 if sudden else 0.0
+    contact[USUAL] += SIM_DT * tuning.USUAL_RATE * (contact[SURPRISE] - contact[USUAL])
     if contact[SURPRISED] == 0.0 or contact[SURPRISED] > tuning.IMPACT:
         calm[:] = P[:3, :3]
     for c in range(3):
-        smooth[c] += SIM_DT * tuning.IMPACT_RATE * (x[c] - smooth[c])
+        smooth[c] = smooth[c] + SIM_DT * tuning.IMPACT_RATE * (x[c] - smooth[c]) if moves else x[c]
     contact[SQUARE] = _square(P, floor, x) if moves else 0.0
     contact[IMPACT_SQUARE] = _square(calm, floor, smooth) if moves else 0.0
     contact[ABOVE] = contact[ABOVE] + 1.0 if contact[SQUARE] > thresholds[0] else 0.0
     contact[IMPACT_ABOVE] = contact[IMPACT_ABOVE] + 1.0 if contact[IMPACT_SQUARE] > thresholds[1] else 0.0
-    if moves:
+    if moves and not sudden:
         contact[BELOW] = contact[BELOW] + 1.0 if contact[SQUARE] < tuning.RELEASE * thresholds[0] else 0.0
     if max(contact[ABOVE], contact[IMPACT_ABOVE]) >= tuning.CONFIRMED:
         contact[TOUCHES], contact[BELOW] = 1.0, 0.0

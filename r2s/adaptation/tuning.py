@@ -112,8 +112,9 @@ FREE_FORCE = 0.1  # N, standard deviation of the force at the beginning of a mot
 FORCE_FLOOR = 0.25 / 3.0
 CONFIRMED, RELEASED = 15, 50  # cycles above, below the thresholds after which a contact begins, ends
 RELEASE = 0.25  # threshold of release, share of the contact threshold
-# cycles: an impact on the stiffest surfaces of development twins is over by then; 1/s, low-pass of the force
+# cycles for which the impact test keeps a covariance, longer than stiff impacts; 1/s, low-pass of the force
 IMPACT, IMPACT_RATE = 30, 100.0
+SUDDEN, USUAL_RATE = 2.0, 1.0  # times the usual innovations: more begins an impact; 1/s, low-pass of the usual ones
 BLOCK_S, TAIL = 0.5, 0.2  # s per maximum; share of the largest maxima from which the tail is fitted
 ALARMS_PER_HOUR = 1.0
 # m, path of the tip after which a force that points down is a weight; share of the force that may be horizontal; path

@@ -7,7 +7,7 @@
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
 tool (wrench_filter.py). A contact begins when the squared force, in units of its covariance, exceeds a threshold for
 15 ms while a joint moves, in a chi-square test of the hypothesis that no force acts. A second test detects impacts
-(contact_detection.py). The thresholds of both tests aim at one false alarm per hour together. The least threshold,
+(contact_detection.py). Together, both tests aim at one false alarm per hour of similar motion. The least threshold,
 GAUSSIAN, assumes independent normal errors in each cycle. For larger errors, `contact_thresholds` computes the
 thresholds from recordings without contact: the largest squared force of each half second has an exponential tail
 (extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997,
@@ -33,8 +33,8 @@ from r2s.physics.payload import ee_pose
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
-ALARMS_PER_HOUR = tuning.ALARMS_PER_HOUR / 2  # of each test
-GAUSSIAN = float(chi2.isf(ALARMS_PER_HOUR * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
+ALARMS_PER_TEST = tuning.ALARMS_PER_HOUR / 2  # an hour
+GAUSSIAN = float(chi2.isf(ALARMS_PER_TEST * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
 SQUARES = ["square", "impact_square"]  # columns of the tests
 BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; fewest blocks for a threshold
 
@@ -58,8 +58,8 @@ class WrenchObserver:
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
         self._noise = wrench_noise(robot, dynamics)
-        uncalibrated = np.array([tuning.UNCALIBRATED * GAUSSIAN, np.inf])
-        self.thresholds = uncalibrated if thresholds is None else thresholds
+        uncalibrated = (tuning.UNCALIBRATED * GAUSSIAN, np.inf)
+        self.thresholds = np.array(uncalibrated if thresholds is None else thresholds, dtype=float)
         self._q, self._dq, self._tau = np.zeros((3, robot.n))
         self.begin()
         zero = np.zeros(robot.n)
@@ -237,8 +237,8 @@ def contact_thresholds(robot: Robot, observer: WrenchObserver, free: Sequence[Re
 
 
 def _exceeded_hourly(maxima: np.ndarray) -> float:
-    """Return the squared force that maxima of blocks (N,) exceed ALARMS_PER_HOUR times an hour, from their tail."""
+    """Return the squared force that maxima of blocks (N,) exceed ALARMS_PER_TEST times an hour, from their tail."""
     level = np.quantile(maxima, 1.0 - tuning.TAIL)
     excess = np.mean(maxima[maxima >= level] - level)
     blocks_per_hour = 3600.0 / tuning.BLOCK_S
-    return float(level + excess * np.log(tuning.TAIL * blocks_per_hour / ALARMS_PER_HOUR))
+    return float(level + excess * np.log(tuning.TAIL * blocks_per_hour / ALARMS_PER_TEST))

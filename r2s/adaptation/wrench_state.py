@@ -13,8 +13,8 @@ COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
 # indices of `WrenchState.contact`: low-passed mean of the joints' squared innovations, in variances; squared force in
 # variances, 0 if no joint moves; 1 in contact; cycles of the squared force above the contact threshold, below the
 # release threshold; path of the tip, m, along which the force pointed down; squared force of the impact test, cycles
-# above its threshold; cycles in which the innovations exceeded their variances
-SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, SURPRISED, ENTRIES = range(10)
+# above its threshold; SURPRISE over the last second; cycles since a sudden rise of SURPRISE above it
+SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, USUAL, SURPRISED, ENTRIES = range(11)
 # rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; slow cycles; angle where it came to rest,
 # motion since, creep of this cycle, rad; friction model now, a cycle ago, Nm; known torque without motor or friction,
 # its mean in the last cycle with both, motor torque, its mean in the coming cycle, Nm; variance of the measured
