@@ -81,6 +81,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 ROBOT = load_robot(**conf("robot/panda"))
 OLD = nominal_dynamics(ROBOT, **conf("friction/gaz2019"))
 NEW = nominal_dynamics(ROBOT, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+NOMINAL = "friction=gaz2019", "inertia=nominal"  # arguments of run.py: published model of the Panda
 JUDGING = {"rigid": range(100, 110), "elastic": range(200, 210)}  # twin seeds that nothing is tuned on
 VARIANT_SEED = {"rigid": 1, "elastic": 2}  # first number of the random seeds of a variant's payloads
 SENSOR_NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}  # rad, rad/s: standard deviations
@@ -158,6 +159,11 @@ def identify_twins(twins: Iterable[tuple[str, int, Path]], root: Path) -> None:
         for v, s, folder in twins
         if not (folder / "posterior.npz").is_file()
     )
+
+
+def cells(table, values: dict[str, float]) -> dict[str, str]:
+    """Return {column: cell} of the measures `values` in the order of a task's `table` of measures."""
+    return {table[key].column.replace("\n", " "): table[key].cell(values[key]) for key in table.rows}
 
 
 def markdown(table: pd.DataFrame) -> str:

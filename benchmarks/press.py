@@ -13,7 +13,7 @@ import re
 import sys
 from pathlib import Path
 
-from common import ROOT, identify_twins, markdown_rows, run_parallel, write_page
+from common import NOMINAL, ROOT, cells, identify_twins, markdown_rows, run_parallel, write_page
 
 from r2s.tasks.press_measures import PRESS
 from r2s.tasks.wipe_measures import WIPE
@@ -25,14 +25,12 @@ FORCES = {
     "press": "Pressing: forces of 5 to 20 N with one step",
     "wipe": "Wiping: paths at 0.05 to 0.2 m/s under 5 to 20 N",
 }
-NOMINAL = "friction=gaz2019", "inertia=nominal"
 Twin = tuple[str, str]  # variant and seed
 
 
 def rows_of(task: str, folder: Path, row: str) -> dict[str, str]:
     """Return the cells of one row of a run's summary.json."""
-    values, table = json.loads((folder / "summary.json").read_text())[row], TABLES[task]
-    return {table[key].column.replace("\n", " "): table[key].cell(values[key]) for key in table.rows}
+    return cells(TABLES[task], json.loads((folder / "summary.json").read_text())[row])
 
 
 def models_of(task: str, twins: list[Twin], minutes: str | None) -> dict[str, dict[Twin, str]]:

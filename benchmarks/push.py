@@ -13,28 +13,33 @@ import re
 import sys
 
 import numpy as np
-from common import RESULTS, ROOT, identify_twins, markdown_rows, put_section, run_parallel, stamp, write_page
+from common import (
+    NOMINAL,
+    RESULTS,
+    ROOT,
+    cells,
+    identify_twins,
+    markdown_rows,
+    put_section,
+    run_parallel,
+    stamp,
+    write_page,
+)
 
 from r2s.tasks.push_measures import PUSH
 
 RUNS = ROOT / "runs" / "push"
 EPISODES = 8
-NOMINAL = "friction=gaz2019", "inertia=nominal"
 TWINS = "The reference on twins"
 SEEDS = range(190, 195)  # nothing was chosen on them
 MINUTES = 10
 POLICY = ("task=push", "algo=tqc", "algo.gamma=0.98", f"budget.minutes={MINUTES}")
 
 
-def cells(values: dict[str, float]) -> dict[str, str]:
-    """Return the cells of measures."""
-    return {PUSH[key].column.replace("\n", " "): PUSH[key].cell(values[key]) for key in PUSH.rows}
-
-
 def trained(name: str) -> dict[str, str] | None:
     """Return the cells of the last policy of a run, None if it has not finished."""
     path = RUNS / "train" / name / "summary.json"
-    return cells(json.loads(path.read_text())["last"]) if path.is_file() else None
+    return cells(PUSH, json.loads(path.read_text())["last"]) if path.is_file() else None
 
 
 def on_twins(twins: list[tuple[str, str]]) -> list[str]:
@@ -62,7 +67,7 @@ def on_twins(twins: list[tuple[str, str]]) -> list[str]:
             success = [100 * values["success"] for values in each]
             rows[f"{variant}, {model} model"] = (
                 {"twins": str(len(own))}
-                | cells(mean)
+                | cells(PUSH, mean)
                 | {"success by twin, %": f"{min(success):.0f} to {max(success):.0f}"}
             )
     what = f"`algo=pusher` with each model on the twin with its box; {EPISODES} goals on each; means over the twins."
@@ -81,7 +86,7 @@ def main() -> None:
         return
     if words not in ([], ["page"]):
         raise SystemExit(__doc__)
-    if not sys.argv[1:]:
+    if not words:
         jobs = [["task=push", "algo=pusher", f"root={RUNS}", "name=reference"]]
         jobs += [[*POLICY, f"seed={seed}", f"root={RUNS}", f"name=seed_{seed}"] for seed in SEEDS]
         run_parallel(jobs)

@@ -15,6 +15,7 @@ has been below 3 mrad/s for 30 ms. inside: share of force components within thei
 
 import argparse
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -133,11 +134,14 @@ def main() -> None:
     options = parser.parse_args()
     if options.arms and not Path(options.arms).is_dir():
         parser.error(f"--arms: no folder {options.arms}; --arms '' leaves the independent arms out")
+    words = [word for word in options.twins.split(",") if word]
+    if wrong := [word for word in words if not re.fullmatch(r"(rigid|elastic)_\d+", word)]:
+        parser.error(f"--twins: '{wrong[0]}' is no twin; rigid_SEED and elastic_SEED are allowed")
+    twins = [(v, int(s)) for v, _, s in (word.partition("_") for word in words)]
     rows = {}
     for name in ARMS if options.arms else ():
         rows[name] = arm((Path(options.arms) / name).resolve())
         print(name, rows[name], flush=True)
-    twins = [(v, int(s)) for v, s in (word.split("_") for word in options.twins.split(",") if word)]
     identify_twins([(v, s, twin_run(v, s)) for v, s in twins], ROOT / "runs")
     for variant, seed in twins:
         judged = " (judging)" if seed in JUDGING[variant] else ""
