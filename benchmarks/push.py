@@ -1,11 +1,12 @@
 """task=push: five trainings with demonstrations, and the reference that demonstrates, also on hidden twins.
 
-    python benchmarks/push.py [page | rigid_100 elastic_200 ...]
+    python benchmarks/push.py [page | [minutes=10] rigid_100 elastic_200 ...]
 
 Trains what is missing, each on one core, and writes benchmarks/results/push.md; `page` trains nothing. The goals of
 reports, boxes and arms selected nothing. With twins, identifies each and runs the reference on the twin with its box,
-with the nominal and with the identified model, EPISODES goals each, and replaces the page's section on twins. A twin
-takes about 6 minutes of one core. Run folders: runs/push.
+with the nominal and with the identified model, EPISODES goals each, and replaces the page's section on twins. With
+minutes, trains a policy on each identified model too, with the twin's seed, and replaces the section on policies
+instead. A twin takes about 6 minutes of one core, and minutes= once more. Run folders: runs/push.
 """
 
 import json
@@ -30,10 +31,12 @@ from r2s.tasks.push_measures import PUSH
 
 RUNS = ROOT / "runs" / "push"
 EPISODES = 8
-TWINS = "The reference on twins"
+TWINS, POLICIES = "The reference on twins", "Policies on twins"
 SEEDS = range(190, 195)  # nothing was chosen on them
 MINUTES = 10
-POLICY = ("task=push", "algo=tqc", "algo.gamma=0.98", f"budget.minutes={MINUTES}")
+ALGO = "algo=tqc", "algo.gamma=0.98"
+POLICY = ("task=push", *ALGO, f"budget.minutes={MINUTES}")
+TWIN = re.compile(r"(rigid|elastic)_\d+")
 
 
 def trained(name: str) -> dict[str, str] | None:
@@ -42,37 +45,53 @@ def trained(name: str) -> dict[str, str] | None:
     return cells(PUSH, json.loads(path.read_text())["last"]) if path.is_file() else None
 
 
-def on_twins(twins: list[tuple[str, str]]) -> list[str]:
-    """Run the reference on twins (variant, seed) with both models; return the parts of their section."""
+def trained_for(twins: list[tuple[str, str]], minutes: str | None) -> dict[str, str]:
+    """Train or evaluate what is missing in simulation; return {label: name of a run with places for the twin}."""
+    common, of_twins = ("task=push", f"root={RUNS}"), f"evaluation.episodes={EPISODES}"
+    jobs = [[*common, of_twins, "algo=pusher", *NOMINAL, "name=nominal"]]
+    names = {"nominal model": "nominal", "identified model": "identified_{}_{}"}
+    if minutes:
+        names["policy, identified model"] = "policy_{}_{}"
+    for v, s in twins:
+        own = [*common, f"calibration={RUNS / 'identify' / f'{v}_{s}'}"]
+        jobs.append([*own, of_twins, "algo=pusher", f"name=identified_{v}_{s}"])
+        if minutes:
+            jobs.append([*own, *ALGO, f"budget.minutes={minutes}", f"seed={s}", f"name=policy_{v}_{s}"])
+    run_parallel(jobs)
+    return names
+
+
+def on_twins(words: list[str], minutes: str | None) -> list[str]:
+    """Run the models on twins (variant_seed); return the parts of their section."""
+    twins = [(v, s) for v, _, s in (w.partition("_") for w in words)]
     identify_twins([(v, int(s), RUNS / "identify" / f"{v}_{s}") for v, s in twins], RUNS)
-    common = "task=push", "algo=pusher", f"evaluation.episodes={EPISODES}", f"root={RUNS}"
-    identified = [(f"calibration={RUNS / 'identify' / f'{v}_{s}'}", f"name=identified_{v}_{s}") for v, s in twins]
-    run_parallel([[*common, *NOMINAL, "name=nominal"], *([*common, *words] for words in identified)])
+    models = trained_for(twins, minutes)
     arm = "simulator=none", "arm=twin", "arm.surface=box", f"evaluation.episodes={EPISODES}", f"root={RUNS}"
-    models = {"nominal": "nominal", "identified": "identified_{}_{}"}
+    on_twin = {(m, v, s): f"{name.partition('_')[0]}_on_{v}_{s}" for m, name in models.items() for v, s in twins}
     run_parallel(
         [
-            *("stage=transfer", *arm, f"policy={RUNS / 'train' / name.format(v, s)}"),
-            *(f"arm.variant={v}", f"arm.seed={s}", f"name={model}_on_{v}_{s}"),
+            *("stage=transfer", *arm, f"policy={RUNS / 'train' / models[m].format(v, s)}"),
+            *(f"arm.variant={v}", f"arm.seed={s}", f"name={name}"),
         ]
-        for v, s in twins
-        for model, name in models.items()
+        for (m, v, s), name in on_twin.items()
     )
     rows = {}
     for variant in dict.fromkeys(v for v, _ in twins):
         for model in models:
-            own = [f"{model}_on_{v}_{s}" for v, s in twins if v == variant]
+            own = [name for (m, v, _), name in on_twin.items() if (m, v) == (model, variant)]
             each = [json.loads((RUNS / "transfer" / n / "summary.json").read_text())["twin"] for n in own]
             mean = {key: float(np.mean([values[key] for values in each])) for key in PUSH.rows}
             success = [100 * values["success"] for values in each]
-            rows[f"{variant}, {model} model"] = (
+            rows[f"{variant}, {model}"] = (
                 {"twins": str(len(own))}
                 | cells(PUSH, mean)
                 | {"success by twin, %": f"{min(success):.0f} to {max(success):.0f}"}
             )
     what = f"`algo=pusher` with each model on the twin with its box; {EPISODES} goals on each; means over the twins."
+    if minutes:
+        what += f" Policies: `{' '.join(ALGO)} budget.minutes={minutes}` on one core, the twin's seed."
     return [
-        stamp(" ".join(["python benchmarks/push.py", *(f"{v}_{s}" for v, s in twins)])),
+        stamp(" ".join(["python benchmarks/push.py", *([f"minutes={minutes}"] if minutes else []), *words])),
         what,
         markdown_rows(rows),
     ]
@@ -81,8 +100,10 @@ def on_twins(twins: list[tuple[str, str]]) -> list[str]:
 def main() -> None:
     """Train what is missing and write the page, or its section on twins."""
     words = sys.argv[1:]
-    if words and all(re.fullmatch(r"(rigid|elastic)_\d+", w) for w in words):
-        put_section(RESULTS / "push.md", TWINS, on_twins([(v, s) for v, _, s in (w.partition("_") for w in words)]))
+    minutes = words[0].partition("=")[2] if words and re.fullmatch(r"minutes=\d+(\.\d+)?", words[0]) else None
+    twins = words[1:] if minutes else words
+    if twins and all(TWIN.fullmatch(word) for word in twins):
+        put_section(RESULTS / "push.md", POLICIES if minutes else TWINS, on_twins(twins, minutes))
         return
     if words not in ([], ["page"]):
         raise SystemExit(__doc__)
@@ -97,8 +118,8 @@ def main() -> None:
         f"`python run.py {' '.join(POLICY)}`, one core each; 200 goals, `dr=box`: each with its own box and arm.",
         markdown_rows(rows),
     ]
-    section = "".join((RESULTS / "push.md").read_text().partition(f"## {TWINS}")[1:]).strip()
-    write_page("push", "Pushing a box", "python benchmarks/push.py", [*parts, *([section] if section else [])])
+    kept = "".join((RESULTS / "push.md").read_text().partition(f"## {TWINS}")[1:]).strip()
+    write_page("push", "Pushing a box", "python benchmarks/push.py", [*parts, *([kept] if kept else [])])
 
 
 if __name__ == "__main__":
