@@ -4,8 +4,8 @@
 
 arms    simulated arms with contact, train, validation and ramps recordings and the truth, FOLDER/<name>, which are no
         part of this repository: stage=identify with its defaults, then the surface against the truth
-twins   variant_seed: `stage=identify` from free motion, then with data.presses=6 on the surface of the seed; finished
-        identifications in runs/identify are not repeated
+twins   variant_seed: `stage=identify` from free motion, then with data.presses=6 on the surface of the seed, for
+        elastic twins also with stated gears; finished identifications in runs/identify are not repeated
 seeds   recordings of benchmarks/pressing.py on drawn surfaces: coverage of the intervals
 
 Only this script reads the truth. It writes benchmarks/results/contact_identification.md.
@@ -17,6 +17,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,8 +26,10 @@ from common import JUDGING, ROBOT, ROOT, identify_twins, markdown, markdown_rows
 from press_twins import TOOL, armed, twin_run
 from pressing import drawn_surface, estimated_arm, press_recording
 
+from r2s.arm.twins.elastic_joints import STIFF
+from r2s.arm.twins.make_twin import make_twin
 from r2s.arm.twins.touch import draw_surface
-from r2s.identification.contact.contact_file import load_contact
+from r2s.identification.contact.contact_file import IdentifiedSurface, load_contact
 from r2s.identification.contact.estimate import Arm, ContactEstimate, identify_contact
 from r2s.identification.contact.exchange import linearized
 from r2s.identification.contact.tip import TipMotion
@@ -40,8 +43,10 @@ NUMBERS = ("slope", "stiffness", "exponent", "damping", "friction")
 TWINS_NOTE = (
     "Identified from free motion, then from presses (`data.presses=6`), with encoders on the motors. slope: error of "
     "the estimate and its 95 % interval; with rigid gears: error if the gears are taken as rigid; gears: mean "
-    "deflection by the largest torques. The prior of the gears was chosen on twins 0 to 9."
+    "deflection by the largest torques. The prior of the gears was chosen on twins 0 to 9. stated gears: the same "
+    "presses with `identify.gears.stiffness=`, the twin's own with an error of 10 % per joint."
 )
+ACCURACY = 0.1  # relative error of the stated gears
 PLAY = 2e-5  # m, of a Panda's encoders; see `TipMotion`
 
 
@@ -121,29 +126,58 @@ def identify_surface(variant: str, seed: int) -> Path:
     """Let a twin record presses and identify its surface, unless it is done; return the run folder."""
     run = ROOT / "runs" / "identify" / f"surface_{variant}_{seed}"
     words = ["arm=twin", f"arm.variant={variant}", f"arm.seed={seed}", "arm.surface=true", "data.presses=6"]
+    return identified(run, variant, seed, words)
+
+
+def identify_with_gears(variant: str, seed: int) -> Path:
+    """Identify the surface of a twin's presses again, unless it is done, with stated gears; return the run folder."""
+    run = ROOT / "runs" / "identify" / f"stated_{variant}_{seed}"
+    wrong = np.random.default_rng([seed, 11]).normal(0.0, ACCURACY, ROBOT.n)
+    stated = (make_twin(ROBOT, variant=variant, seed=seed)._hidden[STIFF] * np.exp(wrong)).round().tolist()
+    words = ["data=recording", f"data.contact={run.with_name(f'surface_{variant}_{seed}') / 'contact.npz'}"]
+    words += [f"identify.gears.stiffness={stated}", f"identify.gears.accuracy={ACCURACY}"]
+    return identified(run, variant, seed, words)
+
+
+def identified(run: Path, variant: str, seed: int, words: list[str]) -> Path:
+    """Run stage=identify with a twin's identification as calibration, unless it is done; return the run folder."""
     tool = run.with_name("press_tool.json")
     tool.write_text(json.dumps({"tip_in_flange_m": TOOL.tip.tolist(), "radius_m": TOOL.radius}))
-    words += [f"calibration={twin_run(variant, seed)}", f"robot.tool={tool}", f"root={ROOT / 'runs'}"]
+    words = [*words, f"calibration={twin_run(variant, seed)}", f"robot.tool={tool}", f"root={ROOT / 'runs'}"]
     if not (run / "contact.yaml").is_file():
         command = [sys.executable, "run.py", "stage=identify", *words, f"name={run.name}"]
         subprocess.run(command, cwd=ROOT, check=True)
     return run
 
 
-def judged_twin(variant: str, seed: int) -> tuple[Score, dict[str, str]]:
-    """Return errors and row of the table for a twin."""
+def slope_error(found: IdentifiedSurface, document: dict[str, Any], truth: Surface) -> str:
+    """Return the error of a surface's slope and its 95 % interval, in % of the truth."""
+    slope = linearized(truth)[0]
+    ends = document["parameters"]["slope_at_10N"]["value"], *found.interval["slope"]
+    own, low, high = (100 * (end / slope - 1.0) for end in ends)
+    return f"{own:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def judged_twin(variant: str, seed: int) -> tuple[dict[str, Score], dict[str, str]]:
+    """Return {coverage group: errors} and row of the table for a twin."""
     run, robot = identify_surface(variant, seed), armed(ROBOT)
     found, document = load_contact(run), yaml.safe_load((run / "contact.yaml").read_text())
     truth = draw_surface(robot, True, np.random.default_rng([seed, 4]))
     assert isinstance(truth, Surface)
-    s, slope = score(found.surface, found.interval, truth), linearized(truth)[0]
-    own, rigid = (d["parameters"]["slope_at_10N"]["value"] for d in (document, document["rigid_gears"]))
-    low, high = (100 * (end / slope - 1.0) for end in found.interval["slope"])
+    s = score(found.surface, found.interval, truth)
+    scores, stated = {"": s}, ""
+    if variant == "elastic":
+        again = identify_with_gears(variant, seed)
+        known, its = load_contact(again), yaml.safe_load((again / "contact.yaml").read_text())
+        scores[" with stated gears"] = score(known.surface, known.interval, truth)
+        stated = slope_error(known, its, truth)
+    rigid = document["rigid_gears"]["parameters"]["slope_at_10N"]["value"]
     held_out = json.loads((run / "summary.json").read_text())["contact"]["validation"]["force_rmse_N"]
-    return s, {
-        "true slope, N/mm": f"{1e-3 * slope:.1f}",
-        "slope at 10 N, %": f"{100 * (own / slope - 1.0):+.1f} [{low:+.1f}, {high:+.1f}]",
-        "with rigid gears, %": f"{100 * (rigid / slope - 1.0):+.1f}",
+    return scores, {
+        "true slope, N/mm": f"{1e-3 * linearized(truth)[0]:.1f}",
+        "slope at 10 N, %": slope_error(found, document, truth),
+        "with stated gears, %": stated,
+        "with rigid gears, %": f"{100 * (rigid / linearized(truth)[0] - 1.0):+.1f}",
         "friction": f"{s.friction:+.4f}",
         "plane, mm": f"{1e3 * s.plane:+.3f}",
         "normal, °": f"{s.tilt_deg:.3f}",
@@ -161,7 +195,8 @@ def twin_parts(twins: list[tuple[str, int]]) -> list[str]:
         judged = " (judging)" if seed in JUDGING[variant] else ""
         name = f"{variant} twin {seed}{judged}"
         one, rows[name] = judged_twin(variant, seed)
-        scores.setdefault(f"{variant}{judged}", []).append(one)
+        for how, own in one.items():
+            scores.setdefault(f"{variant}{how}{judged}", []).append(own)
         print(name, rows[name], flush=True)
     inside = {k: np.mean([list(s.covered.values()) for s in own]) for k, own in scores.items()}
     shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in inside.items())

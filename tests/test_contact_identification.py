@@ -17,6 +17,7 @@ from r2s.identification.contact.contact_file import load_contact, save_contact
 from r2s.identification.contact.estimate import Arm, identify_contact
 from r2s.identification.contact.exchange import linearized, mujoco_contact, sdf_surface
 from r2s.identification.contact.start import external_force
+from r2s.identification.contact.surface_space import stated_gears
 from r2s.identification.contact.tip import TipMotion
 from r2s.identification.contact.validation import press_errors
 from r2s.identification.parameter_file import save_parameters
@@ -81,12 +82,24 @@ def test_the_surface_that_was_pressed_is_identified(found, surface):
     assert all(found.identifiable.values())
 
 
-def test_elastic_gears_are_separated_from_the_surface(robot):
-    """Encoders on motors: gears that halve the stiffness are identified, with a surface and plane behind them."""
-    arm, surface = estimated_arm(robot, SEED), replace(drawn_surface(SEED), stiffness=3e4, exponent=1.0)
+@pytest.fixture(scope="module")
+def behind_gears(robot, surface):
+    """Return arm, surface, compliance of gears that halve the stiffness, and a recording with encoders on motors."""
+    arm, surface = estimated_arm(robot, SEED), replace(surface, stiffness=3e4, exponent=1.0)
     gears = 0.006 * np.linspace(0.85, 1.15, robot.n) / robot.tau_max
     plan = replace(QUICK, places=((0.0, 0.0), (0.10, 0.08), (-0.08, 0.10)))
-    found = identify_contact(arm, press_recording(arm, surface, SEED, plan, gears=gears))
+    return arm, surface, gears, press_recording(arm, surface, SEED, plan, gears=gears)
+
+
+@pytest.fixture(scope="module")
+def separated(behind_gears):
+    return identify_contact(behind_gears[0], behind_gears[3])
+
+
+def test_elastic_gears_are_separated_from_the_surface(robot, behind_gears, separated):
+    """Gears of unknown stiffness are identified, with a surface and plane behind them."""
+    _, surface, gears, _ = behind_gears
+    found = separated
     low, high = np.percentile(found.draws["gears"] @ robot.tau_max, [2.5, 97.5])
     assert low < gears @ robot.tau_max < high
     assert found.identifiable["gears"]
@@ -98,6 +111,18 @@ def test_elastic_gears_are_separated_from_the_surface(robot):
     assert found.height[0] < height < found.height[1]
     assert abs(height) < 5e-4 < abs(wrong)  # gravity moves the tip behind the encoders
     assert found.validation.rmse() < rigid.validation.rmse()
+
+
+def test_stated_gears_sharpen_the_surface(robot, behind_gears, separated):
+    """A stiffness off by two standard deviations in one direction: the interval is narrower and holds the truth."""
+    arm, _, gears, recording = behind_gears
+    accuracy = 0.05
+    stated = stated_gears(robot.tau_max, (1.0 + 2.0 * accuracy / np.sqrt(2.0)) / gears, accuracy)
+    found = identify_contact(arm, recording, gears=stated)
+    low, high = found.interval("slope")
+    assert low < 3e4 < high
+    assert np.log(high / low) < 0.6 * np.log(np.divide(*separated.interval("slope")[::-1]))
+    assert found.identifiable["gears"]
 
 
 def test_two_springs_in_series_have_one_force(robot, surface):
@@ -348,6 +373,23 @@ MISTAKES = {
     "data.path=free.npz data.contact_validation=contact.npz": "there is no data.contact= to validate",
     "data.contact=free.npz robot.tool=tool.json calibration=run": "data.contact: no contact found.*does the tool",
 }
+GEARS = {
+    "stiffness=0": "stiffness: expected positive numbers, Nm/rad, got",
+    "stiffness=[1,2]": "stiffness: expected 7 values, for the 7 joints, got 2",
+    "stiffness=soft": "stiffness: expected a number, or one for each of the 7 joints, got 'soft'",
+    "stiffness=14": r"stiffness: robot.tau_max would twist these gears by .* rad, allowed are 0.05 rad; .* Nm/rad",
+    "accuracy=0": r"accuracy: expected a number in \(0, 0.4\], got 0",
+}
+
+
+@pytest.mark.parametrize("word", GEARS)
+def test_gears_that_cannot_be_are_one_line(word, files):
+    given = [f"data.contact={files / 'contact.npz'}", f"robot.tool={files / 'tool.json'}", "name=gears"]
+    given += [f"calibration={files / 'run'}", "identify.gears.stiffness=14000", f"identify.gears.{word}"]
+    with pytest.raises(UserError, match=rf"^identify\.gears\.{GEARS[word]}") as caught:
+        run(files, *given)
+    assert "\n" not in str(caught.value)
+    assert not (files / "runs" / "identify" / "gears").exists()
 
 
 @pytest.mark.parametrize("words", MISTAKES)

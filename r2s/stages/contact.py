@@ -40,11 +40,29 @@ def contact_data(cfg, robot, file):
         raise UserError("robot.tool: data.contact needs the tip that touches: robot.tool=TOOL.json")
     if file.torque not in (None, "commanded"):
         raise UserError(f"data.contact: a surface is identified from commanded torque, not data.torque={file.torque}")
+    stated_stiffness(cfg, robot)
     files = [located(path) for path in (file.contact, file.contact_validation) if path]
     recordings = [read_file(robot, file, path, torque="commanded") for path in files]
     for recording in recordings:
         check_recording(robot, recording)
     return ContactData(recordings[0], recordings[1] if len(recordings) > 1 else None, files)
+
+
+def stated_stiffness(cfg, robot):
+    """Return the prior of the gears from identify.gears.stiffness and .accuracy; None if nothing is stated.
+
+    Raises:
+        UserError: a value is invalid.
+    """
+    from r2s.identification.contact.surface_space import stated_gears
+    from r2s.physics.robot import per_joint
+    from r2s.stages.parts import plain
+
+    gears = plain(cfg.identify.get("gears"))  # older configs lack this key
+    if gears is None or gears["stiffness"] is None:
+        return None
+    stiffness = per_joint("identify.gears.stiffness", gears["stiffness"], robot.n, f"the {robot.n} joints")
+    return stated_gears(robot.tau_max, stiffness, gears["accuracy"])
 
 
 def press_parts(cfg, robot, arm):
@@ -58,6 +76,7 @@ def press_parts(cfg, robot, arm):
     from r2s.stages.data import check_data
 
     check_data(cfg)
+    stated_stiffness(cfg, robot)
     if robot.tool is None:
         raise UserError("robot.tool: data.presses needs the tip that touches: robot.tool=TOOL.json")
     if is_simulated(cfg) and not cfg.arm.get("surface"):
@@ -125,7 +144,8 @@ def identify_surface(cfg, run, arm, data):
     from r2s.reporting.tables import print_table
 
     progress = Progress("contact")
-    found = identify_contact(arm, data.recording, data.held_out, seed=cfg.seed, report=progress)
+    gears = stated_stiffness(cfg, arm.robot)
+    found = identify_contact(arm, data.recording, data.held_out, gears=gears, seed=cfg.seed, report=progress)
     progress.close()
     source = {"recording": data.recording.name, "calibration": cfg.calibration or str(run.folder)}
     save_contact(run.folder / "contact.yaml", arm.robot, found, source | {"run": str(run.folder)})

@@ -74,7 +74,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
     from r2s.recordings.recording import TORQUES
 
     settings: dict[str, Any] = plain(cfg.identify)
-    for key in ("validation_fraction", "from", "drift"):
+    for key in ("validation_fraction", "from", "drift", "gears"):
         settings.pop(key, None)
     every = [*optional_friction(), *TERMS]
     stated = {k: v for k, v in settings["prior"].items() if k not in TORQUES and (last or k in BODY)}

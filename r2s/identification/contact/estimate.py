@@ -1,7 +1,7 @@
 """Identify a surface that an arm has pressed: stiffness, exponent, damping, friction and plane, with intervals.
 
 If an arm's encoders are on the motors, the gears' deflection adds to the penetration of the surface. A first estimate
-takes the gears as rigid; a second estimates their compliance with the surface.
+takes the gears as rigid; a second estimates their compliance with the surface, about a stated one if there is one.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,16 @@ from r2s.errors import UserError
 from r2s.identification.arm_uncertainty import Arm
 from r2s.identification.contact.problem import SLOWEST, ContactProblem, contact_problem
 from r2s.identification.contact.start import LEAST_S, first_guesses
-from r2s.identification.contact.surface_space import DEFLECTION, LOWER, NAMES, SOFTEST, SURFACE, UPPER, WIDTH
+from r2s.identification.contact.surface_space import (
+    LOWER,
+    NAMES,
+    SOFTEST,
+    SURFACE,
+    UPPER,
+    WIDTH,
+    Gears,
+    unknown_gears,
+)
 from r2s.identification.contact.validation import Press, press_errors, presses
 from r2s.identification.posterior import posterior
 from r2s.identification.result import SHARPER
@@ -91,6 +100,7 @@ def identify_contact(
     recording: Recording,
     held_out: Recording | None = None,
     *,
+    gears: Gears | None = None,
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> ContactEstimate:
@@ -99,13 +109,15 @@ def identify_contact(
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
         held_out: presses on the same surface for validation; None: a fit without the last press predicts that press.
+        gears: prior of the gears' deflection; None: their stiffness is unknown.
         seed: seed of the posterior's draws. report: function that receives the completed share and the next step.
 
     Raises:
         UserError: there is too little contact, or the recording does not determine the stiffness.
     """
     report(0.0, "forces of the arm")
-    surfaces, starts = first_guesses(arm.space, arm.x, recording)
+    gears = gears or unknown_gears(arm.robot.n)
+    surfaces, starts = first_guesses(arm.space, arm.x, recording, gears)
     problem = contact_problem(arm.space, arm.x, arm.samples, recording, surfaces)
     other = contact_problem(arm.space, arm.x, arm.samples, held_out, surfaces) if held_out is not None else None
     report(0.4, "surface")
@@ -187,7 +199,7 @@ def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None,
     identifiable["slope"] &= bool(AT_BOUND < u[3] < 1 - AT_BOUND)  # gears may hide a stiff surface
     identifiable |= {"plane": bool(known[:3].all()), "stiffness": identifiable["slope"] and identifiable["exponent"]}
     if len(u) > SURFACE:  # the mean deflection, against its prior
-        sure = half[SURFACE] / 2 < DEFLECTION / SOFTEST / SHARPER
+        sure = space.gears.stated or half[SURFACE] / 2 < space.gears.width / SOFTEST / SHARPER
         identifiable["gears"] = bool(sure and u[SURFACE] < 1 - AT_BOUND)
     touched = problem.tip.centre[depth > 0].mean(0)
     at = touched - ((touched - surface.point) @ surface.normal) * surface.normal

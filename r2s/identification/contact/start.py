@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.identification.contact.surface_space import LOAD, SurfaceSpace
+from r2s.identification.contact.surface_space import LOAD, Gears, SurfaceSpace
 from r2s.identification.contact.tip import TipMotion
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.torque_residual import TorqueResidual
@@ -20,12 +20,13 @@ FLAT = 3.0  # positions determine the normal if their spread along the plane is 
 
 
 def first_guesses(
-    space: ParameterSpace, x: np.ndarray, recording: Recording
+    space: ParameterSpace, x: np.ndarray, recording: Recording, gears: Gears
 ) -> tuple[SurfaceSpace, list[np.ndarray]]:
     """Return the space of surfaces near a first guess of the plane, and start vectors u (8,) in this space.
 
     Args:
         space: parameter space of an arm with a tool. x: (P,), parameters. recording: one with commanded torque.
+        gears: prior of the gears' deflection.
 
     Raises:
         UserError: the recording shows no contact.
@@ -47,7 +48,7 @@ def first_guesses(
     normals = [normal]
     if spread[1] > FLAT * spread[2]:
         normals.insert(0, axes[2] * np.sign(axes[2] @ normal))
-    surfaces = SurfaceSpace(origin - tool.radius * normals[0], normals[0], space.robot.tau_max)
+    surfaces = SurfaceSpace(origin - tool.radius * normals[0], normals[0], space.robot.tau_max, gears)
     return surfaces, list(_starts(surfaces, normals, centre - tool.radius * normals[0], force))
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r2s.errors import UserError, check_number
 from r2s.physics.surface import UNIT_DEPTH, Surface
 
 LOAD = 10.0  # N, load at which slope and height are defined, so that slope and height depend little on the exponent
@@ -29,6 +30,51 @@ FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 # wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
 DEFLECTION, SOFTEST = 0.01, 0.05
 SCATTER, FARTHEST = 0.2, 0.6  # standard deviation and bound of a joint's deflection about the arm's, as shares of it
+LEAST_ACCURATE = 0.4  # of a stated stiffness; two standard deviations of a joint then fit into FARTHEST
+
+
+@dataclass(frozen=True)
+class Gears:
+    """Prior of the gears' deflection by the joints' largest torques.
+
+    Attributes:
+        shape: (n,) deflection of each joint, relative to the mean over joints.
+        center, width: mean and standard deviation, rad, of the mean deflection. scatter: standard deviation of a
+            joint's relative deflection.
+        stated: whether the stiffness of the gears was stated.
+    """
+
+    shape: np.ndarray
+    center: float
+    width: float
+    scatter: float
+    stated: bool
+
+
+def unknown_gears(n: int) -> Gears:
+    """Return the prior of n gears of unknown stiffness, which are probably stiff."""
+    return Gears(np.ones(n), 0.0, DEFLECTION, SCATTER, False)
+
+
+def stated_gears(tau_max: np.ndarray, stiffness: np.ndarray, accuracy: float) -> Gears:
+    """Return the prior of gears of known stiffness (n,) Nm/rad, whose relative standard deviation is `accuracy`.
+
+    Half of the variance is common to all gears, as an error of the data sheet would be.
+
+    Raises:
+        UserError: a stiffness is not positive, `accuracy` is not in (0, LEAST_ACCURATE], or the gears are too soft.
+    """
+    if not (np.isfinite(stiffness) & (stiffness > 0)).all():
+        raise UserError(f"identify.gears.stiffness: expected positive numbers, Nm/rad, got {stiffness.tolist()}")
+    check_number("identify.gears.accuracy", accuracy, f"(0, {LEAST_ACCURATE:g}]")
+    deflection = tau_max / stiffness
+    if (mean := float(deflection.mean())) > SOFTEST:
+        raise UserError(
+            f"identify.gears.stiffness: robot.tau_max would twist these gears by {mean:.3g} rad, allowed are "
+            f"{SOFTEST:g} rad; the unit is Nm/rad"
+        )
+    half = accuracy / np.sqrt(2.0)
+    return Gears(deflection / mean, mean, half * mean, half, True)
 
 
 @dataclass(frozen=True)
@@ -40,12 +86,13 @@ class SurfaceSpace:
     the largest torques, and the deviation of each joint from it.
 
     Attributes:
-        tau_max: (n,) Nm, largest torques of the joints.
+        tau_max: (n,) Nm, largest torques of the joints. gears: prior of their deflection by these torques.
     """
 
     origin: np.ndarray
     normal: np.ndarray
     tau_max: np.ndarray
+    gears: Gears
 
     @property
     def axes(self) -> np.ndarray:
@@ -73,17 +120,17 @@ class SurfaceSpace:
         if u.shape[-1] == SURFACE:
             return np.zeros((*u.shape[:-1], len(self.tau_max)))
         relative = 1.0 + FARTHEST * (2.0 * u[..., SURFACE + 1 :] - 1.0)
-        return SOFTEST * u[..., SURFACE, None] * relative / self.tau_max
+        return SOFTEST * u[..., SURFACE, None] * self.gears.shape * relative / self.tau_max
 
     def with_gears(self, u: np.ndarray) -> np.ndarray:
-        """Return the surface u (8,) with values for gears, which are rigid: (8 + 1 + n,)."""
-        return np.concatenate([u, [0.0], np.full(len(self.tau_max), 0.5)])
+        """Return the surface u (8,) with values for gears at the center of their prior: (8 + 1 + n,)."""
+        return np.concatenate([u, [self.gears.center / SOFTEST], np.full(len(self.tau_max), 0.5)])
 
     def prior(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return center and 1 / standard deviation (count,) of the normal prior on a vector u (count,)."""
-        gears = [SOFTEST / DEFLECTION, *np.full(len(self.tau_max), 2.0 * FARTHEST / SCATTER)]
-        center = np.concatenate([np.full(SURFACE, 0.5), [0.0], np.full(len(self.tau_max), 0.5)])
-        return center[:count], np.concatenate([np.full(SURFACE, FLAT), gears])[:count]
+        joints = np.full(len(self.tau_max), 2.0 * FARTHEST / self.gears.scatter)
+        weight = np.concatenate([np.full(SURFACE, FLAT), [SOFTEST / self.gears.width], joints])
+        return self.with_gears(np.full(SURFACE, 0.5))[:count], weight[:count]
 
     def surface(self, u: np.ndarray) -> Surface:
         """Return the surface that u (U,) describes."""
