@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from datetime import date
@@ -143,13 +144,15 @@ def run_parallel(jobs: Iterable[Sequence[str]]) -> None:
 def run_scripts(jobs: Iterable[Sequence[str]]) -> None:
     """Run scripts with their arguments, as many at a time as this process has cores."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    waiting, running = list(jobs), []
+    waiting, running = list(jobs), list[subprocess.Popen[bytes]]()
     while waiting or running:
         while waiting and len(running) < cores:
             command = [sys.executable, *waiting.pop(0)]
             running.append(subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}))
-        if (first := running.pop(0)).wait():
-            sys.exit(f"failed: {' '.join(map(str, first.args))}")
+        time.sleep(0.1)
+        if failed := [job for job in running if job.poll()]:
+            sys.exit(f"failed: {' '.join(map(str, failed[0].args))}")
+        running = [job for job in running if job.returncode is None]
 
 
 def identify_twins(twins: Iterable[tuple[str, int, Path]], root: Path) -> None:
