@@ -88,6 +88,11 @@ class Problem:
         return replace(self, data=self.torque_data)
 
     @property
+    def at_link(self) -> bool:
+        """Whether the recorded torque is that of a sensor behind the gear."""
+        return not (self.torque_data.commanded or self.torque_data.at_motor)
+
+    @property
     def prior_width(self) -> np.ndarray:
         """(P,) the prior's standard deviation on the unit cube, for comparison with the posterior's.
 
@@ -113,6 +118,16 @@ class Problem:
         usual = np.where(np.isinf(self.space.usual), self.sigma, self.space.usual)
         own = np.isinf(self.sigma) | (self.sigma < 2 * FIXED * self.space.width)  # flat or fixed
         return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
+
+    @property
+    def for_first_round(self) -> "Problem":
+        """The problem that the first round of a reweighted torque fit solves.
+
+        The weights of the first round come from the nominal arm. If link-side torque also contains the torque of
+        cables, these weights let a narrow prior keep friction near its nominal value and describe the rest by cables,
+        a minimum that later rounds do not leave. With priors as wide as the scatter among arms they do.
+        """
+        return self.with_usual_prior() if self.at_link else self
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
         """Return the problem with flat priors of the values in `names`, whose prior is an extra residual."""
@@ -159,7 +174,7 @@ class Problem:
 
     def _prior(self, u: np.ndarray) -> np.ndarray:
         prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
-        if not (self.torque_data.commanded or self.torque_data.at_motor):
+        if self.at_link:
             # heavy tails as in Student's t (Lange et al., J. Am. Stat. Assoc. 84(408), 1989): data that clearly
             # contradict a narrow prior outweigh it, while the prior is normal near the nominal value
             heavy = np.sign(prior) * np.sqrt(TAIL * np.log1p(prior**2 / TAIL))
@@ -197,7 +212,8 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
     """Fit a torque problem, reweighting between rounds; return u (P,) and the problem with the last weights."""
     u, rounds = problem.start, MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
     for k in range(rounds):
-        u = minimize(problem.residual, problem.linearize, u, FIT_STEPS, FIT_FTOL)
+        own = problem if k else problem.for_first_round
+        u = minimize(own.residual, own.linearize, u, FIT_STEPS, FIT_FTOL)
         if k < rounds - 1:
             problem = problem.reweighted(u, fitted=True)
     return u, problem

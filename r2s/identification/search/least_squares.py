@@ -31,7 +31,8 @@ class LeastSquares:
         if self.level != "torque":
             return minimize(problem.residual, problem.linearize, start, *limits)
         problem = problem.on_torque
-        for _ in range(ROUNDS):  # iteratively reweighted least squares
-            start = minimize(problem.residual, problem.linearize, start, *limits, "torque")
+        for k in range(ROUNDS):  # iteratively reweighted least squares
+            own = problem if k else problem.for_first_round
+            start = minimize(own.residual, own.linearize, start, *limits, "torque")
             problem = problem.reweighted(start, fitted=True)
         return start
