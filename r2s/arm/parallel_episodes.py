@@ -8,7 +8,7 @@ import multiprocessing
 import signal
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import fields, replace
 from typing import Any
 
@@ -19,7 +19,9 @@ from r2s.arm.realtime import Timing
 from r2s.tasks.rollout import PolicyLike, rollout
 from r2s.tasks.task import Episodes, Task
 
+Progress = Callable[[int, int], None]
 CHUNK = 25  # goals
+REPORT_S = 1.0  # s, between reports of the goals that the processes have finished
 
 
 def run_parallel_episodes(
@@ -29,7 +31,7 @@ def run_parallel_episodes(
     starts: np.ndarray,
     goals: np.ndarray,
     workers: int,
-    progress: Callable[[int, int], None],
+    progress: Progress,
 ) -> tuple[Episodes, list[Stop], Timing]:
     """Return the episodes, their early stops, and the measured durations.
 
@@ -40,23 +42,28 @@ def run_parallel_episodes(
         policy, task: see `rollout`.
         starts: (E, n) rad, first postures of the episodes. goals: (E, ...), see `Task`.
         workers: largest number of processes.
-        progress: called after every chunk with (goals done, total).
+        progress: called with (goals done, total) after every goal, with several processes every REPORT_S.
     """
     chunks = range(-(-len(goals) // CHUNK))
     done: dict[int, tuple[Episodes, list[Stop], Timing]] = {}
     job = open_twin, policy, task, starts, goals
 
-    def collect(chunk: int, result: tuple[Episodes, list[Stop], Timing]) -> None:
-        done[chunk] = result
-        progress(sum(len(episodes.goal) for episodes, _, _ in done.values()), len(goals))
+    def after(earlier: int) -> Progress:
+        return lambda k, _: progress(earlier + k, len(goals))
 
     if min(workers, len(chunks)) < 2 or not sys.platform.startswith("linux"):
         for chunk in chunks:
-            collect(chunk, _run_chunk(job, chunk))
+            done[chunk] = _run_chunk(job, chunk, after(chunk * CHUNK))
     else:
-        with multiprocessing.get_context("fork").Pool(min(workers, len(chunks)), _initialize, (job,)) as pool:
-            for chunk, result in pool.imap_unordered(_work, chunks):
-                collect(chunk, result)
+        context = multiprocessing.get_context("fork")
+        finished = context.Value("l", 0)  # goals, of all processes
+        with context.Pool(min(workers, len(chunks)), _initialize, (job, finished)) as pool:
+            results = pool.imap_unordered(_work, chunks)
+            while len(done) < len(chunks):
+                with suppress(multiprocessing.TimeoutError):
+                    chunk, result = results.next(timeout=REPORT_S)
+                    done[chunk] = result
+                progress(finished.value, len(goals))
     parts = [done[chunk] for chunk in chunks]
     each = [episodes for episodes, _, _ in parts]
     names = [f.name for f in fields(Episodes) if f.name != "t" and getattr(each[0], f.name) is not None]
@@ -69,24 +76,33 @@ def run_parallel_episodes(
 
 
 _job: Any = None  # arguments that a forked process got from `_initialize`
+_finished: Any = None  # shared number of finished goals
 
 
-def _initialize(job: Any) -> None:
+def _initialize(job: Any, finished: Any) -> None:
     import torch
 
-    global _job
-    _job = job
+    global _job, _finished
+    _job, _finished = job, finished
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
 
 
 def _work(chunk: int) -> tuple[int, tuple[Episodes, list[Stop], Timing]]:
-    return chunk, _run_chunk(_job, chunk)
+    counted = 0
+
+    def count(k: int, total: int) -> None:
+        nonlocal counted
+        with _finished.get_lock():
+            _finished.value += k - counted
+        counted = k
+
+    return chunk, _run_chunk(_job, chunk, count)
 
 
-def _run_chunk(job: Any, chunk: int) -> tuple[Episodes, list[Stop], Timing]:
+def _run_chunk(job: Any, chunk: int, progress: Progress) -> tuple[Episodes, list[Stop], Timing]:
     open_twin, policy, task, starts, goals = job
     first, now = chunk * CHUNK, slice(chunk * CHUNK, (chunk + 1) * CHUNK)
     with open_twin(chunk) as runner:
-        episodes = rollout(policy, runner, task, starts[now], goals[now])
+        episodes = rollout(policy, runner, task, starts[now], goals[now], progress)
         return episodes, [replace(stop, episode=first + stop.episode) for stop in runner.stops], runner.timing

@@ -1,0 +1,54 @@
+"""Episodes on copies of a twin in parallel processes."""
+
+import sys
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+from conftest import conf
+
+from r2s.arm import parallel_episodes
+from r2s.arm.policy_runner import PolicyRunner
+from r2s.arm.twins.rigid_twin import RigidTwin
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.policy import make_policy
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.tasks.reach import ReachTask
+
+GOALS = 5
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="several processes only on Linux")
+def test_two_processes_do_what_one_does_and_report_every_goal(panda, monkeypatch):
+    """One process reports each goal; two report a count that never falls and ends at all goals."""
+    monkeypatch.setattr(parallel_episodes, "CHUNK", 2)
+    monkeypatch.setattr(parallel_episodes, "REPORT_S", 0.01)
+    torch.manual_seed(0)
+    task = ReachTask(episode_s=0.2)
+    policy, friction = make_policy(panda, task, (8,)), nominal_dynamics(panda, **conf("friction/paper")).level
+    starts, goals = fixed_episodes(panda, task, GOALS)
+
+    @contextmanager
+    def open_twin(chunk):
+        yield PolicyRunner(RigidTwin(panda, 0, noise=chunk), task, friction)
+
+    done, reports = {}, {1: [], 2: []}
+    for workers, calls in reports.items():
+        parts = (
+            open_twin,
+            policy,
+            task,
+            starts,
+            goals,
+            workers,
+            lambda k, total, calls=calls: calls.append((k, total)),
+        )
+        done[workers], stops, timing = parallel_episodes.run_parallel_episodes(*parts)
+        assert not stops
+        assert timing.table()
+    assert reports[1] == [(k, GOALS) for k in range(1, GOALS + 1)]
+    counts = [k for k, _ in reports[2]]
+    assert counts == sorted(counts)
+    assert counts[-1] == GOALS
+    np.testing.assert_array_equal(done[1].q, done[2].q)
