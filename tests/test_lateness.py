@@ -51,9 +51,11 @@ def test_what_is_late_does_not_go_into_the_links(robot, motion, lateness):
 
 
 def test_a_log_without_lateness_keeps_its_result(robot, motion):
-    """The delay is exactly 0, and nothing moves by a tenth of its half interval."""
+    """The delay's interval is shorter than a step and holds 0; nothing moves by a tenth of its half interval."""
     with_term, without = (found_in(robot, motion, *terms) for terms in (["signal_delay"], []))
-    assert with_term.dynamics.signal_delay == 0.0
+    (at,) = with_term.space.where("signal_delay")
+    low, high = with_term.found.low[at], with_term.found.high[at]
+    assert low < 0.0 < high < low + 1e-3
     for name in without.space.blocks:
         ours, theirs = (f.x[f.space.where(name)] for f in (with_term, without))
         half = 0.5 * (without.found.high - without.found.low)[without.space.where(name)]

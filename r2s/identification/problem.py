@@ -119,16 +119,6 @@ class Problem:
         own = np.isinf(self.sigma) | (self.sigma < 2 * FIXED * self.space.width)  # flat or fixed
         return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
 
-    @property
-    def for_first_round(self) -> "Problem":
-        """The problem that the first round of a reweighted torque fit solves.
-
-        The weights of the first round come from the nominal arm. If link-side torque also contains the torque of
-        cables, these weights let a narrow prior keep friction near its nominal value and describe the rest by cables,
-        a minimum that later rounds do not leave. With priors as wide as the scatter among arms they do.
-        """
-        return self.with_usual_prior() if self.at_link else self
-
     def without_prior(self, names: Sequence[str]) -> "Problem":
         """Return the problem with flat priors of the values in `names`, whose prior is an extra residual."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
@@ -150,6 +140,10 @@ class Problem:
     def cost(self, u: np.ndarray) -> float:
         """Return the sum of squares at u (P,)."""
         return float((self.residual(u[None]) ** 2).sum())
+
+    def prior_cost(self, u: np.ndarray) -> float:
+        """Return the sum of squares of the prior and extra rows at u (P,)."""
+        return float((self._prior(u[None]) ** 2).sum())
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """Return residuals (C, R + B) at u (C, P), in standard deviations: data rows, then prior and extra rows."""
@@ -189,6 +183,9 @@ def _differences(residual: Callable[[np.ndarray], np.ndarray], u: np.ndarray) ->
     return r[0], ((r[1:] - r[0]) / h[:, None]).T
 
 
+Solve = Callable[[Problem, np.ndarray], np.ndarray]  # returns the minimum (P,) of a problem near a vector (P,)
+
+
 class Search(Protocol):
     """A search, which minimizes the sum of squares of `Problem.residual` from `start` (P,).
 
@@ -210,13 +207,49 @@ def fits_torque(search: Search) -> bool:
 
 def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
     """Fit a torque problem, reweighting between rounds; return u (P,) and the problem with the last weights."""
-    u, rounds = problem.start, MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
+    rounds = MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
+
+    def solve(own: Problem, u: np.ndarray) -> np.ndarray:
+        return minimize(own.residual, own.linearize, u, FIT_STEPS, FIT_FTOL)
+
+    return reweighted_fit(problem, problem.start, rounds, solve)
+
+
+def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
+    """Fit torque from `start` (P,) in rounds, each weighted by the last; return u (P,) and the last round's problem.
+
+    A fit to link-side torque has several minima if values are far outside of narrow priors: with the first weights,
+    which come from the nominal arm, it may keep cable torque near zero and distort friction instead. So a second fit
+    begins with priors at least as wide as the scatter among arms, and the likelier result counts.
+    """
+    u, last = _rounds(problem, problem, start, rounds, solve)
+    wide = problem.with_usual_prior() if problem.at_link else problem
+    if np.array_equal(wide.sigma, problem.sigma):
+        return u, last
+    v, other = _rounds(wide, problem, start, rounds, solve)
+    return (v, other) if _log_odds(other, v, last, u) > 0 else (u, last)
+
+
+def _rounds(first: Problem, problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
+    """Solve `first`, then `problem` reweighted at each result; return the last u (P,) and its problem."""
     for k in range(rounds):
-        own = problem if k else problem.for_first_round
-        u = minimize(own.residual, own.linearize, u, FIT_STEPS, FIT_FTOL)
+        u = solve(problem if k else first, u)
         if k < rounds - 1:
             problem = problem.reweighted(u, fitted=True)
     return u, problem
+
+
+def _log_odds(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray) -> float:
+    """Return the log of the posterior density at u (P,) over that at v (P,), each with its own torque noise.
+
+    A joint's log likelihood is -N log sigma, with N independent rows. A wrong model correlates the errors of more
+    rows, so N is that of the result with the shorter correlation.
+    """
+    (length, sigma), (longer, larger) = (
+        p.torque_data.noise_at(p.space.from_unit(x)) for p, x in ((one, u), (other, v))
+    )
+    rows = one.torque_data.seen.sum(0) / np.minimum(length, longer)
+    return float(rows @ np.log(larger / sigma)) + 0.5 * (other.prior_cost(v) - one.prior_cost(u))
 
 
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:

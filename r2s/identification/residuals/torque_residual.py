@@ -288,6 +288,11 @@ class TorqueResidual:
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
         return self._with(_weights=self._weights_at(r, fitted), **own)
 
+    def noise_at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the correlation length (n,), in rows, and the RMS (n,) Nm of the error at x (P,)."""
+        factor, constant = self._weights_at(self._seen_errors(x), True)
+        return factor**2, constant
+
     def rigid_body_of_last_link(self) -> np.ndarray:
         """Return torque (T, n, 10) per unit of each standard parameter of an undeclared body on the last link."""
         return self._rigid.y[..., -10:]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r2s.identification.problem import Problem, Report
+from r2s.identification.problem import Problem, Report, reweighted_fit
 from r2s.identification.search.levenberg_marquardt import minimize
 
 ROUNDS = 4  # number of reweighted torque fits; the first weights come from the nominal arm's residual
@@ -30,9 +30,8 @@ class LeastSquares:
         limits = (self.max_evaluations, self.ftol, self.minutes, report)
         if self.level != "torque":
             return minimize(problem.residual, problem.linearize, start, *limits)
-        problem = problem.on_torque
-        for k in range(ROUNDS):  # iteratively reweighted least squares
-            own = problem if k else problem.for_first_round
-            start = minimize(own.residual, own.linearize, start, *limits, "torque")
-            problem = problem.reweighted(start, fitted=True)
-        return start
+
+        def solve(own: Problem, u: np.ndarray) -> np.ndarray:
+            return minimize(own.residual, own.linearize, u, *limits, "torque")
+
+        return reweighted_fit(problem.on_torque, start, ROUNDS, solve)[0]

@@ -21,20 +21,25 @@ from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
 SURE = 4.0  # standard deviations: 3, plus a third, as 95 % intervals covered only 85 % under model error
+UNCLEAR = 2.0  # standard deviations above the estimate, up to which a delay may be
 BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted motion have similar speeds
 
 
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
-    """Return {"delayed": whether torque is clearly late, "alike": whether to treat torque and dq as equally late}.
+    """Return {"delayed": whether to estimate the delay of torque, "alike": whether torque and dq are equally late}.
 
-    r2s first fits torque with corrected dq. If torque then clearly has a delay, r2s corrects torque and dq.
-    Without a clear delay, r2s corrects only dq if this lowers the error of held-out torque by more than one standard
-    error, else uses torque and dq as logged and treats both as equally late. With folds < 2, r2s corrects only dq.
+    If dq is on time, r2s estimates the delay unless it is clearly below LATE_S: set to 0, its interval would miss a
+    delay that is not clear. If dq is late, r2s first fits torque with corrected dq. If torque then clearly has a
+    delay, r2s corrects torque and dq. Otherwise it corrects only dq if this lowers the error of held-out torque by
+    more than one standard error, else it uses torque and dq as logged and treats both as equally late. With
+    folds < 2, it corrects only dq.
     """
-    if DELAY in terms and torque_is_late(cv, terms):
-        return {"delayed": True, "alike": False}
-    late = np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure)
-    if cv.folds < 2 or not late.any():
+    on_time = not np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure).any()
+    if DELAY in terms:
+        late, sigma = torque_delay(cv, terms)
+        if late + UNCLEAR * sigma > LATE_S if on_time else late > max(SURE * sigma, LATE_S):
+            return {"delayed": True, "alike": False}
+    if cv.folds < 2 or on_time:
         return {"delayed": False, "alike": False}
     squares, rest = [], [term for term in terms if term != DELAY]
     for alike in (True, False):
@@ -46,8 +51,8 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     return {"delayed": False, "alike": not clearly_worse((logged - corrected).sum(1))}
 
 
-def torque_is_late(cv: CrossValidation, terms: Sequence[str]) -> bool:
-    """Fit `terms`, which include the delay of torque, and return whether this delay is clearly not 0."""
+def torque_delay(cv: CrossValidation, terms: Sequence[str]) -> tuple[float, float]:
+    """Fit `terms`, which include the delay of torque; return its absolute value and standard deviation, s."""
     space = cv.space(terms)
     recording = cv.recording if cv.recording.period else cv.recording.in_phase()  # repetitions are one block
     data = TorqueResidual(space, recording, cutoff_hz=cv.cutoff_hz, rate_hz=RATE_HZ)
@@ -55,5 +60,5 @@ def torque_is_late(cv: CrossValidation, terms: Sequence[str]) -> bool:
     problem = problem.reweighted(u, fitted=True)
     u = minimize(problem.residual, problem.linearize, u, FIT_STEPS, FIT_FTOL)
     (at,) = space.where(DELAY)
-    late = np.abs(u - problem.start)[at]
-    return bool(late > max(SURE * posterior(problem, u, seed=0).steps.std(0)[at], LATE_S / space.width[at]))
+    sigma = posterior(problem, u, seed=0).steps.std(0)[at]
+    return float(np.abs(u - problem.start)[at] * space.width[at]), float(sigma * space.width[at])
