@@ -1,7 +1,8 @@
 """Identify synthetic arms of 2 to 8 joints and 5 to 400 Nm, logged at four rates, whose truth is known.
 
 `python benchmarks/scaling.py [FOLDER]` prints the figures of each row, beside those of the checkout in FOLDER (an
-earlier state of r2s), and writes benchmarks/results/scaling.md. `only=NAME` computes one row, `json` prints figures.
+earlier state of r2s; without it, those of the page), and writes benchmarks/results/scaling.md. `only=NAME` computes
+one row, `json` prints figures.
 """
 
 import inspect
@@ -389,10 +390,17 @@ ROWS |= {"4 late": late_signals, "5 hold": command_hold, "6 ripple": ripple, "7 
 ROWS |= {"9 payload": payload_limit, "10 pause": pause, "12 identifiable": identifiable}
 
 
+def written() -> dict[str, str]:
+    """Return the column `before` of the page: {row: cell}."""
+    page = Path(__file__).parent / "results" / "scaling.md"
+    rows = [line.strip("| ").split(" | ") for line in page.read_text().splitlines()]
+    return {cells[0]: cells[1] for cells in rows if len(cells) == 3}
+
+
 def main() -> None:
     """Compute the rows here and in another checkout, and write the page."""
     only = [a.removeprefix("only=") for a in sys.argv[1:] if a.startswith("only=")]
-    before: dict = {}
+    before: dict[str, str] = {}
     runs = []
     for folder in (a for a in sys.argv[1:] if "=" not in a and a != "json"):
         copy = shutil.copy(__file__, Path(folder) / "benchmarks")
@@ -404,9 +412,11 @@ def main() -> None:
         print(json.dumps(rows))
         return
     for run in runs:
-        before = json.loads(run.communicate()[0].splitlines()[-1])
+        rest = json.loads(run.communicate()[0].splitlines()[-1])
+        before = {f"{n}: {k}": v for n, r in rest.items() for k, v in r.items()}
+    before = before or written()
     pairs = [(n, k, v) for n, r in rows.items() for k, v in r.items()]
-    lines = {f"{n}: {k}": {"before": before.get(n, {}).get(k, ""), "now": v} for n, k, v in pairs}
+    lines = {f"{n}: {k}": {"before": before.get(f"{n}: {k}", ""), "now": v} for n, k, v in pairs}
     text = (
         f"Arms of {', '.join(f'{n} joints and up to {t:g} Nm' for n, t in ARMS)}; friction, offsets and links are "
         "drawn and known; link-side torque: links as its prior states; motor torque in rows 3 and 4: nominal links, "
@@ -416,7 +426,8 @@ def main() -> None:
     table = markdown_rows(lines, "row")
     print(table)
     if not only:
-        write_page("scaling", "Arms of any size", "python benchmarks/scaling.py FOLDER", [text, table])
+        command = " ".join(["python benchmarks/scaling.py", *["FOLDER"] * bool(runs)])
+        write_page("scaling", "Arms of any size", command, [text, table])
 
 
 if __name__ == "__main__":
