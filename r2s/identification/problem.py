@@ -107,6 +107,11 @@ class Problem:
         """(P,) derivative of each value's prior residual with respect to the value's coordinate on the unit cube."""
         return self.space.width / self.sigma
 
+    @property
+    def is_fixed(self) -> np.ndarray:
+        """(P,) whether `fixed` fixed each value; a prior as narrow may also be stated of an arm with wide bounds."""
+        return self.sigma == FIXED * self.space.width
+
     def fixed(self, at: np.ndarray) -> "Problem":
         """Return the problem with the values at indices `at` fixed at nominal by a very narrow prior."""
         sigma = self.sigma.copy()
@@ -116,7 +121,7 @@ class Problem:
     def with_usual_prior(self) -> "Problem":
         """Return the problem with every prior at least as wide as the scatter among arms, `ParameterSpace.usual`."""
         usual = np.where(np.isinf(self.space.usual), self.sigma, self.space.usual)
-        own = np.isinf(self.sigma) | (self.sigma < 2 * FIXED * self.space.width)  # flat or fixed
+        own = np.isinf(self.sigma) | self.is_fixed
         return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
@@ -172,7 +177,7 @@ class Problem:
             # heavy tails as in Student's t (Lange et al., J. Am. Stat. Assoc. 84(408), 1989): data that clearly
             # contradict a narrow prior outweigh it, while the prior is normal near the nominal value
             heavy = np.sign(prior) * np.sqrt(TAIL * np.log1p(prior**2 / TAIL))
-            prior = np.where(self.sigma > 2 * FIXED * self.space.width, heavy, prior)
+            prior = np.where(self.is_fixed, prior, heavy)
         return np.concatenate([prior, *(extra.residual(self.space, x) for extra in self.extra)], axis=1)
 
 
