@@ -89,7 +89,10 @@ def on_twins(words: list[str], minutes: str | None) -> list[str]:
             )
     what = f"`algo=pusher` with each model on the twin with its box; {EPISODES} goals on each; means over the twins."
     if minutes:
-        what += f" Policies: `{' '.join(ALGO)} budget.minutes={minutes}` on one core, the twin's seed."
+        runs = [RUNS / "train" / models["policy, identified model"].format(v, s) for v, s in twins]
+        steps = [json.loads((run / "summary.json").read_text())["last"]["env_steps"] for run in runs]
+        what += f" Policies: `{' '.join(ALGO)} budget.minutes={minutes}` on one core, the twin's seed; they had "
+        what += f"{min(steps):,} to {max(steps):,} env steps."
     return [
         stamp(" ".join(["python benchmarks/push.py", *([f"minutes={minutes}"] if minutes else []), *words])),
         what,
