@@ -5,7 +5,6 @@ import sys
 
 import h5py
 import numpy as np
-import pandas as pd
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -40,9 +39,6 @@ def message(call, *args, **kwargs):
     text = str(caught.value)
     assert "\n" not in text
     return text
-
-
-# --- bags
 
 
 class Bag:
@@ -398,142 +394,3 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     assert message(read, file, torque="measured") == (
         f"{file}: reading this file needs h5py, which is not installed: pip install 'r2s[recordings]'"
     )
-
-
-# --- HDF5
-
-
-@pytest.mark.parametrize("suffix", [".h5", ".hdf5"])
-@pytest.mark.parametrize("group", ["", "robot/arm/"])
-def test_hdf5_datasets_by_name(tmp_path, suffix, group):
-    ns, q, dq, tau, _ = motion()
-    path = tmp_path / f"log{suffix}"
-    with h5py.File(path, "w") as h5:
-        h5.create_dataset(f"{group}t", data=ns[:, None] * 1e-9)
-        h5.create_dataset(f"{group}q", data=q, compression="gzip", chunks=(50, 7))
-        for j in range(7):
-            h5[f"{group}dq_{j}"] = dq[:, j]
-        h5[f"{group}tau_J"] = tau
-        h5["camera"] = np.zeros((3, 4, 4, 3), np.uint8)
-        h5["operator"] = "someone"
-        h5["empty"] = h5py.Empty("f8")
-    columns = {field: group + name for field, name in (("t", "t"), ("q", "q"), ("dq", "dq"), ("tau", "tau_J"))}
-    assert_motion(read(path, torque="measured", columns=columns, n_joints=7), motion())
-    if not group:
-        assert_motion(read(path, torque="measured"), motion())
-    else:
-        text = message(read, path, torque="measured")
-        assert "no column 't' for t" in text
-        assert "did you mean 'robot/arm/t'? (set data.columns.t)" in text
-        wrong = message(read, path, torque="commanded", columns=columns | {"tau": None})
-        assert "no column 'tau_J_d' for tau (commanded torque)" in wrong
-        assert wrong.endswith("; tau_J is measured torque (set data.columns.tau)")
-        assert "did you mean 'robot/arm/q'?" in message(
-            read, path, torque="measured", columns=columns | {"q": "/robot/arm/q"}
-        )
-
-
-def test_hdf5_declares_its_torque_and_text_is_no_column(tmp_path):
-    ns, q, dq, tau, _ = motion()
-    path = tmp_path / "log.h5"
-    with h5py.File(path, "w") as h5:
-        for name, x in (("t", ns * 1e-9), ("q", q), ("dq", dq), ("tau", tau)):
-            h5[name] = x
-        h5["note"] = ["a"] * 300
-        h5["torque"] = "commanded"
-    assert_motion(read(path, torque=None), motion(), "commanded")
-    assert "expected torque=commanded, as the file declares" in message(read, path, torque="measured")
-    text = message(read, path, torque="commanded", columns={"t": "note"})
-    assert text == f"{path}: column 'note': expected numbers, got 'a' at row 0"
-
-
-def test_a_damaged_hdf5_file_is_refused(tmp_path):
-    path = tmp_path / "log.h5"
-    with h5py.File(path, "w") as h5:
-        h5["t"] = np.arange(9999.0)
-    whole = path.read_bytes()
-    for content in (b"", b"\x00\x01" * 99, whole[: len(whole) // 2]):
-        path.write_bytes(content)
-        assert message(read, path, torque="measured").startswith(f"{path} cannot be read as h5: ")
-
-
-HEADERS = [(b"(99999,), }", b"(99999,,(}"), (b"'shape'", b"  shape'"), (b"{'descr'", b"{{'descr'")]
-
-
-@pytest.mark.parametrize("change", HEADERS)
-def test_a_damaged_header_in_an_npz_is_refused(tmp_path, change):
-    """NumPy parses the header as a Python literal and raises Python's parser errors."""
-    path = tmp_path / "log.npz"
-    np.savez(path, t=np.arange(99999.0))  # large: a small one has its checksum looked at first
-    content = path.read_bytes()
-    assert change[0] in content
-    path.write_bytes(content.replace(change[0], change[1].ljust(len(change[0]))[: len(change[0])]))
-    assert message(read, path, torque="measured").startswith(f"{path} cannot be read as npz: ")
-
-
-@pytest.mark.parametrize("key", ["topic", "joints"])
-def test_what_belongs_to_bags_is_not_silently_ignored(tmp_path, key):
-    path = tmp_path / "log.csv"
-    path.write_text("t,q1\n")
-    text = message(read, path, torque="measured", **{key: "x"})
-    assert text == f"{path}: data.{key}: expected null for .csv, got x: it is for .bag, .db3, .mcap"
-
-
-# --- CSV
-
-
-def libfranka_log(path, sep=", ", rows=300):
-    """Write what `franka::logToCSV` writes: time in ms, a state beside the command of the cycle before it."""
-    _, q, dq, tau_J, command = motion(rows + 1, jitter=0)
-    columns = {"state.q": q[1:], "state.q_d": q[1:] + 1, "state.dq": dq[1:], "state.dq_d": dq[1:] + 1}
-    columns |= {"state.tau_J": tau_J[1:], "state.tau_ext_hat_filtered": 0 * q[1:], "cmd.q_d": 0 * q[1:]}
-    columns |= {"cmd.dq_d": 0 * q[1:], "cmd.O_T_EE_d": np.zeros((rows, 16)), "cmd.O_dP_EE_d": np.zeros((rows, 6))}
-    columns |= {"cmd.tau_J_d": command[:-1]}
-    header = ",".join(sep.join(f"{name}[{i}]" for i in range(x.shape[1])) for name, x in columns.items())
-    times = 81234 + np.arange(rows)
-    lines = [f"time{sep}success_rate{sep}{header}"]
-    for k, row in enumerate(np.concatenate(list(columns.values()), axis=1)):
-        lines.append(f"{times[k]},1," + ",".join(repr(float(x)) for x in row))
-    path.write_text("\n".join(lines) + "\n")
-    return q[1:], dq[1:], tau_J[1:], command[1:]
-
-
-@pytest.mark.parametrize("sep", [", ", ","])  # older and newer versions
-def test_libfranka_logs(tmp_path, sep):
-    """Milliseconds become seconds; `torque` picks tau_J, or the command that was sent from the state of a row."""
-    path = tmp_path / "log.csv"
-    q, dq, tau_J, command = libfranka_log(path, sep)
-    columns = {"t": "t", "q": "q", "dq": "dq", "tau": None, "trajectory": None}  # as conf/data/recording.yaml has it
-    measured = read(path, torque="measured", columns=columns, n_joints=7)
-    np.testing.assert_allclose(measured.t, 81.234 + 1e-3 * np.arange(300), rtol=0, atol=1e-9)
-    for field, x in (("q", q), ("dq", dq), ("tau", tau_J)):
-        np.testing.assert_array_equal(getattr(measured, field), x)
-    commanded = read(path, torque="commanded", columns=columns)
-    np.testing.assert_allclose(commanded.tau[:-1], command[:-1], rtol=0, atol=1e-6)
-    desired = read(path, torque="measured", columns={"q": "state.q_d"})  # any other column by its own name
-    np.testing.assert_array_equal(desired.q, q + 1)
-
-
-def test_a_libfranka_log_of_position_control_holds_no_command(tmp_path):
-    path = tmp_path / "log.csv"
-    libfranka_log(path)
-    frame = pd.read_csv(path, skipinitialspace=True)
-    frame[[f"cmd.tau_J_d[{i}]" for i in range(7)]] = 0.0
-    frame.to_csv(path, index=False)
-    assert message(read, path, torque="commanded") == (
-        f"{path}: tau (tau_J_d) is 0 in every row: this log holds no commanded torque"
-    )
-    read(path, torque="measured")
-    with open(path, "a") as file:
-        file.write("cut off,here\n")
-    assert "column 't': expected numbers, got 'cut off' at row 300" in message(read, path, torque="measured")
-
-
-@pytest.mark.parametrize("joint", ["{}{}", "{}_{}", "{}[{}]"])
-def test_wide_csv_from_zero(tmp_path, joint):
-    ns, q, dq, tau, _ = motion()
-    table = {"t": ns * 1e-9}
-    for name, x in (("q", q), ("dq", dq), ("tau", tau)):
-        table |= {joint.format(name, i): x[:, i] for i in range(7)}
-    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
-    assert_motion(read(tmp_path / "log.csv", torque="measured", n_joints=7), motion())
