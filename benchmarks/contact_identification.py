@@ -44,7 +44,8 @@ TWINS_NOTE = (
     "Identified from free motion, then from presses (`data.presses=6`), with encoders on the motors. slope: error of "
     "the estimate and its 95 % interval; with rigid gears: error if the gears are taken as rigid; gears: mean "
     "deflection by the largest torques. The prior of the gears was chosen on twins 0 to 9. stated gears: the same "
-    "presses with `identify.gears.stiffness=`, the twin's own with an error of 10 % per joint."
+    "presses with `identify.gears.stiffness=`, the twin's own with an error of 10 %, half of "
+    "its variance common to all joints."
 )
 ACCURACY = 0.1  # relative error of the stated gears
 PLAY = 2e-5  # m, of a Panda's encoders; see `TipMotion`
@@ -132,7 +133,8 @@ def identify_surface(variant: str, seed: int) -> Path:
 def identify_with_gears(variant: str, seed: int) -> Path:
     """Identify the surface of a twin's presses again, unless it is done, with stated gears; return the run folder."""
     run = ROOT / "runs" / "identify" / f"stated_{variant}_{seed}"
-    wrong = np.random.default_rng([seed, 11]).normal(0.0, ACCURACY, ROBOT.n)
+    rng, half = np.random.default_rng([seed, 11]), ACCURACY / np.sqrt(2.0)
+    wrong = rng.normal(0.0, half) + rng.normal(0.0, half, ROBOT.n)
     stated = (make_twin(ROBOT, variant=variant, seed=seed)._hidden[STIFF] * np.exp(wrong)).round().tolist()
     words = ["data=recording", f"data.contact={run.with_name(f'surface_{variant}_{seed}') / 'contact.npz'}"]
     words += [f"identify.gears.stiffness={stated}", f"identify.gears.accuracy={ACCURACY}"]

@@ -121,7 +121,7 @@ def main() -> None:
         f"`python run.py {' '.join(POLICY)}`, one core each; 200 goals, `dr=box`: each with its own box and arm.",
         markdown_rows(rows),
     ]
-    kept = "".join((RESULTS / "push.md").read_text().partition(f"## {TWINS}")[1:]).strip()
+    kept = "".join((RESULTS / "push.md").read_text().partition("## ")[1:]).strip()
     write_page("push", "Pushing a box", "python benchmarks/push.py", [*parts, *([kept] if kept else [])])
 
 

@@ -400,7 +400,7 @@ def written() -> dict[str, str]:
 def main() -> None:
     """Compute the rows here and in another checkout, and write the page."""
     only = [a.removeprefix("only=") for a in sys.argv[1:] if a.startswith("only=")]
-    before: dict[str, str] = {}
+    before = written()
     runs = []
     for folder in (a for a in sys.argv[1:] if "=" not in a and a != "json"):
         copy = shutil.copy(__file__, Path(folder) / "benchmarks")
@@ -414,7 +414,6 @@ def main() -> None:
     for run in runs:
         rest = json.loads(run.communicate()[0].splitlines()[-1])
         before = {f"{n}: {k}": v for n, r in rest.items() for k, v in r.items()}
-    before = before or written()
     pairs = [(n, k, v) for n, r in rows.items() for k, v in r.items()]
     lines = {f"{n}: {k}": {"before": before.get(f"{n}: {k}", ""), "now": v} for n, k, v in pairs}
     text = (

@@ -50,7 +50,7 @@ def test_what_is_late_does_not_go_into_the_links(robot, motion, lateness):
     assert half[0] < 2e-3  # a quarter of what is late
 
 
-def test_a_log_without_lateness_keeps_its_result(robot, motion):
+def test_a_log_without_lateness_keeps_its_other_values(robot, motion):
     """The delay's interval is shorter than a step and holds 0; nothing moves by a tenth of its half interval."""
     with_term, without = (found_in(robot, motion, *terms) for terms in (["signal_delay"], []))
     (at,) = with_term.space.where("signal_delay")
@@ -60,6 +60,14 @@ def test_a_log_without_lateness_keeps_its_result(robot, motion):
         ours, theirs = (f.x[f.space.where(name)] for f in (with_term, without))
         half = 0.5 * (without.found.high - without.found.low)[without.space.where(name)]
         assert np.all(np.abs(ours - theirs) <= 0.1 * half + 1e-9)
+
+
+def test_a_known_delay_is_kept(robot, motion):
+    """An identification that starts at a delay of 8 ms finds the same one again."""
+    start = replace(nominal_dynamics(robot, **conf("friction/uniform")), signal_delay=8e-3)
+    how = {"family": "coulomb", "terms": ["offset", "link", "signal_delay"]}
+    found = run(robot, start, late(motion, tau_rows=8), [TORQUE], **how)
+    assert found.dynamics.signal_delay == pytest.approx(8e-3, abs=1e-4)  # s: a tenth of the log's step
 
 
 def test_equal_lateness_that_no_fit_is_sure_of_stays(robot, motion, tmp_path):

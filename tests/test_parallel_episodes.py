@@ -1,5 +1,7 @@
 """Episodes on copies of a twin in parallel processes."""
 
+import os
+import signal
 import sys
 from contextlib import contextmanager
 
@@ -11,6 +13,7 @@ from conftest import conf
 from r2s.arm import parallel_episodes
 from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.twins.rigid_twin import RigidTwin
+from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.dynamics import nominal_dynamics
@@ -52,3 +55,27 @@ def test_two_processes_do_what_one_does_and_report_every_goal(panda, monkeypatch
     assert counts == sorted(counts)
     assert counts[-1] == GOALS
     np.testing.assert_array_equal(done[1].q, done[2].q)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="several processes only on Linux")
+@pytest.mark.parametrize(
+    ("end", "error", "words"),
+    [
+        (lambda: os.kill(os.getpid(), signal.SIGKILL), UserError, "a process that ran episodes was killed"),
+        (lambda: np.zeros(2)[3], IndexError, "out of bounds"),
+    ],
+    ids=["killed", "raised"],
+)
+def test_a_process_that_ends_early_ends_the_run(panda, monkeypatch, end, error, words):
+    """Out of memory, a process is killed: one line, and no wait for episodes that do not come."""
+    monkeypatch.setattr(parallel_episodes, "CHUNK", 1)
+    task = ReachTask(episode_s=0.2)
+    starts, goals = fixed_episodes(panda, task, 2)
+
+    @contextmanager
+    def open_twin(chunk):
+        end()
+        yield
+
+    with pytest.raises(error, match=words):
+        parallel_episodes.run_parallel_episodes(open_twin, None, task, starts, goals, 2, lambda k, total: None)

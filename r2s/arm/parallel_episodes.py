@@ -8,7 +8,9 @@ import multiprocessing
 import signal
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager
 from dataclasses import fields, replace
 from typing import Any
 
@@ -16,10 +18,12 @@ import numpy as np
 
 from r2s.arm.policy_runner import PolicyRunner, Stop
 from r2s.arm.realtime import Timing
+from r2s.errors import UserError
 from r2s.tasks.rollout import PolicyLike, rollout
 from r2s.tasks.task import Episodes, Task
 
 Progress = Callable[[int, int], None]
+Result = tuple[Episodes, list[Stop], Timing]
 CHUNK = 25  # goals
 REPORT_S = 1.0  # s, between reports of the goals that the processes have finished
 
@@ -43,9 +47,12 @@ def run_parallel_episodes(
         starts: (E, n) rad, first postures of the episodes. goals: (E, ...), see `Task`.
         workers: largest number of processes.
         progress: called with (goals done, total) after every goal, with several processes every REPORT_S.
+
+    Raises:
+        UserError: a process was killed.
     """
     chunks = range(-(-len(goals) // CHUNK))
-    done: dict[int, tuple[Episodes, list[Stop], Timing]] = {}
+    done: dict[int, Result] = {}
     job = open_twin, policy, task, starts, goals
 
     def after(earlier: int) -> Progress:
@@ -57,13 +64,21 @@ def run_parallel_episodes(
     else:
         context = multiprocessing.get_context("fork")
         finished = context.Value("l", 0)  # goals, of all processes
-        with context.Pool(min(workers, len(chunks)), _initialize, (job, finished)) as pool:
-            results = pool.imap_unordered(_work, chunks)
-            while len(done) < len(chunks):
-                with suppress(multiprocessing.TimeoutError):
-                    chunk, result = results.next(timeout=REPORT_S)
-                    done[chunk] = result
-                progress(finished.value, len(goals))
+        with ProcessPoolExecutor(min(workers, len(chunks)), context, _initialize, (job, finished)) as pool:
+            waiting = {pool.submit(_run_as_process, chunk): chunk for chunk in chunks}
+            try:
+                while waiting:
+                    for ended in wait(waiting, REPORT_S, FIRST_COMPLETED).done:
+                        done[waiting.pop(ended)] = ended.result()
+                    progress(finished.value, len(goals))
+            except BrokenProcessPool:
+                raise UserError(
+                    "a process that ran episodes was killed, as for lack of memory; threads=1 runs all in one process"
+                ) from None
+            except BaseException:  # Ctrl-C does not wait for the episodes that run
+                for process in multiprocessing.active_children():
+                    process.terminate()
+                raise
     parts = [done[chunk] for chunk in chunks]
     each = [episodes for episodes, _, _ in parts]
     names = [f.name for f in fields(Episodes) if f.name != "t" and getattr(each[0], f.name) is not None]
@@ -88,7 +103,7 @@ def _initialize(job: Any, finished: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
 
 
-def _work(chunk: int) -> tuple[int, tuple[Episodes, list[Stop], Timing]]:
+def _run_as_process(chunk: int) -> Result:
     counted = 0
 
     def count(k: int, total: int) -> None:
@@ -97,10 +112,10 @@ def _work(chunk: int) -> tuple[int, tuple[Episodes, list[Stop], Timing]]:
             _finished.value += k - counted
         counted = k
 
-    return chunk, _run_chunk(_job, chunk, count)
+    return _run_chunk(_job, chunk, count)
 
 
-def _run_chunk(job: Any, chunk: int, progress: Progress) -> tuple[Episodes, list[Stop], Timing]:
+def _run_chunk(job: Any, chunk: int, progress: Progress) -> Result:
     open_twin, policy, task, starts, goals = job
     first, now = chunk * CHUNK, slice(chunk * CHUNK, (chunk + 1) * CHUNK)
     with open_twin(chunk) as runner:

@@ -55,14 +55,14 @@ def stated_stiffness(cfg, robot):
         UserError: a value is invalid.
     """
     from r2s.identification.contact.surface_space import stated_gears
-    from r2s.physics.robot import per_joint
-    from r2s.stages.parts import plain
+    from r2s.stages.parts import called, plain
 
     gears = plain(cfg.identify.get("gears"))  # older configs lack this key
-    if gears is None or gears["stiffness"] is None:
+    if gears is None:
         return None
-    stiffness = per_joint("identify.gears.stiffness", gears["stiffness"], robot.n, f"the {robot.n} joints")
-    return stated_gears(robot.tau_max, stiffness, gears["accuracy"])
+    if not isinstance(gears, dict):
+        raise UserError(f"identify.gears: expected identify.gears.stiffness= and .accuracy=, got {gears!r}")
+    return called(stated_gears, "identify.gears", gears, robot.tau_max)
 
 
 def press_parts(cfg, robot, arm):

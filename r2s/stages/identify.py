@@ -14,6 +14,7 @@ from r2s.stages.contact import (
     keep_calibration,
     press_parts,
     pressed_surface,
+    stated_stiffness,
 )
 from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_user_ramps, record_arm
 from r2s.stages.parts import part
@@ -69,6 +70,7 @@ def make_parts(cfg):
     searches = [part(node, f"search.{k}") for k, node in enumerate(cfg.search)]
     check_number("identify.validation_fraction", cfg.identify.validation_fraction, "(0, 1)")
     check_number("identify.drift", cfg.identify.get("drift", 0.0), "[0, inf)")
+    stated_stiffness(cfg, robot)
     if cfg.data.torque in cfg.identify.terms:
         check_stated(make_settings(cfg, cfg.data.torque, [earlier] if earlier else []).stated, robot.n)
     if cfg.data.kind == "recording":

@@ -62,7 +62,7 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     ends = np.percentile(found.draws["gears"], COVERED, axis=0)
     rows = {"value": found.gears, "interval95_low": ends[0], "interval95_high": ends[1]}
     gears = {"unit": "rad/Nm"} | {name: [_number(v) for v in row] for name, row in rows.items()}
-    document["gears"] = gears | {"identifiable": found.identifiable.get("gears", False)}
+    document["gears"] = gears | {"stated": found.stated, "identifiable": found.identifiable.get("gears", False)}
     document[RIGID_GEARS] = _entries(simulated)
     document["mujoco"] = mujoco_contact(simulated.surface, inverse_mass(robot))
     document["sdf"] = sdf_surface(simulated.surface)

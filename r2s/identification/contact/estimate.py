@@ -51,7 +51,8 @@ class ContactEstimate:
         penetration: (2,) m, smallest and largest penetration depth in the recording.
         training: predicted and measured forces of fitted presses. validation: the same for unfitted presses, or None.
         gears: (n,) rad/Nm, compliance of the gears behind encoders on motors; 0: rigid gears or encoders on links.
-            Joints that contact and gravity hardly load have the mean deflection of all joints.
+            Joints that contact and gravity hardly load keep the prior's ratio to the mean deflection.
+        stated: whether the stiffness of the gears was stated.
         tau_max: (n,) Nm, largest torques of the joints.
         rigid_gears: the surface of the same recording for a simulation with rigid gears, which has the gears' springs
             in its own; None in an estimate with rigid gears.
@@ -64,6 +65,7 @@ class ContactEstimate:
     training: Press
     validation: Press | None
     gears: np.ndarray
+    stated: bool
     tau_max: np.ndarray
     rigid_gears: "ContactEstimate | None" = None
 
@@ -199,7 +201,7 @@ def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None,
     identifiable["slope"] &= bool(AT_BOUND < u[3] < 1 - AT_BOUND)  # gears may hide a stiff surface
     identifiable |= {"plane": bool(known[:3].all()), "stiffness": identifiable["slope"] and identifiable["exponent"]}
     if len(u) > SURFACE:  # the mean deflection, against its prior
-        sure = space.gears.stated or half[SURFACE] / 2 < space.gears.width / SOFTEST / SHARPER
+        sure = half[SURFACE] / 2 < space.gears.width / SOFTEST / SHARPER
         identifiable["gears"] = bool(sure and u[SURFACE] < 1 - AT_BOUND)
     touched = problem.tip.centre[depth > 0].mean(0)
     at = touched - ((touched - surface.point) @ surface.normal) * surface.normal
@@ -212,6 +214,7 @@ def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None,
         training=press_errors(problem.reweighted(u), u, presses(problem, u)),
         validation=validation,
         gears=space.compliance(u),
+        stated=space.gears.stated,
         tau_max=space.tau_max,
     )
 

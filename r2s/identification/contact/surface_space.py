@@ -1,10 +1,12 @@
 """Map the parameters of an unknown surface, and of gears in series with it, to a vector on the unit cube."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from r2s.errors import UserError, check_number
+from r2s.physics.robot import per_joint
 from r2s.physics.surface import UNIT_DEPTH, Surface
 
 LOAD = 10.0  # N, load at which slope and height are defined, so that slope and height depend little on the exponent
@@ -30,7 +32,7 @@ FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 # wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
 DEFLECTION, SOFTEST = 0.01, 0.05
 SCATTER, FARTHEST = 0.2, 0.6  # standard deviation and bound of a joint's deflection about the arm's, as shares of it
-LEAST_ACCURATE = 0.4  # of a stated stiffness; two standard deviations of a joint then fit into FARTHEST
+LEAST_ACCURATE = 0.4  # of a stated stiffness; two standard deviations then fit into FARTHEST and below SOFTEST
 
 
 @dataclass(frozen=True)
@@ -56,24 +58,34 @@ def unknown_gears(n: int) -> Gears:
     return Gears(np.ones(n), 0.0, DEFLECTION, SCATTER, False)
 
 
-def stated_gears(tau_max: np.ndarray, stiffness: np.ndarray, accuracy: float) -> Gears:
-    """Return the prior of gears of known stiffness (n,) Nm/rad, whose relative standard deviation is `accuracy`.
+def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float = 0.1) -> Gears | None:
+    """Return the prior of gears of known stiffness, or None if nothing is stated.
 
     Half of the variance is common to all gears, as an error of the data sheet would be.
+
+    Args:
+        tau_max: (n,) Nm, largest torques of the joints.
+        stiffness: Nm/rad, one value per joint, or that of the strongest joint; other joints then twist as far by
+            their largest torque. accuracy: relative standard deviation of the stiffness.
 
     Raises:
         UserError: a stiffness is not positive, `accuracy` is not in (0, LEAST_ACCURATE], or the gears are too soft.
     """
-    if not (np.isfinite(stiffness) & (stiffness > 0)).all():
-        raise UserError(f"identify.gears.stiffness: expected positive numbers, Nm/rad, got {stiffness.tolist()}")
-    check_number("identify.gears.accuracy", accuracy, f"(0, {LEAST_ACCURATE:g}]")
-    deflection = tau_max / stiffness
-    if (mean := float(deflection.mean())) > SOFTEST:
+    check_number("accuracy", accuracy, f"(0, {LEAST_ACCURATE:g}]")
+    if stiffness is None:
+        return None
+    own = per_joint("stiffness", stiffness, len(tau_max), f"the {len(tau_max)} joints")
+    if np.ndim(stiffness) == 0:
+        own = own * tau_max / tau_max.max()
+    if not (np.isfinite(own) & (own > 0)).all():
+        raise UserError(f"stiffness: expected positive numbers, Nm/rad, got {stiffness}")
+    deflection, half = tau_max / own, accuracy / np.sqrt(2.0)
+    mean, most = float(deflection.mean()), SOFTEST / (1.0 + 2.0 * half)
+    if mean > most:
         raise UserError(
-            f"identify.gears.stiffness: robot.tau_max would twist these gears by {mean:.3g} rad, allowed are "
-            f"{SOFTEST:g} rad; the unit is Nm/rad"
+            f"stiffness: robot.tau_max would twist these gears by {mean:.3g} rad, allowed are {most:.2g} rad; "
+            "the unit is Nm/rad"
         )
-    half = accuracy / np.sqrt(2.0)
     return Gears(deflection / mean, mean, half * mean, half, True)
 
 

@@ -289,7 +289,7 @@ class TorqueResidual:
         return self._with(_weights=self._weights_at(r, fitted), **own)
 
     def noise_at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the correlation length (n,), in rows, and the RMS (n,) Nm of the error at x (P,)."""
+        """Return correlation length (n,), in rows, and RMS (n,) Nm of the error at x (P,) without encoder noise."""
         factor, constant = self._weights_at(self._seen_errors(x), True)
         return factor**2, constant
 

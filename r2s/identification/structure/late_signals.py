@@ -28,11 +28,11 @@ BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether to estimate the delay of torque, "alike": whether torque and dq are equally late}.
 
-    If dq is on time, r2s estimates the delay unless it is clearly below LATE_S: set to 0, its interval would miss a
-    delay that is not clear. If dq is late, r2s first fits torque with corrected dq. If torque then clearly has a
-    delay, r2s corrects torque and dq. Otherwise it corrects only dq if this lowers the error of held-out torque by
-    more than one standard error, else it uses torque and dq as logged and treats both as equally late. With
-    folds < 2, it corrects only dq.
+    If dq is on time, or its lateness unknown, r2s estimates the delay unless it is clearly below LATE_S: with 0, the
+    interval would miss a delay that is not clear. If dq is late, r2s first fits torque with corrected dq. If torque
+    then clearly has a delay, r2s corrects torque and dq. Otherwise it corrects only dq if this lowers the error of
+    held-out torque by more than one standard error, else it uses torque and dq as logged and treats both as equally
+    late. With folds < 2, it corrects only dq.
     """
     on_time = not np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure).any()
     if DELAY in terms:
@@ -61,4 +61,4 @@ def torque_delay(cv: CrossValidation, terms: Sequence[str]) -> tuple[float, floa
     u = minimize(problem.residual, problem.linearize, u, FIT_STEPS, FIT_FTOL)
     (at,) = space.where(DELAY)
     sigma = posterior(problem, u, seed=0).steps.std(0)[at]
-    return float(np.abs(u - problem.start)[at] * space.width[at]), float(sigma * space.width[at])
+    return float(np.abs(space.from_unit(u)[at])), float(sigma * space.width[at])
