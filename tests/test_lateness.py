@@ -70,16 +70,24 @@ def test_a_known_delay_is_kept(robot, motion):
     assert found.dynamics.signal_delay == pytest.approx(8e-3, abs=1e-4)  # s: a tenth of the log's step
 
 
-def test_equal_lateness_that_no_fit_is_sure_of_stays(robot, motion, tmp_path):
-    """With dq and torque 2 ms late, dq is used as logged; links are the true ones, and the file keeps the choice.
+EQUAL = {"dq_s": 0.0025, "tau_rows": 2}  # behind a filter of 2.5 ms, dq is late by 2 ms, as torque is
 
-    With dq alone corrected, the inertia of link 1 about its axis is 0.9 times the true one.
-    """
-    recording = late(motion, dq_s=0.0025, tau_rows=2)
+
+def test_equal_lateness_that_a_fit_is_sure_of_is_corrected(robot, motion):
+    """Torque and dq are 2 ms late. With dq alone corrected, link 1 has 0.9 of its inertia about the axis."""
+    found = found_in(robot, late(motion, **EQUAL), "signal_delay")
+    assert not found.dynamics.late_alike
+    assert found.dynamics.signal_delay == pytest.approx(2e-3, abs=1e-4)  # s: a tenth of the log's step
+    assert np.all(np.abs(found.x[found.space.where("link_alpha")]) < 0.02)
+
+
+def test_equal_lateness_that_no_fit_is_sure_of_stays(robot, tmp_path):
+    """In twenty times the noise, dq is used as logged, which predicts better, and the file keeps the choice."""
+    noisy = recorded(robot, truth_of(robot), 8.0, "measured", noise=20 * NOISE * robot.tau_max)
+    recording = late(noisy, **EQUAL)
     found = found_in(robot, recording, "signal_delay")
     assert found.dynamics.late_alike
     assert found.dynamics.signal_delay == 0.0
-    assert np.all(np.abs(found.x[found.space.where("link_alpha")]) < 0.02)
     how = {"window_s": 0.2, "cutoff_hz": 10.0}
     other = replace(found.dynamics, late_alike=False)
     own, corrected = (prediction_errors(robot, other, d, recording, **how) for d in (found.dynamics, other))

@@ -227,22 +227,25 @@ def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solv
     """Fit torque from `start` (P,) in rounds, each weighted by the last; return u (P,) and the last round's problem.
 
     A fit to link-side torque has several minima if values are far outside of narrow priors: with the first weights,
-    which come from the nominal arm, it may keep cable torque near zero and distort friction instead. So a second fit
-    begins with priors at least as wide as the scatter among arms. Its result counts if it is likelier and clearly
-    lowers the error of a joint: effects that no model contains may also favor it, but hardly lower the error.
+    which come from the nominal arm, it may keep cable torque near zero and distort friction instead. So from nominal
+    values, a second fit begins with rounds whose priors are at least as wide as the scatter among arms; rounds with
+    the problem's priors follow. Its result counts if it is likelier and clearly lowers the error of a joint: effects
+    that no model contains may also favor it, but hardly lower the error.
     """
-    u, last = _rounds(problem, problem, start, rounds, solve)
-    wide = problem.with_usual_prior() if problem.at_link else problem
+    u, last = _rounds(problem, start, rounds, solve)
+    wide = problem.with_usual_prior() if problem.at_link and np.array_equal(start, problem.start) else problem
     if np.array_equal(wide.sigma, problem.sigma):
         return u, last
-    v, other = _rounds(wide, problem, start, rounds, solve)
+    v, other = _rounds(wide, start, rounds, solve)
+    other = replace(other, sigma=problem.sigma).reweighted(v, fitted=True)
+    v, other = _rounds(other, v, rounds, solve)
     return (v, other) if _clearly_likelier(other, v, last, u) else (u, last)
 
 
-def _rounds(first: Problem, problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
-    """Solve `first`, then `problem` reweighted at each result; return the last u (P,) and its problem."""
+def _rounds(problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
+    """Solve the problem from u (P,), and reweight it between rounds; return the last u and its problem."""
     for k in range(rounds):
-        u = solve(problem if k else first, u)
+        u = solve(problem, u)
         if k < rounds - 1:
             problem = problem.reweighted(u, fitted=True)
     return u, problem
