@@ -48,19 +48,51 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
-    covariance = np.linalg.inv(information + prior)
-    root = np.linalg.cholesky(covariance)
+    covariance, root = _inverse(information + prior)
     for own, s in zip(gram, score, strict=True):
         share, axes = np.linalg.eigh(root.T @ own @ root)  # a block's share of the information, by direction
         left = np.sqrt(np.maximum(1.0 - share, LEAST_LEFT))
         s[:] = np.linalg.solve(root.T, axes @ (axes.T @ (root.T @ s) / left))
     score = (score - score.mean(0)) * np.sqrt((few + 1) / few) * student.ppf(0.975, few) / norm.ppf(0.975)
-    least, robust = (covariance @ np.linalg.cholesky(m + prior) for m in (factor**2 * information, score.T @ score))
+    least, robust = (covariance @ _root(m + prior) for m in (factor**2 * information, score.T @ score))
     normal = np.random.default_rng(seed).standard_normal((DRAWS, len(u)))
     normal -= normal.mean(0)
     normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / DRAWS), normal.T).T  # of covariance 1, exactly
     steps = normal @ _at_least(least, robust).T
     return Posterior(u, inside_cube(u, steps, information + prior), information)
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """Return a square root (P, P) of a positive matrix, also if rounding made it indefinite.
+
+    A recording without noise and a wide prior differ in information by more than floats resolve.
+    """
+    try:
+        return np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        scale, values, axes = _resolved(matrix)
+        return scale[:, None] * axes * np.sqrt(values)
+
+
+def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse (P, P) of a positive matrix, and a square root of the inverse; see `_root`."""
+    try:
+        inverse = np.linalg.inv(matrix)
+        return inverse, np.linalg.cholesky(inverse)
+    except np.linalg.LinAlgError:
+        scale, values, axes = _resolved(matrix)
+        root = axes / scale[:, None] / np.sqrt(values)
+        return root @ root.T, root
+
+
+def _resolved(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return scale (P,), eigenvalues (P,) and axes (P, P) of matrix / scale / scale^T, with a unit diagonal.
+
+    No eigenvalue is below what rounding leaves of it.
+    """
+    scale = np.sqrt(np.diag(matrix))
+    values, axes = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return scale, np.maximum(values, len(values) * np.finfo(float).eps * values[-1]), axes
 
 
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
