@@ -17,8 +17,9 @@ from r2s.physics.robot import SIM_DT
 
 UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
-# Ratio of a joint's RMS errors in a wrong and the right minimum: 2 to 36 on arms drawn from the priors of
-# benchmarks/scaling.py; on a physical Panda, the fits with wide and narrow priors have 1.0 to 1.2.
+# Least ratio of a joint's RMS errors that counts as a wrong minimum. In trials with the 2- and 3-joint arms of
+# benchmarks/scaling.py, with values drawn from the priors, wrong minima had 1.9 to 36; on a physical Panda, where the
+# fit from narrow priors predicts better, the ratio is 1.0 to 1.2.
 CLEARLY = 2.0
 TAIL = 25.0  # for link-side torque, the prior is Student's t: degrees of freedom plus 1
 # implicit friction: least significance of its effect in standard deviations; range of actual over expected size

@@ -40,7 +40,6 @@ def contact_data(cfg, robot, file):
         raise UserError("robot.tool: data.contact needs the tip that touches: robot.tool=TOOL.json")
     if file.torque not in (None, "commanded"):
         raise UserError(f"data.contact: a surface is identified from commanded torque, not data.torque={file.torque}")
-    stated_stiffness(cfg, robot)
     files = [located(path) for path in (file.contact, file.contact_validation) if path]
     recordings = [read_file(robot, file, path, torque="commanded") for path in files]
     for recording in recordings:
@@ -76,7 +75,6 @@ def press_parts(cfg, robot, arm):
     from r2s.stages.data import check_data
 
     check_data(cfg)
-    stated_stiffness(cfg, robot)
     if robot.tool is None:
         raise UserError("robot.tool: data.presses needs the tip that touches: robot.tool=TOOL.json")
     if is_simulated(cfg) and not cfg.arm.get("surface"):

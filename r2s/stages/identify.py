@@ -121,6 +121,7 @@ def with_known_arm(cfg):
 def identify_with_known_arm(cfg, overrides, key):
     """Identify a surface or a payload with the model of `calibration=`; write contact.yaml or payload.yaml."""
     robot = make_robot(cfg)
+    stated_stiffness(cfg, robot)
     if key == "presses":
         arm = calibrated_arm(cfg, robot)
         plan = press_parts(cfg, robot, arm)

@@ -37,7 +37,8 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     on_time = not np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure).any()
     if DELAY in terms:
         late, sigma = torque_delay(cv, terms)
-        if late + UNCLEAR * sigma > LATE_S if on_time else late > max(SURE * sigma, LATE_S):
+        delayed = late + UNCLEAR * sigma > LATE_S if on_time else late > max(SURE * sigma, LATE_S)
+        if delayed:
             return {"delayed": True, "alike": False}
     if cv.folds < 2 or on_time:
         return {"delayed": False, "alike": False}
