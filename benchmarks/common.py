@@ -1,5 +1,6 @@
 """Shared by the benchmarks: the Panda with published and true values, settings of conf/, runs, result pages."""
 
+import json
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ from dataclasses import fields, replace
 from datetime import date
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import yaml
 
@@ -22,7 +24,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments
     **dict.fromkeys(("bench", "gallery"), ()),
     "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"(rigid|elastic)_\d+"),
     "grid": ("page",),
-    "press": (rf"minutes={NUMBER}", r"(rigid|elastic)_\d+"),
+    "press": (r"env_steps=[1-9]\d*", r"(rigid|elastic)_\d+"),
     "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
     "searches": (NUMBER,),
     "transfer": ("page", "twins", "noise", r"\d+"),
@@ -167,6 +169,18 @@ def identify_twins(twins: Iterable[tuple[str, int, Path]], root: Path) -> None:
 def cells(table, values: dict[str, float]) -> dict[str, str]:
     """Return {column: cell} of the measures `values` in the order of a task's `table` of measures."""
     return {table[key].column.replace("\n", " "): table[key].cell(values[key]) for key in table.rows}
+
+
+def means(table, rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the mean over rows of each measure in a task's `table`."""
+    return {key: float(np.mean([row[key] for row in rows])) for key in table.rows}
+
+
+def training_time(runs: Sequence[Path]) -> str:
+    """Return the range of env steps and of training time of finished trainings as words."""
+    last = [json.loads((run / "summary.json").read_text())["last"] for run in runs]
+    steps, minutes = ([row[key] for row in last] for key in ("env_steps", "wall_clock_s"))
+    return f"{min(steps):,} to {max(steps):,} env steps in {min(minutes) / 60:.1f} to {max(minutes) / 60:.1f} minutes"
 
 
 def markdown(table: pd.DataFrame) -> str:

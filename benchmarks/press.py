@@ -1,11 +1,11 @@
 """task=press and wipe on the hidden twins: the reference on the nominal and on the identified model, and policies.
 
-    python benchmarks/press.py [minutes=8] [rigid_0 elastic_0 ...]
+    python benchmarks/press.py [env_steps=480000] [rigid_0 elastic_0 ...]
 
-Identifies each twin, evaluates `algo=hybrid_force` with both models, trains policies on the identified one if minutes
-are given, with the twin's seed, and runs all on the twin with its surface, EPISODES goals each. Writes
+Identifies each twin, evaluates `algo=hybrid_force` with both models, with env_steps= trains policies on the
+identified one, with the twin's seed, and runs all on the twin with its surface, EPISODES goals each. Writes
 results/press.md. Finished runs are kept in runs/press and not repeated. A twin takes about 4 minutes of one core, and
-minutes= twice more.
+each of its two policies 3.
 """
 
 import json
@@ -13,7 +13,7 @@ import re
 import sys
 from pathlib import Path
 
-from common import NOMINAL, ROOT, cells, identify_twins, markdown_rows, run_parallel, write_page
+from common import NOMINAL, ROOT, cells, identify_twins, markdown_rows, means, run_parallel, training_time, write_page
 
 from r2s.tasks.press_measures import PRESS
 from r2s.tasks.wipe_measures import WIPE
@@ -28,19 +28,29 @@ FORCES = {
 Twin = tuple[str, str]  # variant and seed
 
 
-def rows_of(task: str, folder: Path, row: str) -> dict[str, str]:
-    """Return the cells of one row of a run's summary.json."""
-    return cells(TABLES[task], json.loads((folder / "summary.json").read_text())[row])
+def row_of(folder: Path, row: str) -> dict[str, float]:
+    """Return the measures of one row of a run's summary.json."""
+    return json.loads((folder / "summary.json").read_text())[row]
 
 
-def models_of(task: str, twins: list[Twin], minutes: str | None) -> dict[str, dict[Twin, str]]:
+def summarized(task: str, each: dict[tuple[str, str], list[dict[str, float]]], name: str) -> str:
+    """Return a table of {(variant, label): rows of the twins}: the means, and each measure's worst twin."""
+    table, rows = TABLES[task], {}
+    for (variant, label), values in each.items():
+        worst = {m: table[m].sign * min(table[m].sign * v[m] for v in values) for m in table.rows}
+        rows[f"{variant}, {label}: mean of {len(values)}"] = cells(table, means(table, values))
+        rows[f"{variant}, {label}: worst"] = cells(table, worst)
+    return markdown_rows(rows, name)
+
+
+def models_of(task: str, twins: list[Twin], env_steps: str | None) -> dict[str, dict[Twin, str]]:
     """Train or evaluate what is missing in simulation; return {label: {twin: name of its run}}."""
     common = f"task={task}", f"root={RUNS}", f"evaluation.episodes={SIMULATED}"
     jobs = [[*common, *NOMINAL, "algo=hybrid_force", f"name={task}_nominal"]]
     names = {"reference, nominal": dict.fromkeys(twins, f"{task}_nominal")}
     algos = {"reference": ["algo=hybrid_force"]}
-    if minutes:
-        algos["policy"] = ["algo=tqc", f"budget.minutes={minutes}"]
+    if env_steps:
+        algos["policy"] = ["algo=tqc", "budget.minutes=null", f"budget.env_steps={env_steps}"]
     for what, words in algos.items():
         names[f"{what}, identified"] = {(v, s): f"{task}_{what}_{v}_{s}" for v, s in twins}
         for (v, s), name in names[f"{what}, identified"].items():
@@ -62,32 +72,30 @@ def section(task: str, names: dict[str, dict[Twin, str]]) -> list[str]:
         ]
         for label, v, s, name in runs
     )
-    transferred = {
-        f"{label}: {v} {s}": rows_of(task, RUNS / "transfer" / name, "twin")
-        for (label, v, s), name in on_twin.items()
-    }
-    simulated = {f"{label}: {v} {s}": rows_of(task, RUNS / "train" / name, "best") for label, v, s, name in runs}
-    rows = [json.loads((RUNS / "train" / name / "summary.json").read_text())["last"] for *_, name in runs]
-    steps = [row["env_steps"] for row in rows if row["env_steps"]]  # the reference has none
+    transferred, simulated = {}, {}
+    for (label, v, s), name in on_twin.items():
+        transferred.setdefault((v, label), []).append(row_of(RUNS / "transfer" / name, "twin"))
+        simulated.setdefault((v, label), []).append(row_of(RUNS / "train" / names[label][v, s], "best"))
+    policies = [RUNS / "train" / name for label, _, _, name in runs if label.startswith("policy")]
     return [
         f"## {FORCES[task]}",
         f"{EPISODES} goals on each twin. No force is fed back."
-        + (f" Policies had {min(steps):,} to {max(steps):,} env steps." if steps else ""),
-        markdown_rows(transferred, "on the twin"),
+        + (f" Policies: {training_time(policies)}, one core each." if policies else ""),
+        summarized(task, transferred, "on the twin"),
         f"In MuJoCo, {SIMULATED} goals with `dr=contact`: each with a surface of its own, friction within 10 %.",
-        markdown_rows(simulated, "in simulation"),
+        summarized(task, simulated, "in simulation"),
     ]
 
 
 def main() -> None:
     """Run what is missing and write the page."""
     words = sys.argv[1:]
-    minutes = next((w.removeprefix("minutes=") for w in words if w.startswith("minutes=")), None)
+    env_steps = next((w.removeprefix("env_steps=") for w in words if w.startswith("env_steps=")), None)
     named = [w for w in words if re.fullmatch(r"(rigid|elastic)_\d+", w)] or ["rigid_0", "elastic_0"]
     twins = [(v, s) for v, _, s in (name.partition("_") for name in named)]
     identify_twins([(v, int(s), RUNS / "identify" / f"{v}_{s}") for v, s in twins], RUNS)
-    about = [f"Policies: `algo=tqc budget.minutes={minutes}` on one core, the twin's seed."] if minutes else []
-    parts = about + [part for task in TABLES for part in section(task, models_of(task, twins, minutes))]
+    about = [f"Policies: `algo=tqc budget.env_steps={env_steps}` on one core, the twin's seed."] if env_steps else []
+    parts = about + [part for task in TABLES for part in section(task, models_of(task, twins, env_steps))]
     write_page("press", "Pressing and wiping", " ".join(["python benchmarks/press.py", *words]), parts)
 
 

@@ -1,19 +1,18 @@
 """task=push: five trainings with demonstrations, and the reference that demonstrates, also on hidden twins.
 
-    python benchmarks/push.py [page | [minutes=10] rigid_100 elastic_200 ...]
+    python benchmarks/push.py [page | [env_steps=1000000] rigid_100 elastic_200 ...]
 
 Trains what is missing, each on one core, and writes benchmarks/results/push.md; `page` trains nothing. The goals of
 reports, boxes and arms selected nothing. With twins, identifies each and runs the reference on the twin with its box,
 with the nominal and with the identified model, EPISODES goals each, and replaces the page's section on twins. With
-minutes, trains a policy on each identified model too, with the twin's seed, and replaces the section on policies
-instead. A twin takes about 6 minutes of one core, and minutes= once more. Run folders: runs/push.
+env_steps, trains a policy on each identified model too, with the twin's seed, and replaces the section on policies
+instead. A twin takes about 6 minutes of one core, a policy about 20 more. Run folders: runs/push.
 """
 
 import json
 import re
 import sys
 
-import numpy as np
 from common import (
     NOMINAL,
     RESULTS,
@@ -21,9 +20,11 @@ from common import (
     cells,
     identify_twins,
     markdown_rows,
+    means,
     put_section,
     run_parallel,
     stamp,
+    training_time,
     write_page,
 )
 
@@ -45,27 +46,28 @@ def trained(name: str) -> dict[str, str] | None:
     return cells(PUSH, json.loads(path.read_text())["last"]) if path.is_file() else None
 
 
-def trained_for(twins: list[tuple[str, str]], minutes: str | None) -> dict[str, str]:
+def trained_for(twins: list[tuple[str, str]], env_steps: str | None) -> dict[str, str]:
     """Train or evaluate what is missing in simulation; return {label: name of a run with places for the twin}."""
     common, of_twins = ("task=push", f"root={RUNS}"), f"evaluation.episodes={EPISODES}"
     jobs = [[*common, of_twins, "algo=pusher", *NOMINAL, "name=nominal"]]
     names = {"nominal model": "nominal", "identified model": "identified_{}_{}"}
-    if minutes:
+    budget = "budget.minutes=null", f"budget.env_steps={env_steps}"
+    if env_steps:
         names["policy, identified model"] = "policy_{}_{}"
     for v, s in twins:
         own = [*common, f"calibration={RUNS / 'identify' / f'{v}_{s}'}"]
         jobs.append([*own, of_twins, "algo=pusher", f"name=identified_{v}_{s}"])
-        if minutes:
-            jobs.append([*own, *ALGO, f"budget.minutes={minutes}", f"seed={s}", f"name=policy_{v}_{s}"])
+        if env_steps:
+            jobs.append([*own, *ALGO, *budget, f"seed={s}", f"name=policy_{v}_{s}"])
     run_parallel(jobs)
     return names
 
 
-def on_twins(words: list[str], minutes: str | None) -> list[str]:
+def on_twins(words: list[str], env_steps: str | None) -> list[str]:
     """Run the models on twins (variant_seed); return the parts of their section."""
     twins = [(v, s) for v, _, s in (w.partition("_") for w in words)]
     identify_twins([(v, int(s), RUNS / "identify" / f"{v}_{s}") for v, s in twins], RUNS)
-    models = trained_for(twins, minutes)
+    models = trained_for(twins, env_steps)
     arm = "simulator=none", "arm=twin", "arm.surface=box", f"evaluation.episodes={EPISODES}", f"root={RUNS}"
     on_twin = {(m, v, s): f"{name.partition('_')[0]}_on_{v}_{s}" for m, name in models.items() for v, s in twins}
     run_parallel(
@@ -80,21 +82,19 @@ def on_twins(words: list[str], minutes: str | None) -> list[str]:
         for model in models:
             own = [name for (m, v, _), name in on_twin.items() if (m, v) == (model, variant)]
             each = [json.loads((RUNS / "transfer" / n / "summary.json").read_text())["twin"] for n in own]
-            mean = {key: float(np.mean([values[key] for values in each])) for key in PUSH.rows}
             success = [100 * values["success"] for values in each]
             rows[f"{variant}, {model}"] = (
                 {"twins": str(len(own))}
-                | cells(PUSH, mean)
+                | cells(PUSH, means(PUSH, each))
                 | {"success by twin, %": f"{min(success):.0f} to {max(success):.0f}"}
             )
     what = f"`algo=pusher` with each model on the twin with its box; {EPISODES} goals on each; means over the twins."
-    if minutes:
+    if env_steps:
         runs = [RUNS / "train" / models["policy, identified model"].format(v, s) for v, s in twins]
-        steps = [json.loads((run / "summary.json").read_text())["last"]["env_steps"] for run in runs]
-        what += f" Policies: `{' '.join(ALGO)} budget.minutes={minutes}` on one core, the twin's seed; they had "
-        what += f"{min(steps):,} to {max(steps):,} env steps."
+        what += f" Policies: `{' '.join(ALGO)} budget.env_steps={env_steps}` on one core, the twin's seed: "
+        what += f"{training_time(runs)}."
     return [
-        stamp(" ".join(["python benchmarks/push.py", *([f"minutes={minutes}"] if minutes else []), *words])),
+        stamp(" ".join(["python benchmarks/push.py", *([f"env_steps={env_steps}"] if env_steps else []), *words])),
         what,
         markdown_rows(rows),
     ]
@@ -103,10 +103,10 @@ def on_twins(words: list[str], minutes: str | None) -> list[str]:
 def main() -> None:
     """Train what is missing and write the page, or its section on twins."""
     words = sys.argv[1:]
-    minutes = words[0].partition("=")[2] if words and re.fullmatch(r"minutes=\d+(\.\d+)?", words[0]) else None
-    twins = words[1:] if minutes else words
+    env_steps = words[0].partition("=")[2] if words and re.fullmatch(r"env_steps=[1-9]\d*", words[0]) else None
+    twins = words[1:] if env_steps else words
     if twins and all(TWIN.fullmatch(word) for word in twins):
-        put_section(RESULTS / "push.md", POLICIES if minutes else TWINS, on_twins(twins, minutes))
+        put_section(RESULTS / "push.md", POLICIES if env_steps else TWINS, on_twins(twins, env_steps))
         return
     if words not in ([], ["page"]):
         raise SystemExit(__doc__)
