@@ -1,11 +1,11 @@
 """task=press and wipe on the hidden twins: the reference on the nominal and on the identified model, and policies.
 
-    python benchmarks/press.py [env_steps=480000] [rigid_0 elastic_0 ...]
+    python benchmarks/press.py [env_steps=320000] [rigid_0 elastic_0 ...]
 
 Identifies each twin, evaluates `algo=hybrid_force` with both models, with env_steps= trains policies on the
 identified one, with the twin's seed, and runs all on the twin with its surface, EPISODES goals each. Writes
 results/press.md. Finished runs are kept in runs/press and not repeated. A twin takes about 4 minutes of one core, and
-each of its two policies 3.
+each of its two policies 2.
 """
 
 import json
