@@ -1,24 +1,30 @@
-# make run: everything on the embedded twin. make test: lint and tests. Both set up what is missing first.
+# make run: everything on the embedded twin. make test: lint and quick tests. Both set up what is missing first.
 # make docs: the site, strictly, into site/. make gazebo-classic: the world plugin of simulator=gazebo_classic.
-# make test-slow: the tests that take minutes. make test-portable: the numeric ones again, as on other processors.
+# make test-long: the tests that take seconds. make test-slow: those that take minutes.
+# make test-portable: the numeric ones again, as on other processors. make check: all but test-slow, as .ci/run.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test test-slow test-portable lint format bench docs gazebo-classic setup uv.lock clean
+.PHONY: run test test-long test-slow test-portable check lint format bench docs gazebo-classic setup uv.lock clean
 
 run: $(READY)
 	$(BIN)/python run.py stage=pipeline
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n 2 --dist loadgroup
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow and not long" -n 2 --dist loadgroup
+
+test-long: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "long and not slow" -n 2 --dist loadgroup
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
 
 test-portable: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/portable.py -n 2 --dist loadgroup
+
+check: test test-long test-portable
 
 lint: $(READY)
 	$(BIN)/ruff check .

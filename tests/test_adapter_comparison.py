@@ -308,6 +308,7 @@ def test_conditions_in_order():
     assert in_words(condition({"soft_start_s": 0.5}, ["arm.soft_start_s"])) == "soft_start_s=0.5"
 
 
+@pytest.mark.long
 def test_the_stage_compares_adapters_unless_there_is_a_training(tmp_path):
     """Through the command line; with a training, transfers are left out with a hint."""
     runs = tmp_path / "runs"

@@ -270,6 +270,7 @@ def test_a_motion_begins_without_memory():
             assert np.any(added)
 
 
+@pytest.mark.long
 def test_a_missing_part_of_an_adapter_gets_one_line(tmp_path):
     (tmp_path / "config.yaml").write_text("calibration: null\n")
     arm = {"name": "twin"}

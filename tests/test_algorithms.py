@@ -110,6 +110,7 @@ def test_two_learners_from_one_state_are_apart(kind):
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "backend"), [(TQC, "aot_eager"), *(pytest.param(k, "inductor", marks=SLOW) for k in ALL)]
 )
@@ -146,6 +147,7 @@ def test_compiling_takes_no_more_processes_than_threads(monkeypatch):
     assert inductor.compile_threads == before
 
 
+@pytest.mark.long
 def test_without_a_compiler_one_warning(tmp_path, monkeypatch):
     """The learner stays as it is and learns on."""
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
@@ -236,6 +238,7 @@ def test_exploration_is_correlated_and_falls(kind):
         assert float(algo.entropy_goal) == pytest.approx(algo.target_entropy + N * math.log(0.1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ALL)
 def test_learns_to_bring_a_point_to_zero(kind):
     """A point x' = x + a/2 with reward -x'^2: after 580 updates on what it did itself, |x| < 0.2 after five steps."""
@@ -283,6 +286,7 @@ def learner_of(kind, robot, task):
     return kind((mean, std), torch.from_numpy(task.torque_limit(robot)), **{"hidden": HIDDEN})
 
 
+@pytest.mark.long
 def test_a_deterministic_policy_becomes_onnx(panda, tmp_path):
     """policy.onnx of TD3 gives the torques of the torch policy, within 1e-5 of their scale."""
     import onnxruntime

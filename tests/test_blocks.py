@@ -48,6 +48,7 @@ def coverage(times: int, slower: float, ripple: float) -> float:
     return float(np.mean(inside))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("times", "slower"), [(1, 1.0), (6, 1.0), (1, 4.0)])
 def test_intervals_under_torque_ripple(times, slower):
     """Ripple repeats with the motion and lasts with its slowness: at least 85 % of 95 % intervals hold the truth."""

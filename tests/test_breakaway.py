@@ -86,6 +86,7 @@ def recorded(panda, truth, poses):
 # --- an arm of known truth
 
 
+@pytest.mark.long
 def test_the_dead_zone_of_the_paper_is_found(recorded, truth):
     """All 14 edges of Table II within 2 % or 0.01 Nm, at two poses; repeatable, and fitted down to the noise."""
     found = estimate_breakaway(recorded[0])
@@ -96,6 +97,7 @@ def test_the_dead_zone_of_the_paper_is_found(recorded, truth):
     assert found.misfit.max() < 4e-5
 
 
+@pytest.mark.long
 def test_a_late_torque_is_allowed_for(panda, truth, poses):
     """Commands that act 3 ms late shift every edge outwards by 3 ms of ramp, unless `delay` says so."""
     ramps = ramp(simulated(panda, truth, seed=1, late=3), poses)
@@ -130,6 +132,7 @@ def test_the_protocol_is_short_gentle_and_complete(recorded, panda, poses):
         assert sign * (ramps.recording.q[rows.stop - 1, j] - ramps.recording.q[rows.start, j]) > 5e-3
 
 
+@pytest.mark.long
 def test_a_joint_that_does_not_move_or_does_not_rest_leaves_the_others_alone(panda, truth):
     """Joint 5 is held by more than is tried; joint 7 slides without command, and is ramped from what stops it."""
     breaks, offset = truth.breakaway.copy(), truth.offset.copy()
@@ -166,6 +169,7 @@ def test_an_arm_that_stops_says_so(panda, truth):
 # --- the twin: another engine, bristles that creep by millirads before they let go
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_twin_lets_go_where_its_friction_does(panda, poses, seed):
     """Level of the bristles at rest, less offset and drag: 15 % as a rule, and repeatable from pose to pose."""
@@ -255,6 +259,7 @@ def falling(U=0.9, level=0.6, viscous=0.3, fall=0.04, inertia=0.8, rate=0.15):
     return Ramps(Recording(t, q, 0 * q, tau, "commanded"), joint=1, sign=-1), known
 
 
+@pytest.mark.long
 def test_friction_that_falls_slowly_is_let_go_of_in_time_once_the_slide_is_known():
     """An inertia that is 5 % off does not matter; a slide that hardly falls is not taken."""
     ramps, known = falling()
@@ -386,6 +391,7 @@ def in_file(path, columns):
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
 def test_ramps_of_a_users_own(tmp_path, suffix):
     """Columns of any format, with and without dq; the third ramp of joint 2 is its second repeat upwards."""

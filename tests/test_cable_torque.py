@@ -15,6 +15,7 @@ SHARE = np.array(
 )  # of tau_max, amplitudes of sine and cosine: a hundred standard deviations of the prior
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 def test_large_cable_torque_is_not_friction(seed):
     """The first joint's axis is vertical, so that gravity has no part in its cable torque."""

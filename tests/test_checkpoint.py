@@ -75,6 +75,7 @@ def make_algo(env):
     return TQC((mean, std), scale, hidden=(16, 16), explore_correlation=0.9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["sigmoid", "bristle"])
 def test_an_environment_goes_back_to_its_state(panda, family):
     """From `state`, another environment does the same steps, resets and draws included, to the bit."""
@@ -99,6 +100,7 @@ def test_an_environment_goes_back_to_its_state(panda, family):
     assert family != BRISTLE.name or np.abs(one.arms.sim.state()["_memory"]).max() > 0
 
 
+@pytest.mark.long
 def test_a_killed_training_resumes_to_the_same_policy(tmp_path):
     """Killed after its first checkpoint and resumed: the same policy and evaluations as without, to the bit."""
     stopped = started(*QUICK, "name=stopped", at=tmp_path)
@@ -234,6 +236,7 @@ def test_updates_begin_with_the_first_transition_and_evaluations_keep_their_dist
     assert rows[-1]["updates"] == (240 - max(4, starts)) / 4
 
 
+@pytest.mark.long
 def test_arms_that_step_beside_the_updates_give_the_same_run(panda):
     """Bit for bit what steps and updates in turn give: networks, optimizer and arms."""
     ends = []
@@ -268,6 +271,7 @@ def break_goal(env, step):
     return env
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("concurrent", [False, True])
 def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, concurrent):
     """NaN in the physics: the message names value, arm and time."""

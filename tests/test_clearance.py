@@ -75,6 +75,7 @@ def way(a, b, seconds, rest=0.5):
 # --- the fence of the driver
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_no_torque_drives_an_arm_into_itself_or_the_table(seed):
     """Without the fence some of the same arms touch."""
@@ -128,6 +129,7 @@ def test_every_driver_has_a_fence():
 # --- clearance of plans
 
 
+@pytest.mark.long
 def test_the_allowed_deviation_touches_nothing():
     """Whatever joints do within it: at its bound in a thousand directions, of all joints and of single ones."""
     rng, space = np.random.default_rng(0), Space(PANDA, z_min=-np.inf)
@@ -179,6 +181,7 @@ def test_a_recording_may_deviate_less_near_the_table():
 # --- the operator's speed cap
 
 
+@pytest.mark.long
 def test_the_speed_share_bounds_every_speed():
     """With the torque of an episode, full or changing: below the share of each limit; without it most are above."""
     _, free, _ = hostile(60, 5)

@@ -182,6 +182,7 @@ def stopped(root) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_a_resumed_identification_ends_where_an_uninterrupted_one_does(stopped, identified):
     """Killed, then `resume=`: the same numbers in every file that holds results; resumed again it is refused."""
     succeed(f"resume={stopped}")
@@ -195,6 +196,7 @@ def test_a_resumed_identification_ends_where_an_uninterrupted_one_does(stopped, 
     assert "is finished" in done.stderr
 
 
+@pytest.mark.long
 def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
     """One bad value: one line, exit status 2, the other job done; a repeated sweep skips that one."""
     sweep = ["-m", *SHORT, f"root={tmp_path}", "skip_completed=true", "name=lr${algo.lr}", "algo.lr=2.0,1e-3"]
@@ -229,6 +231,7 @@ def test_the_grid_is_what_its_file_says(tmp_path):
     assert all((tmp_path / "train" / name / "policy.onnx").is_file() for name in names)
 
 
+@pytest.mark.long
 def test_the_papers_reward_ends_alone_and_without_noise(tmp_path):
     """experiment=paper_reward ends in eq. (2) alone; noise has fallen 15-fold before, the learning rate threefold."""
     succeed("+experiment=[paper_reward,toy]", f"root={tmp_path}", "name=eq2")
@@ -250,6 +253,7 @@ OWN_TESTS = r"resume=|list|look|export|check|convert|engines|.*data\.contact=|.*
 TYPED = [c for c in COMMANDS if not re.match(OWN_TESTS, c)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "command", [pytest.param(c, marks=[pytest.mark.slow] if c.startswith(COSTLY) else []) for c in TYPED]
 )
@@ -352,6 +356,7 @@ def test_exported_policy_is_the_trained_policy(trained):
     assert facts["q_min_rad"].split()[3] == "-3.0718"
 
 
+@pytest.mark.long
 def test_every_algorithm_trains(root):
     """A sweep over those that the grid leaves out writes a run folder with a policy each."""
     out = succeed("-m", "algo=ddpg,sac", f"root={root}", *SHORT)
@@ -399,6 +404,7 @@ IN_TRANSFER = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mistake", IN_TRANSFER)
 def test_mistake_in_a_transfer_gets_one_line(mistake, trained, tmp_path):
     """Before the first goal and the run folder."""
@@ -423,6 +429,7 @@ def test_a_policy_for_an_fr3_meets_one(root):
     assert (root / "transfer" / "fr3" / "stops.txt").read_text() == "none\n"
 
 
+@pytest.mark.long
 def test_a_training_transfers_without_the_identification_that_it_came_from(identified, tmp_path):
     """calibration= and dr=identified: with the identify folder gone, the same policy meets the same arms."""
     folder = tmp_path / "identified"
@@ -455,6 +462,7 @@ def test_another_arm_needs_no_more_than_its_file(root):
     assert parameters["joints"] == len(parameters["parameters"]["phi1"]["value"]) == 6
 
 
+@pytest.mark.long
 def test_names_that_are_taken_get_one_line(tmp_path):
     """A run folder with other settings, or of another process, is neither used nor overwritten."""
     words = [*SHORT, f"root={tmp_path}", "name=a", "compile=false"]
@@ -479,6 +487,7 @@ def test_names_that_are_taken_get_one_line(tmp_path):
     assert re.search(rf"process {os.getpid()} on .* is still writing", done.stderr)
 
 
+@pytest.mark.long
 def test_the_same_policy_in_dart(trained, root):
     """DART and MuJoCo agree on every measure; the summary holds the path gap."""
     succeed("stage=transfer", f"policy={trained}", "simulator=dart", "arm=none", "name=dart", f"root={root}", *TOY)
@@ -488,6 +497,7 @@ def test_the_same_policy_in_dart(trained, root):
     assert rows["dart"]["return_paper"] == pytest.approx(rows["mujoco"]["return_paper"], abs=1.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arm", "package"),
     [

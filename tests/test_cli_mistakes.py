@@ -145,6 +145,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.long
 def test_options_of_the_launcher_that_an_experiment_chose():
     """They are known, and what the lines above say to type is taken."""
     check_overrides(["+experiment=paper_grid", "hydra.launcher.n_jobs=2"], None, multirun=True)

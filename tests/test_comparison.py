@@ -256,6 +256,7 @@ def test_trainings_of_a_task_from_outside_r2s_are_compared_by_its_measures(tmp_p
     assert "force error, last evaluation" in (run.folder / "report.md").read_text()
 
 
+@pytest.mark.long
 def test_the_stage_is_read_in_a_terminal_of_110_columns(user_folder, tmp_path):
     """Table, key, and the runs that were not compared; the legend leaves the figures room."""
     printed = succeed("stage=compare", f"runs={user_folder}/*", f"root={tmp_path}", "name=all")
@@ -339,6 +340,7 @@ def test_a_winner_by_chance_is_no_better_on_a_held_out_seed():
     assert abs(np.mean(unseen)) < 4 * np.std(unseen) / 200**0.5
 
 
+@pytest.mark.long
 def test_winners_at_the_edge_of_what_was_tried_are_named(tmp_path):
     """The best of three learning rates is the largest: a line; one between two others, or of two: none."""
     for k, (lr, batch) in enumerate([("5e-4", 256), ("1e-3", 256), ("2e-3", 128)]):

@@ -98,6 +98,7 @@ def test_a_declared_load_is_expected_in_the_arm(kind, robot):
         assert refused(kind, robot, at_rest(robot, kind.version, arm=twin)) == []
 
 
+@pytest.mark.long
 def test_a_refused_client_is_closed_and_a_check_does_not_move(client, robot):  # noqa: F811
     """With the real packages: one line; the arm's only connection is free again; a check begins no motion."""
     name, make, version = client
@@ -184,6 +185,7 @@ def checked(words, monkeypatch, capsys):
     return status, printed.out, printed.err
 
 
+@pytest.mark.long
 def test_r2s_check_prints_a_page_and_moves_nothing(client, robot, monkeypatch, capsys):  # noqa: F811
     """Exit status 0 with the right settings; 2 and the reason with wrong ones, after the same page."""
     name, _, version = client
@@ -199,6 +201,7 @@ def test_r2s_check_prints_a_page_and_moves_nothing(client, robot, monkeypatch, c
         assert error.count("\n") == bool(status)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["panda", pytest.param("fr3", marks=pytest.mark.slow)])
 def test_r2s_check_reads_states(name, robot, monkeypatch, capsys):
     """In real time it counts the states of an idle arm; a loaded machine may lose some."""
@@ -212,6 +215,7 @@ def test_r2s_check_reads_states(name, robot, monkeypatch, capsys):
     assert "lost states" in page
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "line"),
     [

@@ -113,6 +113,7 @@ def test_elastic_gears_are_separated_from_the_surface(robot, behind_gears, separ
     assert found.validation.rmse() < rigid.validation.rmse()
 
 
+@pytest.mark.long
 def test_stated_gears_sharpen_the_surface(robot, behind_gears, separated):
     """A stiffness off by two standard deviations in one direction: the interval is narrower and holds the truth."""
     arm, _, gears, recording = behind_gears
@@ -348,6 +349,7 @@ def run(folder: Path, *words: str):
     return folder / "runs" / "identify"
 
 
+@pytest.mark.long
 def test_the_command_writes_a_surface_that_calibration_can_be(files, capsys, found):
     """stage=identify data.contact=FILE calibration=RUN: table, figure, yaml, summary, and the arm beside it."""
     words = [f"data.contact={files / 'contact.npz'}", f"robot.tool={files / 'tool.json'}", "name=surface"]
@@ -383,6 +385,7 @@ GEARS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("word", GEARS)
 def test_gears_that_cannot_be_are_one_line(word, files):
     """Refused before a run folder exists, also where the arm would first be identified from free motion."""
@@ -403,6 +406,7 @@ def test_one_stiffness_is_that_of_the_strongest_joint(robot):
     assert one.center == pytest.approx(robot.tau_max.max() / 14e3)
 
 
+@pytest.mark.long
 def test_an_arm_that_rests_in_contact_is_refused(arm, recording):
     """All joints rest: whatever presses is hidden by friction."""
     still = np.zeros_like(recording.q) + recording.q[1000]

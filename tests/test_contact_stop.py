@@ -113,6 +113,7 @@ def test_no_stop_amid_hostile_torques_exceeds_the_bound(stop):
     assert (touched > 100).mean() > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("variant", ["rigid", pytest.param("elastic", marks=pytest.mark.slow)])
 @KINDS
 def test_on_a_twin_an_episode_that_stops_or_ends_leaves_as_decided(stop, variant):

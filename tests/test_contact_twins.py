@@ -89,6 +89,7 @@ def test_a_surface_out_of_reach_changes_no_bit(variant):
     assert not b.O_F_ext_hat_K.any()
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("stiffness", [3e3, 1e5])
 def test_a_twin_presses_and_keeps_its_force(variant, stiffness):

@@ -305,6 +305,7 @@ def test_a_bad_dataset_is_refused_in_one_line(tmp_path, features, how, edit, exp
 # --- r2s convert
 
 
+@pytest.mark.long
 def test_convert_writes_both_from_a_run_folder(tmp_path, capsys, monkeypatch):
     """The plan beside a recording becomes /reference; a dataset converts on; r2s -> each -> r2s agrees."""
     monkeypatch.chdir(tmp_path)
@@ -321,6 +322,7 @@ def test_convert_writes_both_from_a_run_folder(tmp_path, capsys, monkeypatch):
         assert_same(out, true)
 
 
+@pytest.mark.long
 def test_the_commands_of_the_reference(tmp_path, monkeypatch):
     """docs/reference/commands.md: FILE is a CSV in it."""
     monkeypatch.chdir(tmp_path)
@@ -337,6 +339,7 @@ def test_the_commands_of_the_reference(tmp_path, monkeypatch):
         assert_same(out, true)
 
 
+@pytest.mark.long
 def test_convert_writes_the_episodes_of_a_transfer(tmp_path):
     episodes, steps = 3, 20
     rng = np.random.default_rng(0)
@@ -352,6 +355,7 @@ def test_convert_writes_the_episodes_of_a_transfer(tmp_path):
     np.testing.assert_array_equal(np.stack(frame["observation.goal"])[steps - 1], x["goal"][0].astype(np.float32))
 
 
+@pytest.mark.long
 def test_a_wrong_conversion_is_refused_in_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     motion().save("a.npz")

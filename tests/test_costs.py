@@ -72,6 +72,7 @@ def test_rare_large_costs_count_by_their_mean():
     np.testing.assert_allclose(rare, constant, rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [DDPG, TD3, SAC, TQC])
 def test_a_constrained_policy_keeps_its_limit(kind):
     """A point x' = x + a/2 that wants to be at 1, and may be at 0.5 on average.

@@ -78,6 +78,7 @@ def test_which_tasks_demonstrate(panda, dynamics):
     assert make_demonstrator(panda, track, dynamics) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["ddpg", "sac", "td3", "tqc"])
 def test_a_policy_of_a_surface_task_begins_as_the_hybrid_controller(name):
     """Its untrained actions are zero, so an evaluation equals that of `algo=hybrid_force`."""

@@ -87,6 +87,7 @@ def test_the_file_keeps_every_limit_and_reads_back(arm, best, tmp_path):  # noqa
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 def test_a_long_motion_is_of_segments_with_ways_between(arm, space, monkeypatch):  # noqa: F811
     """As a whole it passes the checks of any motion, repeats nothing, and each segment adds information."""
     monkeypatch.setattr(planning, "SEGMENT_S", 3.0)

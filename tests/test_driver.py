@@ -117,6 +117,7 @@ def hostile(cycles, seed, robot=PANDA, check=None, m=125):
     return count, reflexes, stops
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("least", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_a_hostile_policy_never_breaks_a_rule(least):
     """NaN, infinities, 1e9, sign flips, silence, full torque, anywhere: no reflex of the arm, only orderly stops."""
@@ -126,6 +127,7 @@ def test_a_hostile_policy_never_breaks_a_rule(least):
     assert any("no finite action" in s for s in stops)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("least", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_nor_those_of_an_fr3(least):
     """Which allows less speed the closer a joint is to a position limit, and none just before it."""
@@ -161,6 +163,7 @@ def state_of(q, dq, tau):
 numbers = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.lists(numbers, min_size=7, max_size=7), min_size=1, max_size=8), st.integers(0, 2**31))
 def test_any_floats_give_a_command_that_the_arm_takes(targets, seed):

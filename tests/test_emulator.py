@@ -95,6 +95,7 @@ def drive(arm, cycles, share=0.02, pause=lambda k: None):
     return np.array(rows)
 
 
+@pytest.mark.long
 def test_a_motion_is_bit_identical_with_and_without_a_client(client, servers, panda):
     """0.3 s in lock-step: twice with a client, one of them slow, and once without."""
     name, make, version = client
@@ -155,6 +156,7 @@ def test_every_fault_stops_with_libfrankas_reason(client, faulty, panda):
     arm.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
@@ -192,6 +194,7 @@ def test_a_fault_in_an_episode_is_logged(fault, reason, client, panda):
     assert np.isfinite(episodes.q).all()
 
 
+@pytest.mark.long
 def test_a_pressed_stop_button_ends_the_run(client, panda):
     """A pressed button cannot be cleared: the episode ends, and no other one begins."""
     _, make, version = client
@@ -210,6 +213,7 @@ def test_a_pressed_stop_button_ends_the_run(client, panda):
     assert np.isinf(episodes.distance[:, -1]).all()
 
 
+@pytest.mark.long
 def test_only_an_operator_clears_a_reflex(client, panda):
     """Without consent `move_to` refuses; a command beyond the limits is not sent."""
     _, make, version = client
@@ -402,6 +406,7 @@ def alive(process):
     return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
 
 
+@pytest.mark.long
 def test_the_process_dies_with_its_parent(tmp_path):
     """A killed parent leaves no server behind."""
     script = tmp_path / "parent.py"
@@ -441,6 +446,7 @@ def test_wrong_emulator_settings_are_one_line(panda):
         assert one.getsockname()[0] != other.getsockname()[0]
 
 
+@pytest.mark.long
 def test_clients_read_what_the_arm_knows(client, panda):
     """Every signal arrives, at rest and in motion; a load that is set reaches the state."""
     _, make, version = client

@@ -177,6 +177,7 @@ def test_wrong_shapes_are_named():
         DartEngine(panda(), gravity=True, masses=np.ones(3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hold", STICTION_MODELS)
 def test_a_policy_meets_the_same_arm_in_every_engine(hold):
     """Friction, breakaway, offsets, the driver's law, delay: an episode in DART is the batch's, within 1e-3 mm."""

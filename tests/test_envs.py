@@ -52,6 +52,7 @@ def test_options_reach_task_control_and_reward():
     np.testing.assert_array_equal(env.weights, [1, 1, 0, 0, 0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("settings", "line"),
     [
@@ -99,6 +100,7 @@ def test_without_gymnasium_the_extra_is_named(monkeypatch):
         gym_env(task="reach", overrides=SHORT)
 
 
+@pytest.mark.long
 def test_sac_of_torchrl_trains_on_it(monkeypatch):
     """The example: its collector, transforms, buffer, loss and targets, for some hundred steps."""
     monkeypatch.syspath_prepend(ROOT / "examples")

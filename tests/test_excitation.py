@@ -83,6 +83,7 @@ def moves(*postures, seconds=2.0):
 # --- what fourier draws
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("duration", "seed"), [(2.0, 0), (3.0, 1), (7.0, 2), (20.0, 0), (20.0, 1)])
 def test_every_motion_keeps_what_is_allowed(duration, seed):
     """Limits at every sample, torque by another formula, rest at both ends, consistent derivatives."""
@@ -103,6 +104,7 @@ def test_every_motion_keeps_what_is_allowed(duration, seed):
     assert np.all(np.abs(weight) + np.abs(inertial) + friction_margin(r) <= TORQUE_SHARE * r.tau_max)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_slow_and_fast_in_both_directions_and_still_in_between(seed):
     """Each joint crawls and runs both ways; all stand still for 0.4 s three times; slow rungs reverse slowly."""
@@ -123,6 +125,7 @@ def test_slow_and_fast_in_both_directions_and_still_in_between(seed):
     assert speeds[0] < 0.15 < 0.5 < speeds[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gravity", [False, True])
 def test_the_search_increases_the_information(gravity):
     """More information than the median random draw, and than any of them here."""
@@ -143,6 +146,7 @@ def test_information_counts_what_moves():
     assert nats(frozen) < nats(e) - 5
 
 
+@pytest.mark.long
 def test_the_same_seed_is_the_same_motion_and_never_a_period():
     again, other = fourier(arm(), duration=3.0, seed=1, effort=30), excited(3.0, 2)
     assert all(
@@ -153,6 +157,7 @@ def test_the_same_seed_is_the_same_motion_and_never_a_period():
     assert Recording(e.t, e.q, e.dq, 0 * e.q, "commanded").find_period() is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("duration", "seed"), [(3.0, 1), (10.0, 0)])
 def test_an_arm_follows(duration, seed):
     """The twin runs it without a stop, within the clearance of the checks, except for the light wrist."""

@@ -127,6 +127,7 @@ def stream(exported) -> dict[str, np.ndarray]:
     return campaign(exported)
 
 
+@pytest.mark.long
 def test_the_law_in_numpy_sends_what_r2s_sends(exported, stream):
     """Command by command, with the same stop in the same cycle."""
     contract = json.loads((exported.folder / "contract.json").read_text())
@@ -175,6 +176,7 @@ def test_the_law_in_cpp_sends_what_r2s_sends(exported, stream, tmp_path):
     assert (got[:, n:] == stream["ends"]).all()
 
 
+@pytest.mark.long
 def test_the_runtime_keeps_the_rules(exported):
     """In closed loop, with its own policy: each fault, a stop that is asked for, a failing policy, a goal too far."""
     runtime, goal = loaded(exported.folder), np.array([0.5, 0.1, 0.4])
@@ -267,6 +269,7 @@ SCRIPTS = {f"signal_at=300 signal={number}": "a signal" for number in SIGNALS.va
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_the_loop_for_libfranka_ends_damped(exported, loop, script):
     """No command over a rule, none after the end, the arm at rest; exit status 3 and the cause."""

@@ -178,6 +178,7 @@ def by_cpp(exported: Exported, motion: dict[str, np.ndarray], to: Path) -> tuple
     return np.abs(got[:, :n] - m["tau"]).max(), np.abs(got[new, n + 2 :] - m["seen"][new]).max()
 
 
+@pytest.mark.long
 def test_bundle_and_cpp_press_as_r2s_does(pressing, tmp_path):
     """Through the touch, the hold and a stop in contact; in C++ the driver within rounding, and its observation."""
     motion = in_contact(pressing, 1, stop_at=1500)
@@ -230,6 +231,7 @@ def of_bound(motion: dict[str, np.ndarray]) -> float:
     return max(motion["force"][rows].max() / motion["bound"][rows].min() for rows in parts)
 
 
+@pytest.mark.long
 def test_bundle_and_cpp_limit_hostile_pushes_as_r2s_does(hostile, tmp_path):
     """The same torque within rounding, through touches, pushes that the limit cuts, and a stop in contact."""
     motion = pushed(hostile, 1, stop_at=1200)
@@ -262,6 +264,7 @@ def test_ten_thousand_cycles_of_hostile_pushes(hostile, tmp_path):
         assert by_cpp(hostile, motion, tmp_path)[0] < LAW_NM
 
 
+@pytest.mark.long
 def test_the_limit_of_pushes_travels_with_other_tasks(tmp_path):
     """Reaching with a tool, near a table: the contract has the limit, and the runtime loads it."""
     exported = export(tmp_path, "robot.tool=r2s:models/press_tool.json")
@@ -318,6 +321,7 @@ def test_a_friction_of_ones_own_does_not_travel(pressing):
         make_contract(pressing.robot, replace(task, model=model), np.zeros(7))
 
 
+@pytest.mark.long
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
 def test_the_loop_for_libfranka_takes_a_plan(pressing, tmp_path):
     """With the stand-ins of tests/standins: it ends damped on a signal, and refuses what is no plan of the bundle."""

@@ -81,6 +81,7 @@ def dynamics_of(robot, family: str):
     return replace(d, mass=1.1 * d.mass, com=d.com + 0.01, inertia=1.2 * d.inertia)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", [f.name for f in FAMILIES])
 @pytest.mark.parametrize("arm", ["panda", "six_joints"])
 def test_the_torque_of_the_model_is_that_of_r2s(panda, arm, family):

@@ -177,6 +177,7 @@ def test_an_arm_that_slows_before_its_limits_refuses_a_bundle_that_does_not(expo
         runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported), slows=slows))
 
 
+@pytest.mark.long
 def test_the_bundle_of_an_fr3_runs_on_an_fr3(tmp_path):
     made = drawn(tmp_path / "train" / "fr3", "robot=fr3")
     commands.run_command(["export", str(made.run)])

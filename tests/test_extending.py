@@ -19,6 +19,7 @@ LINES = 60  # about a screen
 COMPILED = ("A controller", "A friction family")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("example", [pytest.param(e, marks=[pytest.mark.slow] * (e in COMPILED)) for e in EXAMPLES])
 def test_a_part_is_one_file_one_yaml_and_one_command(example, tmp_path, monkeypatch):
     """The files of an example, in an empty folder, and its command in that folder: the run ends well.

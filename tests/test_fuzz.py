@@ -180,6 +180,7 @@ def formats(tmp_path_factory):
     return Formats(tmp_path_factory.mktemp("recordings"))
 
 
+@pytest.mark.long
 @examples(40)
 @given(data=st.data())
 def test_a_mutated_recording_is_refused_or_physical(formats, data):
@@ -305,6 +306,7 @@ def mutate_leaf(draw, document, keys) -> None:
         document[key] = draw(st.sampled_from(values))
 
 
+@pytest.mark.long
 @examples(100)
 @given(data=st.data())
 def test_a_mutated_run_folder_is_refused_or_physical(run_folder, data):
@@ -391,6 +393,7 @@ class Reached(BaseException):
         raise self
 
 
+@pytest.mark.long
 @examples(8)
 @given(data=st.data())
 def test_a_mutated_command_is_one_line_and_makes_no_folder(tmp_path_factory, data):

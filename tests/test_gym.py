@@ -62,6 +62,7 @@ def close(one, other):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "few"),
     [(REACH, []), *((f"r2s/Panda{t}-v0", ["task.pool=2"]) for t in ("Track", "Press", "Wipe", "Push"))],
@@ -104,6 +105,7 @@ def test_a_camera_has_the_noise_of_the_task():
     assert (np.abs(seen[0.01] - seen[0.0]).max(1) > 1e-3).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dr", ["paper", "force"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_batch_is_gymnasiums_own_batch_of_single_arms(mode, dr):
@@ -228,6 +230,7 @@ def test_gymnasiums_statistics_count_episodes():
         np.testing.assert_allclose(info["episode"]["r"], total, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_td3_as_cleanrl_writes_it_trains_on_it(monkeypatch):
     """The example, for some hundred steps, twice the same."""
     monkeypatch.syspath_prepend(ROOT / "examples")
@@ -239,6 +242,7 @@ def test_td3_as_cleanrl_writes_it_trains_on_it(monkeypatch):
     assert np.isfinite(measures[0]["return_paper"])
 
 
+@pytest.mark.long
 def test_sac_of_sb3_trains_on_it(monkeypatch):
     """The example, for some hundred steps, twice the same; sb3's own checker accepts the single arm."""
     pytest.importorskip("stable_baselines3", reason="needs stable-baselines3: pip install 'r2s[gym]'")

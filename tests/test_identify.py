@@ -133,6 +133,7 @@ def curve_error(found, truth, dq):
     return np.abs(found.friction(grid) - truth.friction(grid)).max(0) / truth.family.level(truth.phi, fastest)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["found", "directly"])
 def test_least_squares_finds_what_was_injected(arm, truth, wrong, motion, how, request):
     """From a wrong start: friction within 2 % of its level, offsets within 0.01 Nm, inertia scales within 2 %."""
@@ -211,6 +212,7 @@ def test_breakaway_edges_are_found_without_ramps(directly, truth):
     assert np.all(np.abs(directly.dynamics.breakaway - truth.breakaway) < 0.05)
 
 
+@pytest.mark.long
 def test_a_start_on_the_level_of_torque_ends_where_replays_alone_do(arm, truth, wrong, motion, directly):
     """Staged from further away, every value ends well within the interval about what replays alone found."""
     further = replace(wrong, phi=wrong.phi * [8.0, 0.7, 1.0], inertia=0.7 * wrong.inertia, offset=np.full(3, -0.5))
@@ -241,6 +243,7 @@ def test_the_history_tells_what_the_search_did(directly):
     assert history["cost"].iloc[starts[1] - 1] < 0.1 * history["cost"].iloc[0]
 
 
+@pytest.mark.long
 def test_identified_dynamics_predict_motion_that_was_not_fitted(arm, truth, wrong, found):
     """On a second excitation every error of the identified arm is far below the nominal one's, at every horizon."""
     other = recorded(arm, truth, 4.5, seed=1)
@@ -407,6 +410,7 @@ def test_what_does_not_fit_is_refused_in_one_line(arm, wrong, motion, change, me
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not REAL.is_file(), reason=f"the real recording is not here: {REAL}")
 def test_the_real_recording_is_predicted_better_than_by_published_values(panda):
     """On held-out phases of the real Panda's motion the torque error is a third below the published model's.

@@ -83,6 +83,7 @@ def fit(arm, wrong, recording, cutoff_hz=10.0, **change):
     return run(arm, wrong, recording, exact, **({"prior": {}, "cutoff_hz": cutoff_hz} | change))
 
 
+@pytest.mark.long
 def test_torque_with_gravity_gives_friction_and_offset(arm, truth, wrong):
     """Noise-free link-side torque: friction curves, offsets and scales are found to 1e-3."""
     recording = measured(arm, truth, SCALE, 8.0)
@@ -170,6 +171,7 @@ def vector(space, truth):
     return np.concatenate([blocks[b] for b in space.blocks])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "commanded"])
 def test_intervals_contain_the_truth(arm, truth, wrong, torque):
     """The 95 % intervals of several recordings hold at least 85 % of the true values, and are not much too wide.
@@ -191,6 +193,7 @@ def test_intervals_contain_the_truth(arm, truth, wrong, torque):
     assert np.sqrt(np.mean(np.square(miss))) > 0.15  # 0.5 were exact
 
 
+@pytest.mark.long
 def test_what_the_data_cannot_tell_stays_nominal_and_is_said(arm, truth, wrong):
     """Of a joint that stands still friction is not identifiable, and is what it was; of joints that move it is."""
     result = fit(arm, wrong, measured(arm, truth, SCALE, 8.0, noise=0.1, moving=(1, 1, 0)))
@@ -230,6 +233,7 @@ PHI = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(PHI))
 def test_the_family_that_made_the_data_is_chosen(arm, truth, wrong, name):
     """family=auto picks the law that the arm has, and says by how much the others predict worse."""
@@ -249,6 +253,7 @@ def inertial(d):
     return d.mass, moments[..., 0] / moments[..., -1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("data", ["a random walk", "an arm of negative mass"])
 def test_whole_links_are_physical_whatever_the_data(arm, wrong, clean, data):
     """Torque of no arm at all, no prior: mass and moments positive, triangle inequality kept, in every draw."""
@@ -340,6 +345,7 @@ def same(one, other):
     assert story[0].equals(story[1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "commanded"])
 def test_an_interrupted_run_goes_on_to_the_same_end(arm, wrong, clean, motion, torque):
     """Stopped before every step in turn, and within one, a run with the same memo ends as if it never had been."""
@@ -373,6 +379,7 @@ def test_an_interrupted_run_goes_on_to_the_same_end(arm, wrong, clean, motion, t
     same(run(arm, wrong, recording, searches, memo=half, **how), expected)
 
 
+@pytest.mark.long
 def test_the_ga_only_improves_and_keeps_its_seed(arm, wrong, clean):
     """The best cost never rises, falls far below the start's, and a seed gives the same generations twice."""
     runs = [run(arm, wrong, clean, [Genetic(seed=seed, population=40, generations=30)]) for seed in (0, 0, 1)]

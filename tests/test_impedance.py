@@ -83,6 +83,7 @@ def target_at(control, place):
     return np.concatenate([control.action_offset, place, rest])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turns", [0.0, 5.0])
 @pytest.mark.parametrize("way", [(0.02, 0, 0), (0, 0.02, 0), (0, 0, 0.02), (0.1, 0.1, -0.1)])
 def test_it_goes_to_the_target_without_overshoot(way, turns):

@@ -67,6 +67,7 @@ int main() {{
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
 @pytest.mark.parametrize("name", CONTROLS)
 def test_the_law_in_cpp_is_that_of_python(name, tmp_path):

@@ -228,6 +228,7 @@ def test_what_each_recording_adds_is_in_the_table(robot, nominal, tools):
     assert np.median(alone.narrower) > 5  # without it there is the prior
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("terms", [["offset"], ["offset", "link"]])
 def test_a_recording_with_another_tool_is_named_with_its_mass(robot, nominal, tools, terms):
     """Also where the parameters could take the tool for the arm's own links."""

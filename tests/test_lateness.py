@@ -31,6 +31,7 @@ def found_in(robot, recording, *terms):
     return run(robot, start, recording, [TORQUE], family="coulomb", terms=["offset", "link", *terms])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lateness", [{"dq_s": 0.01}, {"tau_rows": 8}, {"dq_s": 0.01, "tau_rows": 8}])
 def test_what_is_late_does_not_go_into_the_links(robot, motion, lateness):
     """With dq behind a filter of 10 ms and torque 8 ms late, links and delay are within their intervals.
@@ -81,6 +82,7 @@ def test_equal_lateness_that_a_fit_is_sure_of_is_corrected(robot, motion):
     assert np.all(np.abs(found.x[found.space.where("link_alpha")]) < 0.02)
 
 
+@pytest.mark.long
 def test_equal_lateness_that_no_fit_is_sure_of_stays(robot, tmp_path):
     """In twenty times the noise, dq is used as logged, which predicts better, and the file keeps the choice."""
     noisy = recorded(robot, truth_of(robot), 8.0, "measured", noise=20 * NOISE * robot.tau_max)

@@ -95,6 +95,7 @@ def test_every_draw_is_a_body(found):
     assert (moments[:, 0] + moments[:, 1] >= moments[:, 2] * (1 - 1e-9)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("declared", [None, 0.5])
 def test_from_commands_whatever_was_declared(robot, declared):
     """A declared payload is compensated by the arm, and the estimate is that of the whole payload."""
@@ -187,6 +188,7 @@ def run(folder, *words):
     return folder / "runs" / "identify"
 
 
+@pytest.mark.long
 def test_the_command(robot, tmp_path):
     """A loaded recording on top of a calibration gives payload.yaml, table and figure; a mistake is one line."""
     payload = carried(robot, 0.5)

@@ -192,6 +192,7 @@ def test_the_jacobian_of_every_block_is_that_of_differences(arm, start, motion):
     np.testing.assert_allclose(residual.change(x, stepped), expected, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("payload", [0.0, PAYLOAD])
 def test_a_payload_is_distinguished_from_the_links(arm, start, truth, payload):
     """Of links and payload, both searched, only what motion left out needs is kept: a payload, or neither."""
@@ -329,6 +330,7 @@ def late(recording, *, dq_s=0.0, tau_rows=0):
     return replace(recording, dq=dq, tau=tau)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lateness", [{}, {"dq_s": 0.01}, {"tau_rows": 8}, {"dq_s": 0.01, "tau_rows": 8}])
 def test_a_late_signal_does_not_go_into_the_rotors(arm, start, motion, lateness):
     """With dq behind a filter of 10 ms and torque 8 ms late, rotors and torque delay are within their intervals."""

@@ -32,6 +32,7 @@ def dynamics(panda):
     return nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
 
 
+@pytest.mark.long
 def test_it_reaches_every_goal(panda, task, dynamics):
     """With the true model: every goal within 5 mm, held, at a return above -110; again from the same object."""
     evaluate = make_evaluation(panda, task, lambda rng, m: dynamics, episodes=24, nthread=1)

@@ -59,6 +59,7 @@ def test_an_arm_that_is_too_near_may_leave_but_not_come_nearer():
     assert "above" in violation([near, near + np.array([0, 0.05, 0, 0, 0, 0, 0])])
 
 
+@pytest.mark.long
 def test_a_detour_is_found_if_the_straight_path_is_blocked():
     """Around an obstacle most paths lead through home or joint by joint."""
     postures, ways, refused = allowed(), [], []

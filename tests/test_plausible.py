@@ -99,6 +99,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "commanded"])
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_named(panda, recordings, torque, mistake):
@@ -153,6 +154,7 @@ def test_a_row_that_no_arm_has_is_named(panda, recordings, field, value):
     assert "at row 1573" in str(caught.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "commanded"])
 @pytest.mark.parametrize(
     "case",

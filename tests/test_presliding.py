@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from test_identify import DELAY, TORQUE, arm, recorded, run, wrong  # noqa: F401 # fixtures
 
 from r2s.identification.friction.presliding import MIN_SIGMA
@@ -20,6 +21,7 @@ def bristly(robot):
     return replace(truth, offset=np.array([0.3, -0.4, 0.1]), delay=DELAY)
 
 
+@pytest.mark.long
 def test_a_presliding_distance_is_found_within_its_interval_also_five_times_off(arm, wrong):  # noqa: F811
     """Nominal is 1 mrad; a search from there ended 30 % off. Errors of 3 MIN_SIGMA are 6 %."""
     recording = recorded(arm, bristly(arm), 8.0, seed=2)
@@ -31,6 +33,7 @@ def test_a_presliding_distance_is_found_within_its_interval_also_five_times_off(
     assert (found.high[at] > DISTANCE).all()
 
 
+@pytest.mark.long
 def test_windows_start_with_bristles_that_bent_over_the_distance_of_the_arm(arm):  # noqa: F811
     """Far from reversals the state is +-1; the shorter the distance, the more windows start like this."""
     windows = cut_windows(recorded(arm, bristly(arm), 6.0, seed=2), 0.2)

@@ -84,6 +84,7 @@ def test_the_reference_on_the_true_model_ends_within_a_newton(stiffness):
     assert row["contact"] > 0.98  # the first touch of the most rigid one may bounce
 
 
+@pytest.mark.long
 def test_joints_at_rest_hold_the_force_of_a_contact():
     """Eq. (6) is replaced where a task touches: with it a resting joint yields, and friction feedforward is force."""
     phi = np.array([1.0, 0.0, 0.1]) * np.linspace(1.0, 0.4, N)[:, None]

@@ -21,6 +21,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.stages.data import ArmData
 
 
+@pytest.mark.long
 def test_presses_load_the_surface_along_paths():
     """One path rises from the least to the most force, the next one falls; the rows are commands on one clock."""
     plan = replace(press_plan(PANDA, TRUE), episode_s=4.5)
@@ -48,6 +49,7 @@ def test_presses_load_the_surface_along_paths():
     np.testing.assert_allclose(ends, [[low, high], [high, low]], atol=4.0)
 
 
+@pytest.mark.long
 def test_late_commands_in_any_path_end_the_presses():
     """The arm got 90 % of its commands in time in the first path, all in the second: no recording."""
     plan = replace(press_plan(PANDA, TRUE), episode_s=4.0)

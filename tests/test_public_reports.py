@@ -353,6 +353,7 @@ LOGS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LOGS)
 def test_a_log_of_a_public_report(tmp_path, ur, recording, name):
     _, make, arguments, expected = LOGS[name]

@@ -52,6 +52,7 @@ def test_the_motion_of_the_tip_is_that_of_its_jacobian():
         assert convective == pytest.approx(-UP @ (after - before) / (2 * h), abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("delay", [0, 8])
 def test_no_torque_presses_harder_than_the_limit(delay):
     """At the driver, immediately and 8 ms late; without a limit nearly all of these arms do."""
@@ -62,6 +63,7 @@ def test_no_torque_presses_harder_than_the_limit(delay):
     assert (free > bound).mean() > 0.8
 
 
+@pytest.mark.long
 def test_the_tip_meets_the_surface_at_the_speed_allowed():
     """From 15 mm above it, pressed with all that the arm has, without friction that would hold it back."""
     surface = Surface(POINT, UP, 1e5, 1.0, 0.0, 0.0)

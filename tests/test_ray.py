@@ -73,6 +73,7 @@ def test_a_sweep_outlives_a_node(cluster, tmp_path):
     assert len(pd.read_csv(tmp_path / "compare" / "table" / "last.csv")) == JOBS
 
 
+@pytest.mark.long
 def test_ray_is_one_line_where_it_is_not(tmp_path):
     """Without ray, or without a cluster at the address."""
     code = "import sys; sys.modules['ray'] = None; import runpy; runpy.run_path('run.py', run_name='__main__')"

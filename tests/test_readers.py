@@ -117,6 +117,7 @@ def assert_motion(recording, data, torque="measured"):
     assert recording.name == "log"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 @pytest.mark.parametrize("others", ["", "gripper", "text"])
 def test_joint_states_come_back_in_joint_order(tmp_path, kind, others):

@@ -60,6 +60,7 @@ def panda():
     return load_robot(**conf("robot/panda"))
 
 
+@pytest.mark.long
 def test_a_policy_that_stalls(panda, tmp_path):
     """30 ms have no effect; 60 and 500 ms lead to damping after 50 ms, to rest, and to no further command."""
     path, stalls = tmp_path / "commands", (30, 60, 500)

@@ -141,6 +141,7 @@ def figures(folder: Path, robot: Robot, found: IdentificationResult) -> list[Pat
     ]
 
 
+@pytest.mark.long
 def test_every_figure_is_written_and_shows_something(tmp_path, panda, identified):
     """Also where an error is zero (identified = measured), and where one arm has fewer episodes."""
     for path in figures(tmp_path / "figures", panda, identified):
@@ -418,6 +419,7 @@ def test_the_html_report_is_one_file_that_loads_nothing(tmp_path, panda, identif
     assert targets == {a["id"] for _, a in page.seen if "id" in a} == {"s1", "s2"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["commanded", "measured"])
 def test_the_page_of_an_identification_is_complete(tmp_path, panda, identified, recording, torque):
     """Figures, both reports and the recording; the RMSE of the torque shown is that of summary.json."""

@@ -92,6 +92,7 @@ def test_the_experiment_makes_every_page():
             assert any(re.search(rf'"{page}(\.md)?"', path.read_text()) for path in scripts), page
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a git checkout")
 def test_a_page_is_made_in_a_clone_and_resumes(tmp_path):
     """Its commands run in a clone of the commit; after a failure the run goes on where it ended."""
@@ -126,6 +127,7 @@ def test_a_page_is_made_in_a_clone_and_resumes(tmp_path):
     assert head.strip() in (run / "report.md").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "line"),
     [

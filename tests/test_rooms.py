@@ -134,6 +134,7 @@ def test_data_and_physics_need_neither_torch_nor_hydra(path):
         assert not heads & {"hydra", "omegaconf"}, "only stages and the command line see a config"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "what",
     [

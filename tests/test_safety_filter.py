@@ -171,6 +171,7 @@ class Mixed:
         return torch.from_numpy(action)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("soft_start_s", "rotors"), [(0.0, 0.0), (0.3, 2e-3)])
 def test_the_simulation_as_trained_in_is_the_arm_behind_the_driver(soft_start_s, rotors):
     """The same law inside the physics step and in the driver: states and commands agree to round-off, limits or not.

@@ -59,6 +59,7 @@ def found_in(robot, recording, **change):
     return run(robot, nominal_dynamics(robot, **conf("friction/uniform")), recording, [TORQUE], **how | change)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "motor", "commanded"])
 def test_an_arm_of_forty_times_the_size_has_forty_times_the_values(arm, torque):
     """In Nm: values, and intervals up to the scatter of 512 draws; friction is that of the truth."""
@@ -93,6 +94,7 @@ def test_a_value_at_its_bound_says_so(arm):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "motor", "commanded"])
 def test_friction_of_the_file_is_a_start_and_no_floor(arm, torque):
     """The file has five times the damping and a third of the frictionloss; the rigid model has neither."""
@@ -140,6 +142,7 @@ def driven(robot, truth, every, seconds=5.0, share=(1.0, 1.0, 1.0)):
     return Recording(*(x[::every] for x in (t, q + 2e-5 * noise, dq, tau)), "commanded")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("every", [1, 2, 4, 8])
 def test_the_delay_of_a_command_does_not_depend_on_the_rate_of_the_log(arm, every):
     """A command in every row is held until the next: 2 ms are found within 0.1 ms at 1000, 500, 250 and 125 Hz."""
@@ -149,6 +152,7 @@ def test_the_delay_of_a_command_does_not_depend_on_the_rate_of_the_log(arm, ever
     assert 1e3 * float(found.dynamics.delay) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_joint_at_rest_has_no_say_in_family_and_terms(arm):
     """No candidate enters that the arm lacks, and the family is that of the arm: a resting joint has no error."""
@@ -162,6 +166,7 @@ def test_a_joint_at_rest_has_no_say_in_family_and_terms(arm):
     assert not {b for term in candidates for b in blocks_of(term)} & set(found.space.blocks)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seconds", [2.5, 3.5])
 def test_a_log_of_seconds_lets_no_candidate_in(arm, seconds):
     """Its held-out blocks may be too short for windows of sliding; a candidate that improves nothing stays out."""
@@ -172,6 +177,7 @@ def test_a_log_of_seconds_lets_no_candidate_in(arm, seconds):
     assert not {b for term in candidates for b in blocks_of(term)} & set(found.space.blocks)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "motor"])
 def test_intervals_allow_for_a_removed_term(arm, torque):
     """The file's masses are 10 to 15 % off, and elimination removes them: a payload and gains replace their effect.
@@ -202,6 +208,7 @@ def test_commands_between_the_rows_of_a_slow_log():
     np.testing.assert_allclose(sensed[:5], [0, 0.25, 0.5, 0.75, 1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("torque", ["measured", "motor"])
 def test_identifiable_does_not_depend_on_the_width_of_the_bounds(arm, torque):
     robot = arm(1.0)
@@ -216,6 +223,7 @@ def test_identifiable_does_not_depend_on_the_width_of_the_bounds(arm, torque):
     np.testing.assert_allclose(seen[0].x[:3], seen[1].x[:3], rtol=1e-3)  # Coulomb
 
 
+@pytest.mark.long
 def test_without_a_prior_the_nominal_value_has_no_weight(arm):
     """From another nominal offset the same value, although the prior of the others pulls."""
     robot = arm(1.0)

@@ -144,6 +144,7 @@ def test_a_recording_in_other_units_is_named(groups, folder, robot, truth):  # n
         groups(data__path=[A, "milli.npz"])
 
 
+@pytest.mark.long
 def test_check_judges_each_recording(words, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     given = [*words, "identify.prior.offset.mean=[0.4,null,null]"]

@@ -190,6 +190,7 @@ def needed(robot, d, q, dq, after, tau):
     return tau + d.offset - data.qfrc_inverse
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", [SIGMOID, COULOMB], ids=named)
 def test_a_joint_is_held_against_the_motion_of_the_others(panda, law):
     """Joints 1, 3, 5 and 7 keep their angles to round-off while the others swing, as long as what holds them allows.

@@ -168,6 +168,7 @@ def first(rows, realtime):
     return int(np.flatnonzero(rows)[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "target", "kind", "realtime"),
     [
@@ -196,6 +197,7 @@ def test_a_signal_ends_a_live_motion(name, target, kind, realtime, sides, tmp_pa
     assert result["stops"][0].endswith(f": {name}")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "target", "realtime"),
     [
@@ -252,6 +254,7 @@ def test_a_signal_ends_a_motion_of_the_main_process(kind, name, realtime, client
         assert [stop.split(": ")[-1] for stop in result["stops"]] == [name]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", [3, pytest.param(90, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("live", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_second_ctrl_c_changes_nothing(live, gap, sides, tmp_path):
@@ -262,6 +265,7 @@ def test_a_second_ctrl_c_changes_nothing(live, gap, sides, tmp_path):
     assert result["halted"] == "SIGTERM"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("live", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "name", ["SIGTERM", *(pytest.param(n, marks=pytest.mark.slow) for n in ("SIGINT", "SIGTSTP"))]
@@ -302,6 +306,7 @@ def test_a_signal_while_the_operator_is_asked(live, sides, tmp_path):
     assert log.motion.max() == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("policy", "realtime"),
     [(falls_silent, False), *(pytest.param(p, r, marks=pytest.mark.slow)
@@ -333,6 +338,7 @@ def test_a_stop_holds_what_an_adapter_compensates(realtime, sides, tmp_path):
     assert np.abs(log.after(cause_of(log, realtime)).dq).max() < STILL
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("load", "declared"), [(0.24, 1.3), pytest.param(1.3, 0.0, marks=pytest.mark.slow)])
 def test_a_stop_finds_what_holds_a_wrong_load(load, declared, sides, tmp_path):
     """An arm whose gravity compensation is wrong by 1 kg, which nothing knows yet, comes to rest within REST_S.

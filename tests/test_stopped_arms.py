@@ -48,6 +48,7 @@ def stopping(tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_stopped_arm_ends_a_transfer_with_3(trained, stopping):  # noqa: F811
     """Without an operator: two of 4 goals are done, the tables show it, and the arm gets no further command."""
     words = ["stage=transfer", f"policy={trained.resolve()}", "arm=stopping", "simulator=none", "name=a"]
@@ -64,6 +65,7 @@ def test_a_stopped_arm_ends_a_transfer_with_3(trained, stopping):  # noqa: F811
     assert (folder / "stops.txt").read_text() == "episode 2, 0.15 s: user stop\n"
 
 
+@pytest.mark.long
 def test_an_arm_that_stops_in_its_last_episode_moves_in_no_later_job(trained, stopping):  # noqa: F811
     """All goals began, but no operator agreed to another motion: a sweep ends before its second job."""
     words = [
@@ -79,6 +81,7 @@ def test_an_arm_that_stops_in_its_last_episode_moves_in_no_later_job(trained, st
     assert len(list((stopping / "runs" / "transfer").iterdir())) == 1
 
 
+@pytest.mark.long
 def test_an_error_while_an_arm_moves_ends_the_sweep(trained, stopping):  # noqa: F811
     """The arm moves in no later job before the operator has seen why this one failed."""
     words = ["stage=transfer", f"policy={trained.resolve()}", "arm=stopping", "arm.error=tau is nan"]
@@ -88,6 +91,7 @@ def test_an_error_while_an_arm_moves_ends_the_sweep(trained, stopping):  # noqa:
     assert len(list((stopping / "runs" / "transfer").iterdir())) == 1
 
 
+@pytest.mark.long
 def test_an_estimate_of_a_stopped_arm_ends_with_3(stopping):
     """The estimate of the motion before the stop is written, and the recording's name says that it is not whole."""
     words = ["stage=estimate", "data=arm", "arm=stopping", "arm.motions=1", "arm.stop_s=1.0", "name=a"]
@@ -102,6 +106,7 @@ def test_an_estimate_of_a_stopped_arm_ends_with_3(stopping):
         assert len(part["t"]) == 1000
 
 
+@pytest.mark.long
 def test_a_stopped_arm_ends_an_identification_with_3(stopping):
     """What was recorded before is kept, and what had been of the motion that was stopped."""
     words = ["stage=identify", "data=arm", "arm=stopping", "name=a", *TOY, "data.seconds=2.0"]

@@ -62,6 +62,7 @@ def test_stiction_is_found_to_be_of_the_net_torque(hard):
     np.testing.assert_allclose(edges, truth.breakaway - truth.offset[:, None], rtol=0, atol=0.03)
 
 
+@pytest.mark.long
 def test_a_term_that_is_there_enters(arm):  # noqa: F811
     """Cable drag of a fifth of the friction is asked for by motion left out."""
     truth = replace(coulomb_arm(arm), drag=np.array([[0.25, 0.1], [0.2, -0.2], [0.1, 0.1]]))
@@ -70,6 +71,7 @@ def test_a_term_that_is_there_enters(arm):  # noqa: F811
     assert "drag_sin" in found.space.blocks
 
 
+@pytest.mark.long
 def test_rotors_that_are_there_enter_and_leave_the_links_alone(arm):  # noqa: F811
     """A command feels them on the motor's side: no link has to stand in, whose inertia joints share.
 
@@ -101,6 +103,7 @@ def whole_mass(model, q) -> np.ndarray:
     return out
 
 
+@pytest.mark.long
 def test_ramps_tell_the_rise_towards_standstill(arm):  # noqa: F811
     """Friction as sliding begins is the breakaway's, in either direction, within three times SIGMA."""
     phi = np.concatenate([PHI, np.tile([0.4, 0.03, 0.3], (3, 1))], 1)
@@ -114,6 +117,7 @@ def test_ramps_tell_the_rise_towards_standstill(arm):  # noqa: F811
     np.testing.assert_allclose(*net, rtol=3 * SIGMA)
 
 
+@pytest.mark.long
 def test_replays_that_disagree_with_torque_are_refused(hard, arm):  # noqa: F811
     """A search that ends elsewhere on replays does not change what the torque says."""
     motion = hard[2]

@@ -60,6 +60,7 @@ def computer():
 OFTEN = ["panda", pytest.param("fr3", marks=pytest.mark.slow)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", OFTEN)
 @pytest.mark.parametrize(("kind", "cycles"), [("drop", 7), ("late", 11)])
 def test_lost_cycles_are_counted(client, kind, cycles):
@@ -79,6 +80,7 @@ def test_lost_cycles_are_counted(client, kind, cycles):
         assert np.sum(1 - np.array(timing.success)) == pytest.approx(cycles, abs=1e-3)  # the FR3 sends float32
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", OFTEN)
 def test_a_motion_with_too_few_commands_does_not_count(client):
     """In real time a recording and an episode are refused in one line with the value; in lock-step they count."""
@@ -104,6 +106,7 @@ def test_a_motion_with_too_few_commands_does_not_count(client):
         arm.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", OFTEN)
 def test_every_motion_asks_for_real_time(client):
     """Recording, approach, ramps and episode; afterwards all is as before."""
@@ -136,6 +139,7 @@ def test_every_motion_asks_for_real_time(client):
     assert not inside[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", CLIENTS)
 def test_connecting_keeps_the_scheduler(client):
     """And so does a motion in lock-step: whatever the process does next is not for real time."""
@@ -149,6 +153,7 @@ def test_connecting_keeps_the_scheduler(client):
         arm.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", OFTEN)
 def test_a_reflex_restores_everything(client):
     """The arm ends the motion, not r2s."""
@@ -201,6 +206,7 @@ def may_schedule():
     return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[1] >= PRIORITY
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rights", ["all", "none"])
 def test_the_scheduler_is_set_where_it_may_be(rights):
     """Otherwise one warning in a process for each missing right, and the motion runs."""

@@ -94,6 +94,7 @@ def attacks(left: Path) -> dict[str, dict]:
 KINDS = tuple(attacks(Path("x")))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("enter", [looked, exported, transferred, resumed])
 def test_a_foreign_part_is_refused_before_it_is_imported(honest, left, tmp_path, enter, kind):
@@ -144,6 +145,7 @@ def test_an_honest_run_reads_as_it_was(honest):
     assert after.trust == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "word",
     [

@@ -237,6 +237,7 @@ def test_stops_at_a_limit():
         push(arm, target, 3000)
 
 
+@pytest.mark.long
 def test_any_serial_arm(small):
     """Two light joints: friction in proportion to tau_max, finite motion, a recording."""
     arm: Arm = RigidTwin(small, 1)
@@ -253,6 +254,7 @@ def excited():
     return fourier(panda(), duration=6.0, seed=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("torque", "seed"), [("commanded", 0), ("measured", 1)])
 def test_record(torque, seed):
     """The recording follows the excitation inside every limit, with the declared kind of torque."""
@@ -274,6 +276,7 @@ def test_record(torque, seed):
         arm.command(np.zeros(7))
 
 
+@pytest.mark.long
 def test_row_k_holds_the_command_of_cycle_k():
     arm, sent = RigidTwin(panda(), 0), []
     command = arm.command
@@ -283,6 +286,7 @@ def test_row_k_holds_the_command_of_cycle_k():
     assert np.array_equal(recording.tau, [tau for _, tau in sent])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_excitation_keeps_the_limits(seed):
     """Inside every limit, at rest at both ends, with consistent derivatives, slow and fast parts."""

@@ -51,6 +51,7 @@ def log(robot):
     return log_of(robot)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("torque", "share"),
     [*(pytest.param(*x, marks=pytest.mark.slow) for x in (("measured", 0.18), ("motor", 0.02))), ("commanded", 0.02)],
@@ -121,6 +122,7 @@ def test_a_late_signal_is_measured(robot, log):
         assert found.values["tau_late_s"] == pytest.approx(LATE_S, abs=1e-3)
 
 
+@pytest.mark.long
 def test_what_a_motion_lacks_is_named(robot, log):
     """A joint at rest, a motion twice, and friction speeds that are not reached, five times slower."""
     both = (np.tile(x, (2, 1)) for x in (log.q * [1, 1, 0], 0.2 * log.dq * [1, 1, 0], log.tau))
@@ -131,6 +133,7 @@ def test_what_a_motion_lacks_is_named(robot, log):
     assert "joint 1, 2, 3 faster than 20 % of dq_max" in found["friction speeds"].advice
 
 
+@pytest.mark.long
 def test_r2s_check_prints_a_table_and_writes_json(robot, log, tmp_path, monkeypatch, capsys):
     """Of a recording that passes, and of one that fails, which ends with one line."""
     log.save(tmp_path / "good.npz")
@@ -149,6 +152,7 @@ def test_r2s_check_prints_a_table_and_writes_json(robot, log, tmp_path, monkeypa
     assert json.loads((tmp_path / "runs" / "check" / "bad.json").read_text())["verdict"] == FAIL
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "line"),
     [

@@ -44,6 +44,7 @@ def strict():
     rr.set_strict_mode(False)
 
 
+@pytest.mark.long
 def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
     path = tmp_path / "recording.rrd"
     picture = learning_figure(tmp_path / "learning.png", {"a": make_curve()}, CURVES)

@@ -121,6 +121,7 @@ def run(tmp_path, what, how, **env):
     return done.stdout.splitlines()[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("panda", "fr3")), "jump"])
 def test_a_cycle_loads_nothing(what, tmp_path):
     """In a fresh process, recordings, ramps, approaches, episodes and jumps."""
@@ -167,6 +168,7 @@ class Watched(Paced):
         super().stop()
 
 
+@pytest.mark.long
 def test_the_process_of_an_arm_loads_everything_before_it_opens_the_arm(tmp_path):
     """With an adapter, for twelve control periods."""
     path = tmp_path / "loads"

@@ -56,6 +56,7 @@ def called(installed: Path, folder: Path, *words: str) -> subprocess.CompletedPr
     return done
 
 
+@pytest.mark.long
 def test_installed_it_finds_its_settings(installed, tmp_path):
     """`r2s` and `python -m r2s` compose from the conf of the wheel, whatever the folder."""
     done = called(installed, tmp_path, "algo=tqq")

@@ -95,6 +95,7 @@ def calibrated():
     return observer
 
 
+@pytest.mark.long
 def test_a_force_in_motion_is_found_within_its_interval():
     """A force of 10 N that comes within 0.2 s: to 0.5 N RMS, in its interval, and a contact soon after its half."""
     push = np.array([4.0, -3.0, 8.7])
@@ -110,12 +111,14 @@ def test_a_force_in_motion_is_found_within_its_interval():
     assert 1.5 < begins < 1.65  # 5 N act at 1.6 s: within 50 ms
 
 
+@pytest.mark.long
 def test_free_motion_is_no_contact():
     """Motion that the thresholds were not calibrated on: no false alarm."""
     _, _, touches = run(calibrated(), free(3))
     assert not touches.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("friction", [1.0, 1.1])
 def test_an_impact_is_a_contact(friction):
     """A tip touches with a half sine of 17 N in 15 ms, bounces, and presses with 4 N: a contact within 30 ms.
@@ -132,6 +135,7 @@ def test_an_impact_is_a_contact(friction):
         assert touches[1500:1530].any() == impact
 
 
+@pytest.mark.long
 def test_a_tap_ends():
     """A tip that touches once, with a half sine of 17 N in 15 ms: one contact, which ends within 0.2 s."""
     tap = lambda t: np.array([0.0, 0.0, 17.0 * np.sin(np.pi * np.clip((t - 1.5) / 0.015, 0.0, 1.0))])  # noqa: E731
@@ -199,6 +203,7 @@ def test_bristles_show_a_force_on_a_resting_arm():
     assert np.sqrt(np.mean(np.square(error))) < np.min(BAND[:4] / np.abs(J[2, :4]).clip(0.05)) / 3
 
 
+@pytest.mark.long
 def test_a_payload_is_no_contact_once_it_is_known():
     """A payload pulls with its weight, wherever the arm moves; declared to the observer, no force remains."""
     load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03]}, (3.0, 0.15))
@@ -220,6 +225,7 @@ def test_a_payload_is_no_contact_once_it_is_known():
     assert np.sqrt((np.array(forces)[settled] ** 2).mean()) < 0.5
 
 
+@pytest.mark.long
 def test_an_adapter_does_not_push_against_a_contact():
     """The disturbance observer adds the push on a bare arm; with a tool it stops, with less than a tenth of it."""
     push = lambda t: np.array([0.0, 0.0, 10.0 if t > 1.0 else 0.0])  # noqa: E731
@@ -278,6 +284,7 @@ def test_a_surface_that_was_never_identified_changes_nothing():
         FusedWrench(replace(ROBOT, tool=None), truth(), SOFT)
 
 
+@pytest.mark.long
 def test_a_payload_hung_on_in_the_air_is_no_contact_and_a_press_no_payload():
     """Both pull with 10 N from 1.5 s on, the payload down, the press up: mass is found for the first alone."""
     load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03], "on_s": 1.5}, (3.0, 0.15))
