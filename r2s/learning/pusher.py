@@ -1,9 +1,10 @@
 """Push a box without learning: the model-based baseline `algo=pusher` for `task=push`.
 
 The pusher's model is quasi-static and independent of the box's mass and friction. In this model, a frictionless push
-at a face point p along the inward normal n moves the box with velocity n and yaw rate (p x n) / r^2, up to a common
-factor (limit surface of r2s/physics/sliding.py). The pusher selects the face point with the steepest descent of the
-error |e|^2 + r^2 e_yaw^2, minus a cost for the tip's way to this point, and plans anew in every control period.
+at a face point p along the inward normal n by a length s moves the box by s n / (1 + h^2) and turns it by
+s h / (r (1 + h^2)), where h = (p x n) / r (limit surface of r2s/physics/sliding.py). The error counts position and
+yaw in units of their tolerances. The pusher selects the face point whose best push reduces the error fastest,
+including the tip's way to this point, and plans anew in every control period.
 """
 
 import numpy as np
@@ -17,13 +18,14 @@ from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
+from r2s.tasks.push_measures import GOOD_M, GOOD_RAD
 
 POINTS, EDGE = 9, 0.75  # number of points per face; share of a half edge that the points span
 CLEAR = 0.02  # m, clearance between tip and box while the tip moves around the box
 NEAR = 0.012  # m, lateral error of the tip in front of a face, below which the tip pushes
-WAY = 0.4  # 1/m, cost of a face point per m from the tip to this point, relative to the steepest possible descent
-DONE = 0.008  # m, error below which the pusher stops
-SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, tip speed in a push, between pushes; m, error below which a push slows
+UNITS = np.array([GOOD_M, GOOD_M, GOOD_RAD])  # m, m, rad, one unit of error: the tolerances of success
+DONE = 0.3  # units of error below which the pusher stops; a push may miss by a few mm
+SPEED, TRAVEL, SLOW_M = 0.15, 0.2, 0.02  # m/s, tip speed in a push, between pushes; m, a shorter push is slower
 GAIN = 0.25  # gain of the tip speed feedback / damping of the impedance law; 25 Hz and the latency allow little more
 
 
@@ -58,8 +60,11 @@ class Pusher:
         self._damping = 2.0 * np.sqrt(self._stiffness * 3.0 / np.trace(mobility))  # N s/m, critical
         self._centre = task.table.inside(task.centre)
         half = 0.5 * np.array(task.size)
-        self._half, self._reach = half[:2], float(Surface(half, half, 1.0, half=half).reach)
-        self._points, self._normals = _face_points(self._half)
+        self._half, self._clear = half[:2], half[:2] + task.tip_radius + CLEAR
+        self._points, self._normals = p, n = _face_points(self._half)
+        reach = float(Surface(half, half, 1.0, half=half).reach)
+        lever = (p[:, 0] * n[:, 1] - p[:, 1] * n[:, 0]) / reach
+        self._twists = np.column_stack([n, lever / reach]) / (1.0 + lever[:, None] ** 2) / UNITS  # per m of a push
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
@@ -86,33 +91,49 @@ class Pusher:
         """Return the tip velocity (3,) m/s along the table, and the unit push direction (2,), or 0 for no push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
-        at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), self._reach * error[2]])
-        radius, r = self._task.tip_radius, self._reach
-        size = float(np.linalg.norm(e))
-        if size < DONE:
+        at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), error[2]]) / UNITS
+        if np.linalg.norm(e) < DONE:
             return np.zeros(3), np.zeros(2)
-        p, n = self._points, self._normals
-        twist = np.column_stack([n, (p[:, 0] * n[:, 1] - p[:, 1] * n[:, 0]) / r])
-        descent = twist @ e / (np.linalg.norm(twist, axis=1) * size)
-        before = p - (radius + 0.3 * CLEAR) * n
-        contact = p - radius * n
-        off = np.linalg.norm(at - contact, axis=1)
-        best = int(np.argmax(descent - WAY * off))
-        across = np.array([-n[best, 1], n[best, 0]])
-        aside, gap, push = abs((at - p[best]) @ across), -(at - contact[best]) @ n[best], np.zeros(2)
-        if aside < NEAR and gap < 2 * CLEAR:
-            push = rotation.T @ n[best]
-            way = SPEED * min(1.0, size / SLOW_M) * n[best] - 3.0 * ((at - p[best]) @ across) * across
+        k, length = self._best_push(at, e)
+        point, normal, radius = self._points[k], self._normals[k], self._task.tip_radius
+        across, push = np.array([-normal[1], normal[0]]), np.zeros(2)
+        aside, gap = (at - point) @ across, (point - at) @ normal - radius
+        if abs(aside) < NEAR and gap < 2 * CLEAR:
+            push = rotation.T @ normal
+            way = SPEED * min(1.0, length / SLOW_M) * normal - 3.0 * aside * across
         else:
-            towards = self._around(at, before[best]) - at
+            towards = self._around(at, point - (radius + 0.3 * CLEAR) * normal) - at
             far = float(np.linalg.norm(towards))
             way = min(TRAVEL, 6.0 * far) * towards / max(far, 1e-9)
         return np.array([*(rotation.T @ way), 0.0]), push
 
+    def _best_push(self, at: np.ndarray, e: np.ndarray) -> tuple[int, float]:
+        """Return the face point and the length, m, of the push that reduces the error e (3,) fastest.
+
+        The push from a face point of the twist w has the length s >= 0 that minimizes |e - s w|. Its time is that of
+        the way from `at` (2,) m and of the push.
+        """
+        squares = (self._twists**2).sum(axis=1)
+        lengths = (self._twists @ e / squares).clip(0.0)
+        left = np.linalg.norm(e - lengths[:, None] * self._twists, axis=1)
+        contacts = self._points - self._task.tip_radius * self._normals
+        off = np.abs(self._along(contacts) - self._along(at[None]))
+        ways = np.maximum(np.minimum(off, 4.0 * self._clear.sum() - off), np.linalg.norm(contacts - at, axis=1))
+        rates = (np.linalg.norm(e) - left) / (ways / TRAVEL + lengths / SPEED + 1e-9)
+        k = int(np.argmax(rates))
+        return k, float(lengths[k])
+
+    def _along(self, at: np.ndarray) -> np.ndarray:
+        """Return coordinates (k,) m of points (k, 2) m, counterclockwise along the way around the box."""
+        a, b = self._clear
+        x, y = (at / (np.abs(at) / self._clear).max(axis=1, keepdims=True).clip(1e-9)).T
+        lateral = np.abs(x) * b >= np.abs(y) * a
+        sides = [lateral & (x > 0.0), ~lateral & (y > 0.0), lateral]
+        return np.select(sides, [b + y, 2 * b + a - x, 3 * b + 2 * a - y], 4 * b + 3 * a + x)
+
     def _around(self, at: np.ndarray, to: np.ndarray) -> np.ndarray:
         """Return the next waypoint (2,) m, in the box's frame, from `at` to `to` around the box."""
-        edge = self._half + self._task.tip_radius
-        clear = edge + CLEAR
+        clear, edge = self._clear, self._clear - CLEAR
         corners = clear * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         if not _crosses(at, to, edge + 0.2 * CLEAR):
             return to
