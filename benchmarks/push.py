@@ -35,7 +35,7 @@ EPISODES = 8
 TWINS, POLICIES = "The reference on twins", "Policies on twins"
 SEEDS = range(190, 195)  # nothing was chosen on them
 ALGO = "algo=tqc", "algo.gamma=0.98", "budget.minutes=null"
-POLICY = ("task=push", *ALGO, "budget.env_steps=480000")
+POLICY = ("task=push", *ALGO, "budget.env_steps=800000")
 TWIN = re.compile(r"(rigid|elastic)_\d+")
 
 
