@@ -172,15 +172,30 @@ def cells(table, values: dict[str, float]) -> dict[str, str]:
 
 
 def means(table, rows: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Return the mean over rows of each measure in a task's `table`."""
-    return {key: float(np.mean([row[key] for row in rows])) for key in table.rows}
+    """Return the mean over rows of each measure in a task's `table`, of RMS errors the root of the mean square.
+
+    A measure that is missing in a row, such as an error of stopped episodes, is NaN.
+    """
+
+    def mean(key: str) -> float:
+        power = 2 if table[key].root_mean_square else 1
+        values = np.array([row[key] for row in rows], dtype=float)  # None becomes NaN
+        return float(np.mean(values**power) ** (1 / power))
+
+    return {key: mean(key) for key in table.rows}
+
+
+def worst(table, rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the worst of the rows' values of each measure in a task's `table`; NaN if a value is missing."""
+    values = {key: np.array([row[key] for row in rows], dtype=float) for key in table.rows}
+    return {key: table[key].sign * float(np.min(table[key].sign * each)) for key, each in values.items()}
 
 
 def training_time(runs: Sequence[Path]) -> str:
-    """Return the range of env steps and of training time of finished trainings as words."""
+    """Return the env steps and the range of training times of finished trainings as words."""
     last = [json.loads((run / "summary.json").read_text())["last"] for run in runs]
-    steps, minutes = ([row[key] for row in last] for key in ("env_steps", "wall_clock_s"))
-    return f"{min(steps):,} to {max(steps):,} env steps in {min(minutes) / 60:.1f} to {max(minutes) / 60:.1f} minutes"
+    steps, seconds = ([row[key] for row in last] for key in ("env_steps", "wall_clock_s"))
+    return f"{max(steps):,} env steps in {min(seconds) / 60:.1f} to {max(seconds) / 60:.1f} minutes"
 
 
 def markdown(table: pd.DataFrame) -> str:

@@ -13,13 +13,25 @@ import re
 import sys
 from pathlib import Path
 
-from common import NOMINAL, ROOT, cells, identify_twins, markdown_rows, means, run_parallel, training_time, write_page
+from common import (
+    NOMINAL,
+    ROOT,
+    cells,
+    identify_twins,
+    markdown_rows,
+    means,
+    run_parallel,
+    training_time,
+    worst,
+    write_page,
+)
 
 from r2s.tasks.press_measures import PRESS
 from r2s.tasks.wipe_measures import WIPE
 
 EPISODES, SIMULATED = 12, 100
 RUNS = ROOT / "runs" / "press"
+ALGO = "algo=tqc", "budget.minutes=null"
 TABLES = {"press": PRESS, "wipe": WIPE}
 FORCES = {
     "press": "Pressing: forces of 5 to 20 N with one step",
@@ -33,13 +45,12 @@ def row_of(folder: Path, row: str) -> dict[str, float]:
     return json.loads((folder / "summary.json").read_text())[row]
 
 
-def summarized(task: str, each: dict[tuple[str, str], list[dict[str, float]]], name: str) -> str:
-    """Return a table of {(variant, label): rows of the twins}: the means, and each measure's worst twin."""
-    table, rows = TABLES[task], {}
-    for (variant, label), values in each.items():
-        worst = {m: table[m].sign * min(table[m].sign * v[m] for v in values) for m in table.rows}
-        rows[f"{variant}, {label}: mean of {len(values)}"] = cells(table, means(table, values))
-        rows[f"{variant}, {label}: worst"] = cells(table, worst)
+def summarized(task: str, each: dict[str, list[dict[str, float]]], name: str) -> str:
+    """Return a table of {label: rows of the twins}: the means, and the worst twin of each column."""
+    rows = {}
+    for label, values in each.items():
+        rows[f"{label}, mean of {len(values)}"] = cells(TABLES[task], means(TABLES[task], values))
+        rows[f"{label}, worst in each column"] = cells(TABLES[task], worst(TABLES[task], values))
     return markdown_rows(rows, name)
 
 
@@ -50,7 +61,7 @@ def models_of(task: str, twins: list[Twin], env_steps: str | None) -> dict[str, 
     names = {"reference, nominal": dict.fromkeys(twins, f"{task}_nominal")}
     algos = {"reference": ["algo=hybrid_force"]}
     if env_steps:
-        algos["policy"] = ["algo=tqc", "budget.minutes=null", f"budget.env_steps={env_steps}"]
+        algos["policy"] = [*ALGO, f"budget.env_steps={env_steps}"]
     for what, words in algos.items():
         names[f"{what}, identified"] = {(v, s): f"{task}_{what}_{v}_{s}" for v, s in twins}
         for (v, s), name in names[f"{what}, identified"].items():
@@ -72,10 +83,13 @@ def section(task: str, names: dict[str, dict[Twin, str]]) -> list[str]:
         ]
         for label, v, s, name in runs
     )
-    transferred, simulated = {}, {}
+    transferred = {f"{v}, {label}": [] for label, each in names.items() for v, _ in each}
+    simulated = {key: [] for key in transferred if not key.endswith("nominal")}
     for (label, v, s), name in on_twin.items():
-        transferred.setdefault((v, label), []).append(row_of(RUNS / "transfer" / name, "twin"))
-        simulated.setdefault((v, label), []).append(row_of(RUNS / "train" / names[label][v, s], "best"))
+        transferred[f"{v}, {label}"].append(row_of(RUNS / "transfer" / name, "twin"))
+        if f"{v}, {label}" in simulated:
+            simulated[f"{v}, {label}"].append(row_of(RUNS / "train" / names[label][v, s], "best"))
+    simulated["reference, nominal"] = [row_of(RUNS / "train" / f"{task}_nominal", "best")]
     policies = [RUNS / "train" / name for label, _, _, name in runs if label.startswith("policy")]
     return [
         f"## {FORCES[task]}",
@@ -94,7 +108,7 @@ def main() -> None:
     named = [w for w in words if re.fullmatch(r"(rigid|elastic)_\d+", w)] or ["rigid_0", "elastic_0"]
     twins = [(v, s) for v, _, s in (name.partition("_") for name in named)]
     identify_twins([(v, int(s), RUNS / "identify" / f"{v}_{s}") for v, s in twins], RUNS)
-    about = [f"Policies: `algo=tqc budget.env_steps={env_steps}` on one core, the twin's seed."] if env_steps else []
+    about = [f"Policies: `{' '.join(ALGO)} budget.env_steps={env_steps}`, the twin's seed."] if env_steps else []
     parts = about + [part for task in TABLES for part in section(task, models_of(task, twins, env_steps))]
     write_page("press", "Pressing and wiping", " ".join(["python benchmarks/press.py", *words]), parts)
 

@@ -1,11 +1,10 @@
 """Run the numeric tests again as other processors would: `make test-portable`.
 
 A processor decides which kernels the libraries pick, and with them the last bits: fused multiply-adds or not, sums in
-2, 4 or 8 lanes. Each row of PROCESSORS makes the libraries pick what they would there; `make test` runs them as this
-processor. numba needs no row: it fuses no multiply with an add and reorders no sum, so its code rounds alike
-everywhere, and one cache serves all rows. Nothing can ask for more than a processor has: rows that ask for it are
-skipped, with a line. A variable that is set already stays as it is, since somebody set it because this machine needs
-it.
+2, 4 or 8 lanes. Each row of PROCESSORS makes the libraries pick what they would there; `make test` and
+`make test-long` run them as this processor. numba needs no row: it fuses no multiply with an add and reorders no sum,
+so its code rounds alike everywhere, and one cache serves all rows. Rows that need more than this processor has are
+skipped, with a line. A variable that is set already stays as it is, since this machine may need it.
 """
 
 import importlib

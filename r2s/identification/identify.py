@@ -32,7 +32,7 @@ from r2s.identification.problem import (
     fit_torque,
     fits_torque,
     implicit_friction,
-    without,
+    search_lag,
     worse_on_torque,
 )
 from r2s.identification.residuals.replay_residual import ReplayResidual
@@ -344,7 +344,7 @@ def reweight(s: State) -> State:
         s.history.add(row | {"search": f"{row['search']}, reweighted"})
 
     for k in range(REWEIGHTS):
-        local = search if lag is None or k < REWEIGHTS - 1 else partial(without, lag, search)
+        local = search if lag is None or k < REWEIGHTS - 1 else partial(search_lag, lag, search)
         u, problem = _run(s, f"reweighted {k + 1}", local, problem, u, report)  # type: ignore[arg-type]
         problem = problem.reweighted(u, fitted=True)
     if lag is not None and np.array_equal(u[lag], problem.start[lag]):

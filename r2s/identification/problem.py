@@ -277,7 +277,7 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     return bool(rise > max(len(u), ALIKE * fitted))
 
 
-def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
+def search_lag(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
     """Return the solution u (P,) of a local search, with the lag u[at] estimated only if the data require a lag.
 
     If torque changes slowly, a short lag acts like a delay. The data require a lag if it lowers the cost by more than
@@ -291,9 +291,9 @@ def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray,
     if fits_torque(search):
         fixed = fixed.torque_reweighted(u)
     u[at] = problem.start[at]  # exactly the start value: `reweight` recognizes a fixed lag by this equality
-    without, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
-    most = np.bincount(problem.clusters, (without - having)[:rows]).max()
-    needed = without.sum() - having.sum() - most > np.log(rows)
+    fixed_squares, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
+    most = np.bincount(problem.clusters, (fixed_squares - having)[:rows]).max()
+    needed = fixed_squares.sum() - having.sum() - most > np.log(rows)
     return search(replace(fixed, sigma=problem.sigma), start, report) if needed else u
 
 

@@ -3,8 +3,8 @@
 The pusher's model is quasi-static and independent of the box's mass and friction. In this model, a frictionless push
 at a face point p along the inward normal n by a length s moves the box by s n / (1 + h^2) and turns it by
 s h / (r (1 + h^2)), where h = (p x n) / r (limit surface of r2s/physics/sliding.py). The error counts position and
-yaw in units of their tolerances. The pusher selects the face point whose best push reduces the error fastest,
-including the tip's way to this point, and plans anew in every control period.
+yaw in units of their tolerances. In every control period, the pusher plans anew: it selects the face point whose best
+push, with the tip's travel to this point, reduces the error fastest.
 """
 
 import numpy as np
@@ -23,8 +23,8 @@ from r2s.tasks.push_measures import GOOD_M, GOOD_RAD
 POINTS, EDGE = 9, 0.75  # number of points per face; share of a half edge that the points span
 CLEAR = 0.02  # m, clearance between tip and box while the tip moves around the box
 NEAR = 0.012  # m, lateral error of the tip in front of a face, below which the tip pushes
-UNITS = np.array([GOOD_M, GOOD_M, GOOD_RAD])  # m, m, rad, one unit of error: the tolerances of success
-DONE = 0.3  # units of error below which the pusher stops; a push may miss by a few mm
+TOLERANCE = np.array([GOOD_M, GOOD_M, GOOD_RAD])  # m, m, rad: the unit of the error
+DONE = 0.3  # tolerances, error below which the pusher stops: 9 mm or 3 degrees; a noisy pose alone has 0.06
 SPEED, TRAVEL, SLOW_M = 0.15, 0.2, 0.02  # m/s, tip speed in a push, between pushes; m, a shorter push is slower
 GAIN = 0.25  # gain of the tip speed feedback / damping of the impedance law; 25 Hz and the latency allow little more
 
@@ -63,8 +63,10 @@ class Pusher:
         self._half, self._clear = half[:2], half[:2] + task.tip_radius + CLEAR
         self._points, self._normals = p, n = _face_points(self._half)
         reach = float(Surface(half, half, 1.0, half=half).reach)
-        lever = (p[:, 0] * n[:, 1] - p[:, 1] * n[:, 0]) / reach
-        self._twists = np.column_stack([n, lever / reach]) / (1.0 + lever[:, None] ** 2) / UNITS  # per m of a push
+        h = (p[:, 0] * n[:, 1] - p[:, 1] * n[:, 0]) / reach
+        self._twists = np.column_stack([n, h / reach]) / (1.0 + h[:, None] ** 2) / TOLERANCE  # tolerances per m
+        self._contacts = p - task.tip_radius * n
+        self._places = self._along(self._contacts - CLEAR * n)
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
@@ -91,48 +93,51 @@ class Pusher:
         """Return the tip velocity (3,) m/s along the table, and the unit push direction (2,), or 0 for no push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
-        at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), error[2]]) / UNITS
+        at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), error[2]]) / TOLERANCE
         if np.linalg.norm(e) < DONE:
             return np.zeros(3), np.zeros(2)
         k, length = self._best_push(at, e)
         point, normal, radius = self._points[k], self._normals[k], self._task.tip_radius
         across, push = np.array([-normal[1], normal[0]]), np.zeros(2)
         aside, gap = (at - point) @ across, (point - at) @ normal - radius
-        if abs(aside) < NEAR and gap < 2 * CLEAR:
+        if abs(aside) < NEAR and -radius < gap < 2 * CLEAR:  # not beyond the face: from there a push leads away
             push = rotation.T @ normal
-            way = SPEED * min(1.0, length / SLOW_M) * normal - 3.0 * aside * across
+            velocity = SPEED * min(1.0, (length + max(gap, 0.0)) / SLOW_M) * normal - 3.0 * aside * across
         else:
             towards = self._around(at, point - (radius + 0.3 * CLEAR) * normal) - at
             far = float(np.linalg.norm(towards))
-            way = min(TRAVEL, 6.0 * far) * towards / max(far, 1e-9)
-        return np.array([*(rotation.T @ way), 0.0]), push
+            velocity = min(TRAVEL, 6.0 * far) * towards / max(far, 1e-9)
+        return np.array([*(rotation.T @ velocity), 0.0]), push
 
     def _best_push(self, at: np.ndarray, e: np.ndarray) -> tuple[int, float]:
         """Return the face point and the length, m, of the push that reduces the error e (3,) fastest.
 
-        The push from a face point of the twist w has the length s >= 0 that minimizes |e - s w|. Its time is that of
-        the way from `at` (2,) m and of the push.
+        The error is in tolerances and in the box's frame, as the tip's position `at` (2,) m. The push from a face
+        point of the twist w has the length s >= 0 that minimizes |e - s w|. Its time is that of the travel from `at`
+        around the box and of the push, without acceleration.
         """
         squares = (self._twists**2).sum(axis=1)
         lengths = (self._twists @ e / squares).clip(0.0)
-        left = np.linalg.norm(e - lengths[:, None] * self._twists, axis=1)
-        contacts = self._points - self._task.tip_radius * self._normals
-        off = np.abs(self._along(contacts) - self._along(at[None]))
-        ways = np.maximum(np.minimum(off, 4.0 * self._clear.sum() - off), np.linalg.norm(contacts - at, axis=1))
-        rates = (np.linalg.norm(e) - left) / (ways / TRAVEL + lengths / SPEED + 1e-9)
+        remaining = np.linalg.norm(e - lengths[:, None] * self._twists, axis=1)
+        around = np.abs(self._places - self._along(at[None]))
+        around = np.minimum(around, 4.0 * self._clear.sum() - around)
+        travel = np.maximum(around, np.linalg.norm(self._contacts - at, axis=1))
+        rates = (np.linalg.norm(e) - remaining) / (travel / TRAVEL + lengths / SPEED + 1e-9)
         k = int(np.argmax(rates))
         return k, float(lengths[k])
 
     def _along(self, at: np.ndarray) -> np.ndarray:
-        """Return coordinates (k,) m of points (k, 2) m, counterclockwise along the way around the box."""
+        """Return coordinates (k,) m of points (k, 2) m, moved onto the way around the box; counterclockwise."""
         a, b = self._clear
-        x, y = (at / (np.abs(at) / self._clear).max(axis=1, keepdims=True).clip(1e-9)).T
-        lateral = np.abs(x) * b >= np.abs(y) * a
-        sides = [lateral & (x > 0.0), ~lateral & (y > 0.0), lateral]
+        nearest, rows = np.clip(at, -self._clear, self._clear), np.arange(len(at))
+        side = np.argmin(self._clear - np.abs(nearest), axis=1)  # 0: left or right, 1: above or below
+        nearest[rows, side] = np.where(nearest[rows, side] < 0.0, -1.0, 1.0) * self._clear[side]
+        x, y = nearest.T
+        sides = [(side == 0) & (x > 0.0), (side == 1) & (y > 0.0), side == 0]
         return np.select(sides, [b + y, 2 * b + a - x, 3 * b + 2 * a - y], 4 * b + 3 * a + x)
 
     def _around(self, at: np.ndarray, to: np.ndarray) -> np.ndarray:
-        """Return the next waypoint (2,) m, in the box's frame, from `at` to `to` around the box."""
+        """Return the first waypoint (2,) m, in the box's frame, from `at` around the box to `to`."""
         clear, edge = self._clear, self._clear - CLEAR
         corners = clear * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         if not _crosses(at, to, edge + 0.2 * CLEAR):
