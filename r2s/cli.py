@@ -23,7 +23,7 @@ INTERRUPTED = 130
 RESUMABLE = ("identify", "train", "tune", "results")
 PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
-MOST_SEED = 2**32 - 1  # largest seed that some generators of NumPy accept
+MOST_SEED = 2**32 - 1  # largest seed that all generators of NumPy accept
 ABSENT = "not there"
 # keys that skip_completed does not compare: a run's folder, display and number of cores
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")

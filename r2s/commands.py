@@ -61,7 +61,7 @@ def run_command(words: Sequence[str]) -> None:
     )
     converting.add_argument("--trust", help=TRUSTED)
     commands.add_parser("engines", help="the physics engines: version, or how to install it")
-    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # in front: KEY=VALUE may repeat
+    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first, since KEY=VALUE may repeat
     others = [w for w in words[1:] if not w.startswith(("to=", "trust="))]
     typed, unknown = parser.parse_known_args([words[0], *options, *others])
     if unknown:

@@ -28,7 +28,7 @@ from r2s.provenance import git, machine, packages, sha256
 
 # keys of meta.json for each part of a run; every resume begins a new part
 PART = ("start", "wall_clock_s", "status", "process", "threads", "device", "git", "packages", "machine")
-NOTE_S = 30.0  # s between updates of the wall clock in meta.json, which records the duration even of a killed run
+NOTE_S = 30.0  # s between updates of the wall clock in meta.json, so that the duration of a killed run is known
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Job:
     """Description of a job, stored in the job's run folder.
 
     Attributes:
-        stage, name: run folder runs/<stage>/<name>; an existing name gets a number, and None means `default_name`.
+        stage, name: run folder runs/<stage>/<name>. r2s adds a number if the name exists; name None: `default_name`.
         config: composed config as YAML text. overrides: overrides as the user typed them.
         seed: seed of the run. threads: number of threads; 0: one per core. device: device of the learner.
         inputs: files that the run reads; meta.json records their SHA-256. parents: run folders that the run uses.
@@ -320,7 +320,7 @@ def is_done(folder: Path) -> bool:
 
 
 def is_locked(folder: Path) -> bool:
-    """Return whether a process has locked a run folder, because the process is writing there."""
+    """Return whether a process has locked a run folder in order to write there."""
     try:
         with open(folder / "overrides.yaml", "r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -25,7 +25,7 @@ from r2s.physics.robot import SIM_DT
 def detect(thresholds, floor, state):
     """Test whether a contact begins or ends, if any joint moves; friction of resting joints hides forces.
 
-    Two tests of the hypothesis that no force acts, each with its own threshold: of the force, and of an impact. An
+    Two tests check the hypothesis that no force acts: the first tests the force, the second an impact. An
     impact raises the filter's variances, which would hide the impact from the first test. The second test keeps the
     covariance from before a sudden rise of the innovations, for at most IMPACT cycles, and low-passes the force,
     because vibrating gears make the estimated force oscillate.

@@ -41,7 +41,7 @@ class Estimate:
     rests: bool  # no joint slides
     odds: float  # log odds of a payload change
     changed: bool  # a payload change was detected at this moment
-    beyond: bool = False  # the mass exceeds the largest payload, to which compensation is limited
+    beyond: bool = False  # mass - mass_half exceeds the largest payload, to which compensation is limited
 
 
 class Estimator:

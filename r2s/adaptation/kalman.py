@@ -66,8 +66,8 @@ class Filter(NamedTuple):
     counts: np.ndarray  # (5,), SPANS: all spans; AT_REST: successive spans at rest; USED, NEXT, SINCE_JUMP
     log_odds: np.ndarray  # (2,), MEAN: log odds over all onsets; ONSET: index of the likeliest one
     innovations: np.ndarray  # (2, n) Nm and Nm^2, innovations and their variances
-    # (n,), white variance relative to `Noise`, at least 1; it grows under persistent innovations, such as a gear's
-    # vibration under a load that no recording has
+    # (n,), white variance relative to `Noise`, at least 1; it grows if innovations stay large, as when a gear
+    # vibrates under a load that no recording has
     noise_scale: np.ndarray
     work: np.ndarray  # (2, N), scratch: P h^T; variance of the friction from the payload, per joint
 
@@ -151,7 +151,7 @@ def _predict_joint(filter, noise, residual, j):
         P[error, error] += model**2 * (1.0 - fade * fade)
     P[error, error] += noise.reversal[j] ** 2 * noise.level[j] * residual.friction_path[j]
     most = model**2 + (2.0 * noise.reversal[j] * noise.level[j]) ** 2
-    if P[error, error] > most:  # limit to an unknown error's variance; shrink correlations as well
+    if P[error, error] > most:  # limit to an unknown error's variance; keep the correlations
         for i in range(N):
             if i != error:
                 P[error, i] *= np.sqrt(most / P[error, error])
@@ -198,7 +198,7 @@ def _innovation(filter, noise, residual, j):
     of_friction, of_rate, payload = residual.friction[j], residual.rate[j], residual.payload
     R = noise.white[j] ** 2 + (noise.momentum_share[j] * of_rate) ** 2 + filter.work[1, j]
     R = filter.noise_scale[j] * R
-    if residual.sliding[j] == 0.0:  # stiction balances any torque within breakaway: uniform
+    if residual.sliding[j] == 0.0:  # stiction balances any torque up to breakaway: uniform distribution
         R += noise.breakaway[j] ** 2 / 3.0 * STICTION_S / T
     for i in range(len(x)):
         s = P[i, friction] * of_friction + P[i, offset] + P[i, error] + P[i, rate] * of_rate

@@ -1,10 +1,10 @@
 """Correct the identified model by a fit to recordings without a payload.
 
 An identification omits model terms that hardly improve the fit. A payload estimate needs these terms, because a
-torque error of 0.1 Nm at a lever arm of 0.5 m looks like a mass of 20 g. The correction therefore fits all terms of a
-joint (`TERMS`), mass and first moments of every link, and the compliance of every gear. Each parameter has a prior
-with mean zero and a typical standard deviation, so the fit is a ridge regression (Bishop 2006, 3.3). The fit uses
-momentum residuals (momentum_residual.py), which need no accelerations.
+torque error of 0.1 Nm at a lever arm of 0.5 m looks like a mass of 20 g. The correction therefore fits the terms of
+every joint (`TERMS`), missing inertia and latency, mass and first moments of every link, and the compliance of every
+gear. Each parameter has a prior with mean zero and a typical standard deviation, so the fit is a ridge regression
+(Bishop 2006, 3.3). The fit uses momentum residuals (momentum_residual.py), which need no accelerations.
 
 A compliant gear of stiffness K twists by torque / K. A residual that ignores the twist between motor and link has an
 error of M d2(torque)/dt2 / K: 0.7 Nm at 15 kNm/rad on a Panda whose torque varies by 4 Nm at 7 Hz.

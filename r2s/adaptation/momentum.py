@@ -1,7 +1,7 @@
-"""Compute an arm's generalized momentum, and its derivatives (columns) by a payload's inertial parameters; compiled.
+"""Compute an arm's momentum and its derivatives (columns) with respect to a payload's inertial parameters; compiled.
 
-The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q), without accelerations (De Luca and Mattone, ICRA
-2003). Joint j has the screw axis S_j about the base origin and moves bodies with the total momentum h_j. Then p_j is
+The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q) (De Luca and Mattone, ICRA 2003). Let S_j be the
+screw axis of joint j about the base origin, and h_j the total momentum of all bodies that joint j moves. Then p_j is
 S_j . h_j, and element j of C^T dq is dS_j/dt . h_j, both linear in each body's mass, first moments and tensor.
 """
 

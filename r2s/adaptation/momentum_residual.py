@@ -1,7 +1,7 @@
 """Compute the momentum residual: mean torque over 60 ms that command, friction and links do not explain; compiled.
 
 The change of momentum equals the integral of all torques, so the residual needs no accelerations. Let m be the moving
-average of the model torque's integral minus the momentum. The residual y = (m(t) - m(t - T)) / T in Nm compares two
+average of (integral of the model torque - momentum). The residual y = (m(t) - m(t - T)) / T in Nm compares two
 averages at a distance of one span, T s. The residual is linear in the unknown parameters x: y = H x + noise.
 
 The moving average has triangular weights over two spans, so y averages torque by a quadratic spline over three spans.

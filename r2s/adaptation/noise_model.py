@@ -79,7 +79,7 @@ def fit_noise(
     The motion `train` yields a first model correction. The noise is fitted to the residuals of the corrected model in
     the motion `other`: covariances at lags of 60 to 300 ms yield a joint's model error, and the remaining variance
     yields white noise that grows with the momentum rate. Scaling each joint's noise then matches the variance of the
-    innovations to the prediction. A final common factor limits the odds of a payload change to the number of spans.
+    innovations to the prediction. A common factor then limits the odds of a payload change to the number of spans.
     Both motions determine the returned correction and the prior means of friction and offsets.
     """
     first = fit_model_correction(robot, arm, train)
@@ -151,7 +151,7 @@ def _with_model(prior: np.ndarray, model: np.ndarray, momentum: np.ndarray) -> n
 
 
 def _without_payload(noise: Noise) -> Noise:
-    """Return the noise of an arm that is known to carry no payload."""
+    """Return `noise` with a payload prior near zero, for an arm without a payload."""
     prior = noise.prior.copy()
     prior[:BODY] = 1e-6
     return noise._replace(prior=prior, rest_drift=0.0)

@@ -36,21 +36,21 @@ CORRELATED_SPANS = 15  # spans with the same model error: 0.3 s, see CORRELATION
 # shares of an arm's largest payload and distance: RMS of a mass uniform up to half the largest, RMS of centers
 # uniform in a ball of half the distance; tensor of 0.87 kg of 5 cm size, 5 cm from the frame, for 3 kg and 0.15 m
 PAYLOAD_MASS, PAYLOAD_CENTRE, PAYLOAD_TENSOR = 0.5 / np.sqrt(3), 0.5 / np.sqrt(5), 4e-3 / (3.0 * 0.15**2)
-WARMED = 0.07  # share of friction that may have changed by temperature since the identification
+WARMED = 0.07  # relative change of friction with temperature since the identification, standard deviation
 FRICTION_DRIFT = 0.007  # 1/sqrt(s): 7 % in 100 s
 OFFSET_DRIFTED, OFFSET_DRIFT = 0.02, 0.003  # share of the friction level; the same per sqrt(s)
 # 1/s, share of the squared largest payload, 0.02 kg^2/s for a Panda's 3 kg: after 1 s, the mass interval spans the
 # masses that stiction hides, breakaway torque / (lever arm g), 0.1 to 0.25 kg
 REST_DRIFT = 0.02 / 3.0**2
 PAYLOAD_DRIFT = 0.003  # 1/sqrt(s), share of the payload's prior
-NOISE_ADAPTATION = 0.04  # per span: persistent innovations become noise within 0.5 s
+NOISE_ADAPTATION = 0.04  # per span: if innovations stay large, the white noise adapts within 0.5 s
 CORRELATION_S = 0.3  # s, correlation time of the model error
 PAYLOAD_FRICTION = 0.015  # Nm per Nm of payload torque: load-dependent friction
 # without recordings: shares of the friction level (WHITE, MODEL), momentum rate (MOMENTUM), friction step (REVERSAL)
 WHITE_SHARE, MOMENTUM_SHARE, MODEL_SHARE, REVERSAL_SHARE = 0.2, 0.1, 0.1, 0.1
 LAGS = range(3, 16)  # spans, lags at which residuals no longer share the noise of measured speeds
 FINEST_SHARE = 0.03  # share of the friction level: smallest model error that a fit may yield
-SECOND_HALF = 0.7  # scale of a noise fitted from half of the motion; benchmarks/payload.py part=events,quiet
+SECOND_HALF = 0.7  # factor on noise that was fitted to half of the motion; benchmarks/payload.py part=events,quiet
 LEAST_SCALE, MOST_SCALE, SCALINGS = 0.5, 1.5, 8  # scaling of the noise: bounds of one step, most steps
 OUTLIER = 3.0  # standard deviations at which innovations are clipped, because the filter weighs larger ones less
 
@@ -65,16 +65,16 @@ MOST_SURPRISE = 9.0  # squared standard deviations: a larger innovation is a jum
 ONSETS = 10  # spans at which a jump may have begun: 0.2 s
 THRESHOLD = np.log(36000.0 / T)  # log odds: one false alarm in ten hours (Markov's inequality)
 NEW_PAYLOAD = 0.2  # share of the prior: standard deviation of a payload directly after a jump
-SETTLING_SPANS = round(0.5 / T)  # spans of motion after a rest in which its payload is compared with that before
+SETTLING_SPANS = round(0.5 / T)  # spans after a rest in which the payload is compared with the one before the rest
 # squared distance of two estimates: one false alarm in an hour of tests, doubled because model errors persist
 REPLACED = 2.0 * chi2.isf(T / 3600.0, 4)
 
 # reported estimate (estimator.py)
 LEAST_MASS = 0.02 / 3.0  # share of the largest payload, 0.02 kg of a Panda's 3 kg: a smaller mass gets no center
-FRICTION_CURVE = 0.02  # share of friction: error of its speed dependence, which one factor cannot follow
+FRICTION_CURVE = 0.02  # share of friction: error of its speed dependence, which one factor cannot represent
 
 # feedforward (feedforward.py)
-BLENDING = -np.expm1(-SIM_DT / T)  # per cycle: a new estimate enters over one span
+BLENDING = -np.expm1(-SIM_DT / T)  # per cycle: a new estimate takes effect over one span
 ACCELERATION_S = 1 / RATE  # s, low-pass of accelerations: a loop of this rate tolerates the latency of an arm
 
 # wrench (wrench_filter.py, wrench.py); benchmarks/wrench.py measures them on independent arms and twins in contact
@@ -110,11 +110,11 @@ MOMENT_ARM = 0.1  # m, lever arm of forces on an arm without a tool, which scale
 FREE_FORCE = 0.1  # N, standard deviation of the force at the beginning of a motion
 # N per kg of the largest payload, per axis, 0.25 N for a Panda's 3 kg: error beyond the filter's covariance
 FORCE_FLOOR = 0.25 / 3.0
-CONFIRMED, RELEASED = 15, 50  # cycles above, below the thresholds after which a contact begins, ends
+CONFIRMED, RELEASED = 15, 50  # cycles above the threshold until a contact begins, below RELEASE until it ends
 RELEASE = 0.25  # threshold of release, share of the contact threshold
 # cycles for which the impact test keeps a covariance, longer than stiff impacts; 1/s, low-pass of the force
 IMPACT, IMPACT_RATE = 30, 100.0
-SUDDEN, USUAL_RATE = 2.0, 1.0  # times the usual innovations: more begins an impact; 1/s, low-pass of the usual ones
+SUDDEN, USUAL_RATE = 2.0, 1.0  # an impact exceeds this multiple of the usual innovations; 1/s, their low-pass
 BLOCK_S, TAIL = 0.5, 0.2  # s per maximum; share of the largest maxima from which the tail is fitted
 ALARMS_PER_HOUR = 1.0
 # m, path of the tip after which a force that points down is a weight; share of the force that may be horizontal; path

@@ -6,7 +6,7 @@
 
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
 tool (wrench_filter.py). A contact begins when the squared force, in units of its covariance, exceeds a threshold for
-15 ms while a joint moves, in a chi-square test of the hypothesis that no force acts. A second test detects impacts
+15 ms while a joint moves: a chi-square test of the hypothesis that no force acts. A second test detects impacts
 (contact_detection.py). Together, both tests aim at one false alarm per hour of similar motion. The least threshold,
 GAUSSIAN, assumes independent normal errors in each cycle. For larger errors, `contact_thresholds` computes the
 thresholds from recordings without contact: the largest squared force of each half second has an exponential tail
@@ -33,7 +33,7 @@ from r2s.physics.payload import ee_pose
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
-ALARMS_PER_TEST = tuning.ALARMS_PER_HOUR / 2  # an hour
+ALARMS_PER_TEST = tuning.ALARMS_PER_HOUR / 2  # per hour
 GAUSSIAN = float(chi2.isf(ALARMS_PER_TEST * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
 SQUARES = ["square", "impact_square"]  # columns of the tests
 BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; fewest blocks for a threshold
@@ -43,8 +43,8 @@ class WrenchObserver:
     """Observer that estimates the wrench on one arm, cycle by cycle.
 
     Attributes:
-        thresholds: (2,), squared forces, in units of their covariances, above which the arm is in contact: of the
-            force, and of an impact.
+        thresholds: (2,), thresholds of the two contact tests, for force and for impact: squared forces in units of
+            their covariances.
         tool: tool of the robot; None for a robot without a tool.
 
     Args:
@@ -200,7 +200,7 @@ def observe_recording(
 
 
 def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
-    """Return the begin and end, s, and the largest force, N, of each contact in a table from `observe_recording`."""
+    """Return the start and end, s, and the largest force, N, of each contact in a table from `observe_recording`."""
     touches = np.diff(np.concatenate([[0], table["in_contact"].to_numpy(), [0]]))
     force = np.linalg.norm(table[["force_x_N", "force_y_N", "force_z_N"]].to_numpy(), axis=1)
     t = table["t"].to_numpy()
@@ -237,7 +237,7 @@ def contact_thresholds(robot: Robot, observer: WrenchObserver, free: Sequence[Re
 
 
 def _exceeded_hourly(maxima: np.ndarray) -> float:
-    """Return the squared force that maxima of blocks (N,) exceed ALARMS_PER_TEST times an hour, from their tail."""
+    """Extrapolate block maxima (N,) to the squared force that they exceed ALARMS_PER_TEST times per hour."""
     level = np.quantile(maxima, 1.0 - tuning.TAIL)
     excess = np.mean(maxima[maxima >= level] - level)
     blocks_per_hour = 3600.0 / tuning.BLOCK_S

@@ -1,8 +1,8 @@
 """Kalman filter of the external wrench, the momentum, and the friction model's error; compiled.
 
 The state has N = w + 2 n components: the wrench at the tip in base axes, with w = 3 (force) or 6 (force and moment);
-for each of n joints, the error b of the friction f = f_model + b, Nm; and the generalized momentum p, Nm s, which
-every cycle measures (momentum.py). Momentum obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
+for each of n joints, the error b of the friction f = f_model + b, Nm; and the generalized momentum p, Nm s, which is
+measured in every cycle (momentum.py). Momentum obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
 and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 
 The uncertainty of a joint's friction depends on whether the joint moves (wrench_friction.py).
@@ -229,7 +229,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Limit the friction of joints at rest to the breakaway torques (edges), and its variance to `_hidden`."""
+    """Limit the friction of joints at rest to the breakaway torques (edges), its variance to that of `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)

@@ -151,7 +151,7 @@ def side_variance(noise, joints, j):
     """Return the variance, Nm^2, of friction whose direction is wrong with probability p: 4 f^2 p (1 - p)."""
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
-    p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # logistic for the normal distribution
+    p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # approximately the normal cdf
     unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # for presliding, whose law is known only roughly
     return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent)
 

@@ -47,7 +47,7 @@ class FusedWrench(WrenchObserver):
     """A `WrenchObserver` whose force estimate also uses an identified surface; contact detection does not.
 
     Args:
-        surface: identified surface. draws: posterior samples of it (r2s/identification/contact/contact_file.py).
+        surface: identified surface. draws: samples of its posterior (r2s/identification/contact/contact_file.py).
 
     Raises:
         UserError: the robot has no tool.

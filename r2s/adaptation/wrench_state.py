@@ -15,9 +15,9 @@ COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
 # release threshold; path of the tip, m, along which the force pointed down; squared force of the impact test, cycles
 # above its threshold; SURPRISE over the last second; cycles since a sudden rise of SURPRISE above it
 SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, USUAL, SURPRISED, ENTRIES = range(11)
-# rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; slow cycles; angle where it came to rest,
-# motion since, creep of this cycle, rad; friction model now, a cycle ago, Nm; known torque without motor or friction,
-# its mean in the last cycle with both, motor torque, its mean in the coming cycle, Nm; variance of the measured
+# rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; successive slow cycles; reference angle at
+# rest, motion since, creep of this cycle, rad; modeled friction now, a cycle ago, Nm; known torque without motor and
+# friction, mean of the last cycle with both, motor torque, its mean in the coming cycle, Nm; variance of the measured
 # momentum (Nm s)^2; presliding deflection; two low-passes of the momentum Nm s, mean square of its fast part
 ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
 MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)

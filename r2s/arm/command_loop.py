@@ -142,7 +142,7 @@ class CommandLoop:
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:
-        """Complete a stop that the driver began before the motion ended, and raise the reason of this stop.
+        """Complete a stop that the driver began before the motion ended, and raise ArmStopped with the reason.
 
         Raises:
             StopRequested, ArmStopped: as `__call__`.
@@ -153,7 +153,7 @@ class CommandLoop:
     def halt(self, reason: str) -> None:
         """Damp the arm to rest under zero command, and raise ArmStopped with `reason`.
 
-        If the driver is already stopping the arm, do nothing, because this stop itself makes the arm deviate.
+        If the driver is already stopping the arm, do nothing, because this stop causes the deviation.
         """
         if self.driver.stopping is not None:
             return
@@ -161,7 +161,7 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return the reason if the driver was stopping it or it stops itself meanwhile, else None.
+        """Stop the arm; return the reason if the driver was stopping the arm or the arm stops itself, else None.
 
         A driver with a push limit first handles a contact force, as in any stop (r2s/physics/contact_stop.py).
         """
@@ -198,7 +198,7 @@ class CommandLoop:
             self._adapting, self._added = True, np.zeros(self.arm.robot.n)
 
     def _adapt(self, adapter: Adapter) -> None:
-        """Update the adapter's torque; if the adapter raises an exception, stop the arm, then raise it again."""
+        """Update the adapter's torque; if the adapter raises an exception, stop the arm and raise this exception."""
         try:
             self._added = np.asarray(adapter(self.state.q, self.state.dq, self.sent), dtype=float)
             if self._added.shape != self.sent.shape:

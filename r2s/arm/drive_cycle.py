@@ -43,7 +43,7 @@ class Memory(NamedTuple):
         command: (m, c), the last finite commands. law: (m, k), memory of the control law.
         target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `Actuation`.
         sent: (m, n) Nm, the last torque command.
-        held: (m, n) Nm, last sum of adapter torque and `Given.hold`, which a stop without contact still applies.
+        held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop without contact still applies this sum.
         share: (m,), factor on the allowed speeds, which is 1 in a motion and decreases in a stop (`_brake`).
         cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, and the stop's start.
         why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the filter changed a torque.
@@ -146,7 +146,7 @@ def _watch(i, q, dq, given, bounds, memory):
 
 @njit(cache=True)
 def resist(dq, spring, most, held):
-    """Adjust the torque `held` (n,) Nm of a stop so that it brakes the joints that still move, at dq (n,) rad/s.
+    """Adjust the torque `held` (n,) Nm of a stop to brake the joints that still move; dq: (n,) rad/s, joint speeds.
 
     A joint continues to move if it carries an undeclared load, or if `held` still compensates kinetic friction.
 
@@ -162,7 +162,7 @@ def resist(dq, spring, most, held):
 
 @njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
-    """Add the adapter's torque, or `Memory.held` during a stop, to the target torque (n,) Nm of arm i."""
+    """Add the adapter's torque, or `Memory.held` during a stop, to `target` (n,) Nm, the effort of arm i."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:
@@ -193,7 +193,7 @@ def _kinematics(model, q):
 def _brake(i, seen, arm, bounds, model, memory):
     """Set the target torque of arm i in a stop, and lower the allowed speeds from the present speed toward zero.
 
-    Only a stop with code SILENT, LAW_NOT_FINITE or REQUESTED handles a contact force (`stop_torque`).
+    `stop_torque` handles contact only in stops with code SILENT, LAW_NOT_FINITE or REQUESTED.
     """
     needs, why = 0.0, memory.why[i]
     memory.target[i] = 0.0

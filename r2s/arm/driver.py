@@ -2,9 +2,9 @@
 
 Each cycle checks that the command is finite and recent (watchdog). The control law (r2s/physics/control_laws.py)
 computes a target torque, which passes soft start and low-pass. The torque of an adapter (r2s/adaptation/adapter.py)
-is added. The same safety filter as in training (r2s/physics/safety_filter.py) limits the sum; finally, the
-change from the torque that the arm applied in the last cycle is limited. The driver has no clock and no connection to
-an arm: states and commands are its only inputs, so tests can run it on a million adversarial inputs.
+is added. The same safety filter as in training (r2s/physics/safety_filter.py) limits the sum. Finally, the
+driver limits the change from the torque that the arm applied in the last cycle. The driver has no clock and no
+connection to an arm: states and commands are its only inputs, so tests can run it on a million adversarial inputs.
 
 `DriverBatch` drives many arms in lock-step; `Driver` drives one arm.
 """
@@ -39,7 +39,7 @@ from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
 
-DEADLINE_S = 0.05  # s; without a new finite command for this time, or for PERIODS if longer, the driver stops the arm
+DEADLINE_S = 0.05  # s; the driver stops an arm without a new finite command for this time, or for PERIODS if longer
 PERIODS = 2.5  # control periods of the policy
 DAMP_S = 0.5  # s, longest time to bring an arm to rest
 Q_INSIDE = 0.02  # rad; the driver stops an arm that comes this close to a position limit
@@ -128,7 +128,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, torque that a stop still applies: compensation, plus contact torque if it holds a contact."""
+        """(m, n) Nm, torque that a stop applies: compensation, and contact torque if the stop holds a contact."""
         m = self._memory
         if not self.decides_contact:
             return m.held

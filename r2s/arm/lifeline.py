@@ -11,7 +11,7 @@ from multiprocessing.sharedctypes import RawArray
 
 OWNER_DIED, OWNER = 0x40000000, 0x3FFFFFFF  # FUTEX_OWNER_DIED and FUTEX_TID_MASK of linux/futex.h
 SHARED = ROBUST = 1  # PTHREAD_PROCESS_SHARED, PTHREAD_MUTEX_ROBUST
-_kept: list[RawArray] = []  # type: ignore[valid-type]  # once locked: the C library may still refer to them
+_kept: list[RawArray] = []  # type: ignore[valid-type]  # locked mutexes, to which the C library may still refer
 
 
 class Lifeline:
@@ -43,5 +43,5 @@ class Lifeline:
             ctypes.CDLL(None).pthread_mutex_unlock(self._raw)
 
     def lost(self) -> str | None:
-        """Return a message if the thread that locked the mutex has died, else None; for use with `watched`."""
+        """Return a message for `watched` if the thread that locked the mutex has died, else None."""
         return "the process of the policy has ended" if self._raw[0] & OWNER_DIED else None

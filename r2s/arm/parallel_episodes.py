@@ -46,7 +46,7 @@ def run_parallel_episodes(
         policy, task: see `rollout`.
         starts: (E, n) rad, first postures of the episodes. goals: (E, ...), see `Task`.
         workers: largest number of processes.
-        progress: called with (goals done, total) after every goal, with several processes every REPORT_S.
+        progress: called with (goals done, total) after every goal; with several processes, at least every REPORT_S.
 
     Raises:
         UserError: a process was killed.

@@ -68,7 +68,7 @@ class PolicyRunner:
 
     Attributes:
         stops: stops that ended episodes early. timing: see `Timing`.
-        done: number of episodes for which the arm moved, or tried to move, to the start.
+        done: number of `place` calls after which `halted` was None, even if the arm stopped on the way.
         speeds: (1, T, n) rad/s, joint speeds after each control step of the last episode, see `smooth_speeds`.
         halted: why no further episode runs: a request to stop, the operator's refusal after a stop, or too many
             failed attempts to reach a start. None: not halted.
@@ -139,9 +139,9 @@ class PolicyRunner:
                 return
 
     def end(self) -> np.ndarray:
-        """Stop the arm; return (1,) bool: whether arm, driver, a request or lost commands ended the episode."""
+        """Stop the arm; return (1,) bool: whether arm, driver, a stop request or lost commands ended the episode."""
         reason = self._loop.end() or requested() or self.timing.refusal(self._arm)
-        if not self._stopped and reason is not None:  # a stop that had not yet been raised when the episode ended
+        if not self._stopped and reason is not None:  # a stop that raised no exception before the episode ended
             self._record_stop(f"{self._loop.state.t:.2f} s", reason)
         self.halted = self.halted or requested()
         self.blocked = self._arm.blocked if isinstance(self._arm, Operated) else None
@@ -156,9 +156,7 @@ class PolicyRunner:
         return len(self._angles)
 
     def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
-        """Return the arm's state, the low-pass filtered target (n,) Nm, whether the episode was stopped, and the
-        number of cycles in which the safety filter changed the torque.
-        """
+        """Return state, effort (n,) Nm, whether the episode was stopped, and the number of filtered cycles."""
         driver = self._loop.driver
         return self._loop.state, driver.effort, self._stopped, driver.limited
 
@@ -210,7 +208,8 @@ class PolicyRunner:
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
     """Compute smooth joint speeds (k, n) rad/s in every `every`-th cycle, from the angles (n,) rad of all cycles.
 
-    A speed is a parabola's slope over SMOOTHING_CYCLES on each side (Savitzky and Golay, Anal. Chem. 36(8), 1964).
+    Each speed is the slope of a parabola fitted to the angles up to SMOOTHING_CYCLES before and after its cycle
+    (Savitzky and Golay, Anal. Chem. 36(8), 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:

@@ -1,7 +1,7 @@
 """Record an arm while it presses on a surface and slides along it, to identify the surface.
 
 The arm performs `task=wipe`: hybrid control with the identified model moves the tip along paths on the surface. The
-force rises or falls on alternate paths. The joints must move, as stiction hides the force (docs/how_to/surfaces.md).
+force rises along one path and falls along the next. Joints must move: stiction hides force (docs/how_to/surfaces.md).
 """
 
 from collections import deque
@@ -77,7 +77,7 @@ def record_presses(
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver stopped the motion; `recording` contains the paths completed before, if any.
+        ArmStopped: arm or driver stopped the motion, or commands were late; `recording`: the completed paths, if any.
         UserError: the tip does not reach the surface, or no safe path leads there.
     """
     robot, control = arm.robot, plan.control(arm.robot)

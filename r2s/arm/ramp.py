@@ -1,4 +1,4 @@
-"""The paper's breakaway protocol: ramp the torque of one joint after the other, in both directions, until it moves.
+"""The paper's breakaway protocol: ramp the torque of each joint in turn, in both directions, until the joint moves.
 
 The ramps run on any `Arm`; r2s/identification/friction/breakaway.py estimates breakaway torques from them.
 """
@@ -30,13 +30,13 @@ AFTER_MOTION = 5  # cycles recorded after the joint has moved
 STRAY = DEVIATION  # rad: a ramp ends if any joint moves this far; an arm this far from its pose moves back to it
 POSE_MARGIN = 0.15  # rad from a pose to the position limits; more than any joint moves in one ramp
 UNFILTERED_HZ = 1e30  # disables the driver's low-pass: a ramp has no steps, and joints at rest need a command of 0
-# The stop after a ramp: a PID controller with three equal real poles brakes each joint, then its torque is released
+# The stop after a ramp: a PID controller with three equal real poles brakes each joint, then the torque is released
 BANDWIDTH = 20.0  # rad/s, of the three poles: well damped with 5 ms of delay and 3 ms of lag
 DAMPED_CYCLES = 20  # cycles of damping only, because a spring would slowly pull a joint back to where braking began
 BRAKE_SHARE = 0.1  # share of tau_max for braking: small enough that the rate limit adds no delay
 BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; attempts to stop before the next ramp starts anyway
-RELEASE_CYCLES = 10  # cycles of the release, of the rest before a ramp, and per mean angle for a speed in braking
-# rad/s, mean speeds: release begins with all joints below SLOW, the next ramp's below STILL; rest: below SLIDING
+RELEASE_CYCLES = 10  # cycles of the release, of the rest before a ramp, and of mean angles for speeds in braking
+# rad/s, mean speeds: release begins with all joints below SLOW, the next joint below STILL; rest: below SLIDING
 SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
@@ -69,7 +69,7 @@ def ramp(
     all other joints stay 0. The ramp ends when the joint has moved by MOVED, its command reaches `largest`, or any
     joint has moved by STRAY. The recording omits the stop after each ramp. The rows have the format of
     `r2s.arm.recorder`. If the error of gravity compensation exceeds a joint's friction, the joint slides at zero
-    command. Braking then finds a constant command that stops this joint, and the joint's ramp starts from there.
+    command. Braking then finds a constant command that stops this joint, and the joint's ramp starts at this command.
 
     Args:
         arm: moves to each pose, and is always stopped at the end.
@@ -198,7 +198,7 @@ class _Drive:
             still = self.rest()
             if still.all():
                 return
-            if attempt:  # after the first attempt, bristles that spring back may cause the motion
+            if attempt:  # not in the first attempt, after which bristles that spring back may cause motion
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:

@@ -99,14 +99,14 @@ class Timing:
     success: list[float] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Prepare for the cycles of a new motion."""
+        """Reset the references for a new motion: times of the last cycle, and index of the first success rate."""
         self._begun, self._last = len(self.success), (0.0, 0.0)
 
     def cycle(self, clock: tuple[float, float, float], state: ArmState, adapts: bool = False) -> None:
         """Add the durations of one cycle, given `CommandLoop.clock` and the state after this cycle."""
         began, driven, adapted = clock
         (sent_at, t), self._last = self._last, (driven, state.t)
-        if not t:  # the first command starts the motion, which takes longer than a cycle
+        if not t:  # the first command starts the motion; this start takes longer than a cycle
             self._last = 0.0, state.t
         self.driver.append(driven - began)
         if adapts:
@@ -133,7 +133,7 @@ class Timing:
             raise ArmStopped(reason)
 
     def table(self) -> list[dict[str, float | str]]:
-        """Return a row per kind of duration: count, quantiles, maximum, ms; for `robot` also lost cycles, success."""
+        """Return one row per kind of duration: count, quantiles in ms; for `robot` also lost cycles, success rate."""
         rows: list[dict[str, float | str]] = []
         for name in ("policy", "driver", "adapter", "period", "robot"):
             values = getattr(self, name)

@@ -2,7 +2,7 @@
 
 The arm's process continues whatever happens to the policy's process. If no new command arrives within the driver's
 deadline, the driver damps and stops the arm. A thread would not suffice, because a policy that holds Python's global
-lock blocks all threads. The processes share memory without a lock, which a killed process would never release.
+lock blocks all threads. The processes share memory without a lock, because a killed process would not release a lock.
 
 The arm's process runs in its own session, so signals from the terminal do not reach it. Every motion, including the
 approach, is damped and ended if the policy's process receives a signal or ends, or if the arm's process receives a
@@ -36,7 +36,7 @@ from r2s.tasks.task import State, Task
 
 START_S = 240.0  # longest time for the process to import, compile and connect to its arm
 POLL_S = 2e-4  # s between two reads of shared memory, a fifth of a cycle
-EXIT_S = 5.0  # s for the arm to come to rest at the end; after twice this time its process is ended by force
+EXIT_S = 5.0  # s for the arm to come to rest at the end; its process gets SIGTERM after 2 EXIT_S, SIGKILL after 4
 READ_ATTEMPTS = 10  # most attempts to read a slot that is being written; then `Slot.read` returns None
 
 
@@ -187,11 +187,11 @@ class RealtimeRunner:
                 return self._observe()
             polls += 1
             if polls % 100 == 0 and not self._process.is_alive():
-                self._receive("ended")  # raises the process's last message, or that it has ended
+                self._receive("ended")  # raises the exception that the process sent, or ArmStopped
             time.sleep(POLL_S)
 
     def end(self) -> np.ndarray:
-        """Stop the arm; return (1,) bool: whether arm, driver, a request or lost commands ended the episode."""
+        """Stop the arm; return (1,) bool: whether arm, driver, a stop request or lost commands ended the episode."""
         self._channel.end.write(np.ones(1))
         self._section.close()
         self.stops, stopped, timing, self.speeds, self.halted, self.blocked = self._receive("ended")
@@ -204,7 +204,7 @@ class RealtimeRunner:
             serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, effort (n,) Nm, whether the arm stopped, and the number of safety-filtered cycles."""
+        """Return cycle, state, effort (n,) Nm, whether the episode was stopped, and the number of filtered cycles."""
         while (latest := self._channel.state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")

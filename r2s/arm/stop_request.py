@@ -22,7 +22,7 @@ GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s eac
 
 
 class _Request:
-    """The stop request of this process; `ending`: a motion is stopping for it; `served`: no motion runs any more."""
+    """The stop request of this process; `ending`: a motion stops because of it; `served`: no motion runs any more."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -55,7 +55,7 @@ def serve() -> None:
 
 @contextmanager
 def watched(source: Callable[[], str | None]) -> Iterator[None]:
-    """Let `requested` call `source` in this context; `source` must return a stop reason or None in microseconds."""
+    """Let `requested` call `source` in this context; `source` must return a reason or None within microseconds."""
     _request.sources.append(source)
     try:
         yield
@@ -74,7 +74,7 @@ def pipeline() -> int | None:
 
 
 def _follow(parent: int, over: threading.Event) -> None:
-    """Send SIGTERM to this process if `parent` is not, or no longer, its parent before the event `over` is set."""
+    """Send SIGTERM to this process once its parent is not `parent`; check until the event `over` is set."""
     while not over.wait(FOLLOW_S):
         if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -98,7 +98,7 @@ def handled_signals(
 
     If no motion has responded GRACE_S after the request, the main thread gets a KeyboardInterrupt, and this context
     raises `Stopped` with the signal's name. If its block ends before a motion has responded, the context also raises
-    `Stopped`, as later code may move the arm. Outside the main thread it does nothing: Python allows no handlers.
+    `Stopped`, as later code may move the arm. The context acts only in the main thread, as Python requires.
 
     Args:
         forward: function that the signal handler calls with each signal's number.

@@ -18,9 +18,9 @@ ADAPTATION_RATE = 0.8  # 1/s, adaptation gain over proportional gain; leaves hal
 FRICTION_DQ = 0.03  # rad/s, width of the sign change of the friction estimate
 MASS_EVERY = 10  # cycles between two updates of the mass matrix
 # Limits
-OFFSET_SHARE = 0.1  # share of tau_max, limit of the estimated offset: balances 1 undeclared kg at a Panda's reach
+OFFSET_SHARE = 0.1  # share of tau_max, limit of the estimated offset: balances an undeclared 1 kg at a Panda's reach
 CORRECTION_SHARE = 0.3  # share of tau_max, limit of the total torque added to the feedforward
-MAX_DEVIATION = 0.2  # rad; an arm that deviates more meets an obstacle, or is not the arm of the plan
+MAX_DEVIATION = 0.2  # rad; a larger deviation indicates an obstacle or a wrong model of the arm
 # For an arm with an undeclared payload
 LOADED_FACTOR = 2.0  # factor on OFFSET_SHARE and CORRECTION_SHARE
 LOADED_DEVIATION = 0.5  # rad

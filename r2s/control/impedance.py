@@ -25,7 +25,7 @@ from r2s.physics.newton_euler import COM, LINK, MASS, links_of
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 
 ACTIONS = ("target", "stiffness", "both")
-# the springs' share of what the torque limit allows in all directions at home; the rest: damping, feedforward
+# springs' share of the force that the torque limit allows in all directions at home; rest: damping, feedforward
 CLIP = 0.7
 CLIP_M = 0.05  # m, error at which the default spring saturates
 
@@ -92,7 +92,7 @@ def joint_impedance(
     damping: float = 1.0,
     tank: Sequence[float] = (1.0, 2.0),
 ) -> Impedance:
-    """Return the joint impedance controller about a task's trajectory, or about home without a trajectory.
+    """Return the joint impedance controller about the task's trajectory or, if the task has none, about home.
 
     Args:
         robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
@@ -263,7 +263,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Return the force or moment `value`, checked; None: CLIP times what `limit` allows in all directions at home."""
+    """Check and return a force or moment; None: CLIP times the one that `limit` allows in all directions at home."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most
@@ -274,7 +274,7 @@ def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian
 
 
 def fastest_spring(task: ControlledTask) -> float:
-    """Return a spring's highest natural frequency w, rad/s; a critically damped spring has the loop bandwidth 2 w."""
+    """Return the highest allowed spring frequency w, rad/s; a critically damped spring has the loop bandwidth 2 w."""
     return 0.5 * BANDWIDTH_LATENCY / (1 / (2 * np.pi * task.cutoff_hz) + LATENCY)
 
 

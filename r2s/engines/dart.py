@@ -185,7 +185,7 @@ def _dartpy() -> ModuleType:
 
 def _as_gazebo(dart: ModuleType, world) -> None:
     """Change the settings in which dartpy 6.20 differs from Gazebo's plugin."""
-    # this setting affects the whole process; by default DART pushes a joint beyond its limit back at up to 10 rad/s
+    # this setting affects the whole process; by default DART pushes joints back into their limits at up to 10 rad/s
     dart.constraint.JointConstraint.setMaxErrorReductionVelocity(0.0)
     options = dart.simulation.DeactivationOptions()
     options.mEnabled = False

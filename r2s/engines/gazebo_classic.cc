@@ -4,7 +4,7 @@
 // the number of joints, from the base outwards.
 //     states, written here:   q (n) rad, dq (n) rad/s, before each step
 //     commands, read here:    1: set the state, 0: do not; torque (n) Nm; q (n) rad, dq (n) rad/s
-// When r2s closes the commands, the server ends.
+// When r2s closes the pipe of commands, the server ends.
 #include <unistd.h>
 
 #include <cstdlib>
@@ -42,12 +42,12 @@ class R2sLockstep : public WorldPlugin {
       state[i] = this->joints[i]->Position(0);
       state[n + i] = this->joints[i]->GetVelocity(0);
     }
-    // a pipe passes up to 4096 bytes at once, 170 joints
+    // a pipe passes up to 4096 bytes at once, enough for 170 joints
     const ssize_t out = state.size() * sizeof(double), in = command.size() * sizeof(double);
     if (write(this->states, state.data(), out) != out || read(this->commands, command.data(), in) != in)
       std::_Exit(0);  // r2s has closed the pipes; an orderly end takes more than 10 s
     const double *tau = &command[1], *q = tau + n, *dq = q + n;
-    if (command[0] != 0) {  // from the base outwards: a joint moves the links beyond it; then the speeds
+    if (command[0] != 0) {  // positions first, from the base outwards: a joint moves the links beyond it
       for (std::size_t i = 0; i < n; ++i) this->joints[i]->SetPosition(0, q[i]);
       for (std::size_t i = 0; i < n; ++i) this->joints[i]->SetVelocity(0, dq[i]);
     }

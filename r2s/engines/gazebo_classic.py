@@ -31,7 +31,7 @@ from r2s.physics.simulator import single_arm
 PHYSICS = ("ode", "dart")
 PLUGIN = Path(__file__).with_name("libr2s_gazebo_classic.so")
 ROOT = "R2S_GAZEBO_ROOT"  # environment variable: a root directory with Gazebo
-FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # library folders, relative to Debian's folder of the processor
+FOLDERS = (".", "blas", "lapack", "pulseaudio", "..")  # library folders, relative to Debian's folder for the CPU type
 NAME = "simulator=gazebo_classic"
 HELP = "docs/how_to/gazebo.md installs it; simulator=dart needs nothing more"
 START_S = 60.0  # s, longest wait for the server; a start takes 0.5 s

@@ -37,7 +37,7 @@ ENDS_S = 0.2  # s, rest at both ends
 LONGEST_S = 120.0
 LEAST_S = 5 * BLEND_S
 # Series.
-TOP_HZ = 1.0  # highest harmonic, in the series' own time
+TOP_HZ = 1.0  # frequency of the highest harmonic at full speed
 DECAY = 1.5  # harmonic k has an amplitude proportional to k^-DECAY: the acceleration limit bounds high harmonics
 SHORTEST_S = 4.0  # s, minimum fundamental period
 RANGE = 0.8  # share of the distance from the center to the nearer position limit, or of pi rad if that is less
@@ -51,7 +51,7 @@ TRIES = 5  # candidates per step of the local search
 MIN_AMPLITUDE = 0.3  # share of a joint's largest amplitude; a series that is safe only below this share is dropped
 MARGIN = 0.3  # least `_safety`: 0.3 of a clearance and 0.03 of tau_max, a reserve for motion between two samples
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
-FINE = 10  # number of samples for limits per sample for information and safety
+FINE = 10  # ratio of two sample rates: that of limits over that of information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
 Samples = tuple[np.ndarray, ...]  # offset from the center, velocity, acceleration
 # Scores (B,) of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)
@@ -73,7 +73,7 @@ def fourier(
 
     A random series uses up to 80 % of the position range, 65 % of the velocity limit and 70 % of the acceleration
     limit, and less near obstacles. A local search changes the series to increase the motion's `information`. The
-    series ends before its period, so the motion does not repeat itself. Equal arguments produce equal motions.
+    motion ends within the series' period, so it does not repeat itself. Equal arguments produce equal motions.
 
     Args:
         robot: limits, links and nominal model.
@@ -194,7 +194,7 @@ class Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the motion at 1 kHz with amplitudes safe at GEOMETRY_HZ; None if safe amplitudes are too small."""
+        """Return the motion at 1 kHz, with amplitudes that are safe at GEOMETRY_HZ; None if one becomes too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))
@@ -257,7 +257,7 @@ class Candidates:
     ) -> np.ndarray | None:
         """Return `a`, reduced until `_safety` is at least `margin`; None if an amplitude would be below `least`.
 
-        Each round reduces the amplitude of one joint: the joint that most improves the least safe sample's safety.
+        Each round reduces the amplitude of one joint: the one whose reduction most helps the least safe sample.
         """
         a = a.copy()
         for every in (5, 1):  # first every fifth sample, so that most rounds are fast

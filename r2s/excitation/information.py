@@ -10,7 +10,7 @@ COARSE_HZ = 10  # rate of the samples for information and safety
 # Standard deviations of noise and priors, rough values of torque-controlled arms.
 NOISE = 0.002  # share of tau_max, per sample
 FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
-DRAG_PRIOR = 0.01  # share of tau_max, torque proportional to the sine of the angle, for example from a cable
+DRAG_PRIOR = 0.01  # share of tau_max, coefficients of sine and cosine of the angle, for example of a cable's torque
 MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, for each coordinate of its center of mass
 SCALE_PRIOR = 0.3  # share of a link's tensor, or of its trace
 DELAY_PRIOR = 3e-3  # s
@@ -21,13 +21,13 @@ RESTING = 1e-3  # share of dq_max; a slower joint may stick, so that the joint's
 def information(
     robot: Robot, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool
 ) -> np.ndarray:
-    """Return the information (B,) nats in motions (B, T, n) at times (T,) s.
+    """Return the information (B,), in nats, of motions (B, T, n) at times (T,) s.
 
     Information is half of log(det posterior precision / det prior precision), with independent normal priors. The
     unknowns of each joint are offset, Coulomb friction (a tanh with unknown width and shift), viscous friction and
     drag. The unknowns of each link are mass and center of mass; gravity compensation does not remove their errors.
     For commanded torque (`gravity` false), each tensor's scale and one delay are also unknown; for link-side torque,
-    each tensor element is. Samples at 10 Hz have a noise of 0.2 % of tau_max; a resting joint's samples are ignored.
+    each tensor element. Samples at 10 Hz have a noise of 0.2 % of tau_max; a resting joint's samples are ignored.
     """
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)

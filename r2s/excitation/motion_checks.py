@@ -124,7 +124,7 @@ def check_derivatives(robot: Robot, motion: Motion) -> None:
 
 
 def check_torque(robot: Robot, motion: Motion) -> None:
-    """Raise UserError if the motion needs more than 80 % of a torque limit with the nominal model and friction."""
+    """Raise UserError if a motion's torque, with nominal model and `friction_margin`, exceeds 80 % of its limit."""
     rows = geometry_rows(motion)
     share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
     bad = np.argwhere(~(share <= TORQUE_SHARE))
@@ -169,7 +169,7 @@ def friction_margin(robot: Robot) -> np.ndarray:
 
 
 class Space:
-    """Computes the distances of an arm's links from table, obstacles and each other; `collision` selects the geoms.
+    """Compute the distances of an arm's links from table, obstacles and each other; collision.py selects the geoms.
 
     An arm does not follow its plan exactly. If each joint j deviates by e_j rad, a distance decreases by at most
     sum_j lever_j |e_j| to first order, where lever_j bounds the link's displacement per rad of joint j. A planned
@@ -218,7 +218,7 @@ class Space:
             )
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # so that an arm can return to a low home posture
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
-        # at most half of the distance in the home posture is required, so that an arm may return to a low one
+        # the largest required distance is half of that at home, or `clearance`, so that an arm may return home
         self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:

@@ -149,7 +149,7 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"simulator or arm (run)": measures} for a policy's ended transfers that recorded `measure`."""
+    """Return {"simulator or arm (run)": measures} of a policy's done or stopped transfers that have `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:

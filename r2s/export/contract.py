@@ -123,7 +123,7 @@ def kind_of(task: Task) -> str:
 
 
 def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
-    """Return the position (3,) m of the shoulder, which is joint 2; the contract limits a goal's distance from it."""
+    """Return the position (3,) m of the shoulder: joint 2, or a single joint; the region of goals surrounds it."""
     arm = Model(model)
     arm.place(robot.q_home)
     return listed(arm.origin[min(1, robot.n - 1)])

@@ -70,7 +70,7 @@ class Model:
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
 
-        Newton-Euler recursion yields the torque. The mass matrix is the sum of J_k^T (m, I)_k J_k over the links k.
+        Newton-Euler recursion yields the torque. The mass matrix is the armatures plus sum_k J_k^T (m, I)_k J_k.
         """
         R, p, z, n = self.frame, self.origin, self.axis, self.n
         spin = z * dq[:, None]
@@ -88,7 +88,7 @@ class Model:
         moment = (tensor @ alpha[:, :, None])[..., 0] + cross(omega, turning) + cross(centre, force)
         force, moment = np.cumsum(force[::-1], 0)[::-1], np.cumsum(moment[::-1], 0)[::-1]
         bias = (z * (moment - cross(p, force))).sum(1)
-        moves = self._before * cross(np.broadcast_to(z, (n, n, 3)), centre[:, None] - p)  # of link k by joint j
+        moves = self._before * cross(np.broadcast_to(z, (n, n, 3)), centre[:, None] - p)  # Jacobians [link, joint]
         rotates = self._before * np.broadcast_to(z, (n, n, 3))
         heavy = moves * self._mass[:, None, None]
 
@@ -173,7 +173,7 @@ class Driver:
             mass, bias = self._model.equations(dq)
             if self._push is not None:
                 self._push.see(dq, mass, bias)
-        if stopping:  # brake from the present speed, at once
+        if stopping:  # brake at once: the allowed speed falls from the present speed
             self._target, needs = np.zeros_like(self._target), 0.0
             if seen and self._damped == 1:
                 self._share = min(1.0, float((np.abs(dq) / j["most"]).max()))
@@ -228,7 +228,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within all limits nearest to `effort`, and whether a limit changed it."""
+        """Return the allowed torque (n,) Nm nearest to `effort` plus holding torque, and whether a limit acts."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -251,7 +251,7 @@ class Driver:
     ) -> tuple[np.ndarray, bool]:
         """Return the torque (n,) Nm nearest to tau with acceleration in `bounds`, and whether the two differ.
 
-        ddq: (n,) rad/s^2, acceleration by tau. bounds: inverse mass matrix, then lowest and highest allowed ddq (n,).
+        ddq: (n,) rad/s^2, acceleration from tau. bounds: inverse mass matrix, then lowest and highest ddq (n,).
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():

@@ -1,7 +1,7 @@
 """Check and follow plans on a surface, for policies that press or wipe; training uses tasks/surface_task.py instead.
 
 Each row of a plan describes one control step: a point on the nominal plane, the plane's normal, the target's depth
-below this point, the desired force, the path's velocity, the start posture and the controller's setpoint.
+below this point, the requested force, the path's velocity, the start posture and the controller's setpoint.
 This module imports only NumPy and modules that `r2s export` also copies into r2s_runtime.py.
 """
 
@@ -108,7 +108,7 @@ class SurfaceFollower:
         return {name: np.atleast_1d(value) for name, value in made.items()}
 
     def _force(self, seen: dict[str, np.ndarray], jacobian: np.ndarray) -> np.ndarray:
-        """Return the estimated force (3,) N that the surface exerts on the tip."""
+        """Return the estimated force (3,) N that the tip exerts on the surface."""
         q, dq = seen["q"], seen["dq"]
         external = seen["tau_J_d"] - self._dynamics.equations(q, dq, np.zeros_like(q))[1]
         return np.linalg.solve(jacobian @ jacobian.T + self._regular, jacobian @ external)

@@ -1,15 +1,15 @@
 """Divide a recording into blocks with independent errors, which are the clusters in the posterior's covariance.
 
-Unlike noise, model error is correlated in time: torque ripple at low speed lasts seconds. It recurs if the motion is
-repeated. So each block spans several correlation times of the residual. If residuals recur, repetitions belong to the
-same block.
+Unlike noise, model error is correlated in time: torque ripple at low speed lasts seconds. So each block spans several
+correlation times of the residual. Model error also recurs if the motion is repeated. If residuals recur, repetitions
+belong to the same block.
 """
 
 import numpy as np
 
 BLOCK_S = 0.5  # s, shortest block
 BLOCKS = 20, 400  # fewest and most blocks; few blocks make the scatter uncertain, many blocks cost time
-LENGTH = 5.0  # correlation times per block: a block sum then has 90 % of the variance per length of a long block
+LENGTH = 5.0  # correlation times per block; a block sum's variance, over length, is then 90 % of a long block's
 WINDOW = 5.0  # correlation times; beyond this lag, autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
 LONGEST_S = 60.0  # s, longest lag of the autocorrelation
 REPEATED = 0.3  # relative growth of variance due to repetition above which blocks join repetitions
@@ -59,7 +59,7 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
     """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,) s.
 
-    It is the integral of the squared autocorrelation, an upper bound even if residual times slope oscillates.
+    This time is the integral of the squared autocorrelation, an upper bound even if residual times slope oscillates.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))

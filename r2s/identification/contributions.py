@@ -19,8 +19,8 @@ from r2s.identification.search.levenberg_marquardt import minimize, normal_equat
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CONTRADICTS = 2.0  # ratio of sums of squares: one fit to all recordings, over two fits with one recording apart
-WORSE = 4.0  # ratio of a recording's RMSE in a fit to it alone to the median of the other recordings' RMSE
+CONTRADICTS = 2.0  # ratio of sums of squares: fit to all recordings, over fit without one plus fit to this one alone
+WORSE = 4.0  # RMSEs of fits to single recordings: ratio of one recording's to the median of the others'
 CARRIED = 0.5  # a body on the last link is reported if it explains this share of the squared left-out error
 LEAST_MASS = 0.01  # least mass of such a body, relative to the arm's mass
 ROUNDS = 3  # reweighted fits of each recording alone
@@ -36,7 +36,7 @@ class Contribution:
         label, torque, seconds: name, kind of torque and length of the recording. use: "training" or "validation".
         rmse: (n,) Nm, error of the fit to all recordings.
         left_out: (n,) Nm, error of a fit without this recording; None for a validation recording.
-        narrower: (P,), ratio of 95 % interval widths without and with this recording; None for validation.
+        narrower: (P,), 95 % interval widths without this recording over those with it; None for validation.
         alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio of sums of squares, see
             CONTRADICTS; 1 for one recording. body_kg: mass on the last link that explains the contradiction, or nan.
     """
@@ -142,7 +142,7 @@ def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
 
 
 def contradictions(parts: Sequence[Contribution]) -> list[str]:
-    """Return a message, if any, about a recording that contradicts the others or that the model fits far worse."""
+    """Return 0 or 1 messages: a recording contradicts the others, or the model fits it far worse."""
     trained = [p for p in parts if p.left_out is not None and p.alone is not None]
     if len(trained) < 2:
         return []

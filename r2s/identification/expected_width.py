@@ -23,7 +23,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-STEPS, FTOL = 6, 1e-2  # most Jacobians between reweightings; a fit ends at a smaller relative gain of a step
+STEPS, FTOL = 6, 1e-2  # most Jacobians per weighting; a fit ends when a step lowers the cost by less (relative)
 USED_S = 120.0  # s, longest part of a recording that is used
 
 
@@ -34,8 +34,8 @@ class ExpectedWidths:
     Attributes:
         space: parameter space. width: (P,), expected widths, SI units. share: (P,), posterior sigma over prior sigma.
         identifiable: (P,), whether the data will determine each parameter, by the rule of `conclude`.
-        late: s, a time shift and its standard deviation. If the recording has commanded torque, the motion is later
-            than the torque by this shift; measured or motor torque is later than the motion by this shift.
+        late: s, a time shift and its standard deviation. For commanded torque, the motion is later than the torque
+            by this shift; for measured or motor torque, the torque is later than the motion.
     """
 
     space: ParameterSpace

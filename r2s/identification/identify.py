@@ -230,12 +230,12 @@ def prune_terms(s: State) -> State:
 
 
 def draw_full_model(s: State) -> dict[str, np.ndarray]:
-    """Return posterior draws (S, P) of the kept values on the unit cube, from a fit with all terms and usual priors.
+    """Return posterior draws (S, P) of the kept values on the unit cube, from a fit with all terms and wide priors.
 
     Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
-    replaces a removed one, for example a payload replaces the error of a link's mass. The fit's priors serve
-    prediction and can be narrower than the scatter among arms, so they alone may decide between two values. The
-    result's intervals are those of both models with equal weights (Hoeting et al., Statistical Science 14(4), 1999).
+    compensates for a removed one, for example a payload for the error of a link's mass. Priors of the main fit serve
+    prediction and can be narrower than the scatter among arms, which narrows the intervals further. The result's
+    intervals count draws of both models equally (Hoeting et al., Statistical Science 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
     u, problem = fit_torque(full.problem.with_usual_prior())
@@ -248,7 +248,7 @@ def formulate(s: State) -> State:
     how, memory = s.settings, s.nominal.family.has_memory
     settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # stays at 0, see `settle_lateness`
     space = search_space(s.robot, s.nominal, how.bounds, [*s.terms, *settled], s.recording, how.stated)
-    s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # repetitions are one block
+    s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # so that blocks join repetitions
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
     edges = estimate_breakaway(s.ramps) if s.commanded and s.ramps is not None else None
@@ -274,7 +274,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the prior that the user states or, for all remaining values, that an earlier identification yields."""
+    """Return the user's prior, completed for all other values by that of an earlier identification, or None."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated
@@ -328,7 +328,7 @@ def fit_presliding(s: State) -> State:
     x[at] = found["presliding"]
     u[at] = np.clip(s.space.to_unit(x)[at], 0.0, 1.0)
     problem = replace(s.problem, data=data, torque_data=data, extra=extra)
-    problem = problem.without_prior([s.space.names[k] for k in at])  # `Presliding` contains it
+    problem = problem.without_prior([s.space.names[k] for k in at])  # `Presliding` contains this prior
     return replace(s, problem=problem.reweighted(u, fitted=True), u=u)
 
 

@@ -18,7 +18,7 @@ from r2s.identification.posterior import Z_95
 
 BODY = (*OF_LINKS, *PAYLOAD)  # shared by all kinds of torque; friction, offsets and gains differ between kinds
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # parameters that drift besides those of the friction law
-FLOOR = 1e-4  # least standard deviation, relative to `ParameterSpace.usual`; all draws may be clipped at a bound
+FLOOR = 1e-4  # least standard deviation, relative to `ParameterSpace.usual`, in case all draws lie at a bound
 FAR = 5.0  # standard deviations in the worst of about thirty directions, above which prior and data disagree
 
 

@@ -238,7 +238,7 @@ class ParameterEstimate:
 
     Attributes:
         x: estimated values. identifiable: whether the data determine a value.
-        low, high: ends of 95 % intervals of the values; for measured and motor torque, the intervals also count draws
+        low, high: ends of 95 % intervals of the values; for measured and motor torque, the intervals also use draws
             from a second model (`draw_full_model`), which `samples` does not contain.
         samples: (S, P) random draws from the posterior.
     """

@@ -88,7 +88,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _resolved(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return scale (P,), eigenvalues (P,) and axes (P, P) of matrix / scale / scale^T, with a unit diagonal.
 
-    No eigenvalue is below what rounding leaves of it.
+    Eigenvalues below the rounding error of the largest one are replaced by this error.
     """
     scale = np.sqrt(np.diag(matrix))
     values, axes = np.linalg.eigh(matrix / np.outer(scale, scale))

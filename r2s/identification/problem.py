@@ -21,7 +21,7 @@ FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bound
 # benchmarks/scaling.py, with values drawn from the priors, wrong minima had 1.9 to 36; on a physical Panda, where the
 # fit from narrow priors predicts better, the ratio is 1.0 to 1.2.
 CLEARLY = 2.0
-TAIL = 25.0  # for link-side torque, the prior is Student's t: degrees of freedom plus 1
+TAIL = 25.0  # degrees of freedom plus 1 of Student's t, which is the prior for link-side torque
 # implicit friction: least significance of its effect in standard deviations; range of actual over expected size
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
 ALIKE = 0.2  # relative uncertainty of the number of independent rows, and so of a sum of squares
@@ -113,7 +113,7 @@ class Problem:
 
     @property
     def is_fixed(self) -> np.ndarray:
-        """(P,) whether `fixed` fixed each value; a prior as narrow may also be stated of an arm with wide bounds."""
+        """(P,) whether `fixed` fixed each value; a test of equality, because stated priors may be even narrower."""
         return self.sigma == FIXED * self.space.width
 
     def fixed(self, at: np.ndarray) -> "Problem":
@@ -123,7 +123,7 @@ class Problem:
         return replace(self, sigma=sigma)
 
     def with_usual_prior(self) -> "Problem":
-        """Return the problem with every prior at least as wide as the scatter among arms, `ParameterSpace.usual`."""
+        """Return the problem with priors at least as wide as `ParameterSpace.usual`, except those of fixed values."""
         usual = np.where(np.isinf(self.space.usual), self.sigma, self.space.usual)
         own = np.isinf(self.sigma) | self.is_fixed
         return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
@@ -225,13 +225,13 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 
 
 def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
-    """Fit torque from `start` (P,) in rounds, each weighted by the last; return u (P,) and the last round's problem.
+    """Fit torque from `start` (P,) in rounds, reweighting between rounds; return u (P,) and the last round's problem.
 
     A fit to link-side torque has several minima if values are far outside of narrow priors: with the first weights,
-    which come from the nominal arm, it may keep cable torque near zero and distort friction instead. So from nominal
-    values, a second fit begins with rounds whose priors are at least as wide as the scatter among arms; rounds with
-    the problem's priors follow. Its result counts if it is likelier and clearly lowers the error of a joint: effects
-    that no model contains may also favor it, but hardly lower the error.
+    which come from the nominal arm, a fit may keep cable torque near zero and distort friction instead. If `start` is
+    nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
+    problem's priors. It replaces the first fit if it is likelier and clearly lowers the error of a joint. Unmodeled
+    effects may also make it likelier, but they hardly lower the error.
     """
     u, last = _rounds(problem, start, rounds, solve)
     wide = problem.with_usual_prior() if problem.at_link and np.array_equal(start, problem.start) else problem
@@ -253,10 +253,10 @@ def _rounds(problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple
 
 
 def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray) -> bool:
-    """Return whether u (P,) has the larger posterior density than v (P,), and in a joint a clearly smaller error.
+    """Return whether u (P,) has a larger posterior density than v (P,), and a clearly smaller error in some joint.
 
-    Each has its own torque noise. A joint's log likelihood is -N log sigma, with N independent rows. A wrong model
-    correlates the errors of more rows, so N is that of the result with the shorter correlation.
+    Each solution has its own torque noise sigma. A joint's log likelihood is -N log sigma, with N independent rows. A
+    wrong model lengthens the correlation of errors, so N follows from the shorter of both correlation times.
     """
     (length, sigma), (longer, larger) = (
         p.torque_data.noise_at(p.space.from_unit(x)) for p, x in ((one, u), (other, v))

@@ -132,7 +132,7 @@ def conclude(
     full: Mapping[str, Any] | None = None,
     **story: Any,
 ) -> IdentificationResult:
-    """Reset the values that the data hardly determine to nominal, and return the result of the identification.
+    """Reset to nominal the values that the data hardly determine, and return the result of the identification.
 
     Args:
         problem: the solved problem.
@@ -147,7 +147,7 @@ def conclude(
     u, unseen = _settle(u, problem.start, h + RIDGE * np.eye(len(u)), steps.std(0) / prior)
     steps = np.clip(u + steps, 0.0, 1.0) - u
     both = np.concatenate([steps, full["draws"] - u]) if full else steps
-    # distances below and above u, both at most 0
+    # the interval is u + low to u - high; low and high are at most 0
     low, high = (np.minimum(0.0, np.quantile(sign * both, 0.025, axis=0)) for sign in (1.0, -1.0))
     inside = (u > EDGE) & (u < 1.0 - EDGE)  # at a bound, the interval is cut off on one side
     seen = inside & (-0.5 * (low + high) < prior / SHARPER)

@@ -19,9 +19,9 @@ TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to
 
 
 def check_stated(stated: Stated, n: int | None = None) -> None:
-    """Raise UserError for an unknown parameter or key, or a value that is neither a number nor a list of n of them.
+    """Raise UserError for an unknown parameter or key, a wrong value, or a fixed value with a mean or width.
 
-    n: number of joints; None: the lengths of the lists are not checked.
+    A value is a number, null or a list of n of these. n: number of joints; None: do not check lengths of lists.
     """
     check_parameters("identify.prior", stated)
     for name, entry in stated.items():
@@ -40,7 +40,7 @@ def check_stated(stated: Stated, n: int | None = None) -> None:
 
 
 def check_family(stated: Stated, name: str) -> None:
-    """Raise UserError if the friction family `name` lacks a stated friction parameter, or if `name` is auto."""
+    """Raise UserError if a friction parameter is stated that family `name` lacks or, for auto, might lack."""
     known = {own for f in known_families() for own in f.names}
     for parameter in stated:
         if parameter not in known or (name != "auto" and parameter in family(name).names):

@@ -117,7 +117,7 @@ def scaled_prior(
     """Convert the standard deviations in `prior` to SI units, and omit flat priors (None).
 
     In `prior`, values for torque-like parameters are relative to the largest torque; values for logarithmic ones have
-    no unit. Viscous friction in the arm's file is a guess, so the standard deviation is at least this guess.
+    no unit. Viscous friction in the arm's file is a guess, so its standard deviation is at least this guess.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():

@@ -12,7 +12,7 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia, nominal_torque, regressor
 from r2s.physics.robot import Robot
 
-MASS, MASS_LEFT = 3.0, 0.1  # factor from which a wrong mass is reported; largest share of misfit after a correction
+MASS, MASS_LEFT = 3.0, 0.1  # least factor of a reported mass error; largest share of the misfit left by a correction
 CARRIED = 3  # number of last links whose mass is not judged, because a payload may be undeclared
 TILTED = np.radians(20)  # least reported angle of a mounting; uncertain masses can cause smaller fitted angles
 INERTIA = 0.3, 4.0  # allowed factor of the nominal torque: errors of tensors, payloads, sensor gains

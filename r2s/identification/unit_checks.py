@@ -27,12 +27,12 @@ MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
 STILL = 0.02  # rad, range of a joint up to which the joint is treated as at rest
 REFUSED, CORRECTED = 0.5, 0.25  # largest accepted unexplained share; largest fraction left by a valid correction
 SUSPECT = 0.3  # misfit above which other joint orders are tested; correct recordings had 0.006 to 0.21
-TURNED = 0.05  # misfit above which other mountings are tested; a valid one (3 numbers) leaves at most a tenth of it
+TURNED = 0.05  # misfit above which other mountings are tested; a valid mounting leaves at most MASS_LEFT of it
 HELD = 0.05  # a joint whose RMS nominal torque exceeds this share of tau_max is judged even at rest
 HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity: range in torque with gravity; most without
 CURRENT = 0.005  # A/Nm, least ratio of a current to torque: no arm's joint has 200 Nm/A
 OVER_LIMIT = 3.0  # largest allowed torque over tau_max
-RATIO = 4.0  # factor between dq and the slope of q above which, or below its inverse, dq is refused
+RATIO = 4.0  # dq is refused if its ratio to the slope of q is above RATIO or below 1 / RATIO
 UNITS = {"tau": {1e3: "mNm", 1e-3: "kNm"}, "dq": {np.degrees(1): "deg/s", 1e3: "mrad/s", np.radians(1): "", 1e-3: ""}}
 ORDER, UNITS_OF, GRAVITY, CLOCK, MASSES = "order of joints", "units and signs", "gravity", "clock", "masses"
 
@@ -114,7 +114,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
     if not len(seen):
         return ratios
     s, v = slope[:, seen], dq[:, seen]
-    cross = s.T @ v / len(s)  # of joint j's slope with column k of dq
+    cross = s.T @ v / len(s)  # mean product of joint j's slope and column k of dq
     square = np.maximum((v**2).mean(0), 1e-12)
     left = 1.0 - cross**2 / (size[seen, None] ** 2 * square)  # share that no factor explains
     own = np.diag(left)

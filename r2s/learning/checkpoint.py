@@ -28,7 +28,7 @@ class Checkpoint:
 
     @property
     def env_steps(self) -> int:
-        """Number of environment steps at the checkpoint; 0 without a checkpoint."""
+        """Number of env steps at the checkpoint; 0 without a checkpoint."""
         path = self.folder / "state.pt"
         return load_tensors(path, "resume")["seen"] if path.is_file() else 0
 

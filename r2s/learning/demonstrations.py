@@ -17,7 +17,7 @@ from r2s.tasks.push import PushTask
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-NOISE = 0.3  # standard deviation on the last arm's action; first tested value, on development seeds 0 to 2 of reach
+NOISE = 0.3  # standard deviation of the last arm's noise; first value tested, on development seeds 0 to 2 of reach
 KEPT = 0.9  # correlation of the noise between steps; white noise hardly moves an arm
 
 
@@ -25,7 +25,7 @@ class Demonstrator:
     """A model-based controller plus noise with a standard deviation from 0 (first arm) to NOISE (last arm).
 
     Attributes:
-        at_zero: whether the controller's actions are zero, so that a policy can start as the controller.
+        at_zero: whether the controller's actions are zero; a policy with zero actions then equals the controller.
 
     Args:
         reference: the controller, with the interface of `r2s.learning.networks.Policy`.

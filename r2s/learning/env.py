@@ -35,7 +35,7 @@ class TaskEnv(EnvBase):
         draw: domain randomization, called at every reset; a `Pushes` also applies joint torques at every step.
         nsim: number of arms. nthread: number of threads; 0: all cores.
         seed: seed of goals, starts and dynamics.
-        stagger: whether first episodes end at a different time in each of GROUPS groups of arms.
+        stagger: whether the first episodes of the GROUPS groups of arms end at different times.
         reward: reward terms and weights; None selects the terms and `paper_weights` of the task.
     """
 
@@ -63,7 +63,7 @@ class TaskEnv(EnvBase):
         self.reward, self.control = reward or Reward(), task.control(robot)
         self.reward.terms(task)  # raises if the reward does not fit the task
         self.weights = self.reward.weights(task, 0.0)
-        self._factor = self.reward.factor  # `set_progress` adapts it to the mean of the terms since the last call
+        self._factor = self.reward.factor  # `set_progress` adapts this factor to the mean terms since the last call
         self._seen, self._seen_steps = np.zeros_like(self.weights), 0
         self._torque = task.torque_limit(robot)
         self._staggered = self._stagger = stagger  # the setting, and whether the next reset staggers

@@ -70,7 +70,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
         num_envs: number of arms. nthread: number of threads; 0: all cores.
-        reward: reward terms and weights, see `TaskEnv`; weights have initial values before `set_progress`.
+        reward: reward terms and weights, see `TaskEnv`; weights keep their initial values until `set_progress`.
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
@@ -177,7 +177,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
 
 
 class ArmEnv(gym.Env):
-    """A single simulated arm: an `ArmVectorEnv`, with the same arguments, of one arm without automatic resets."""
+    """A single simulated arm: an `ArmVectorEnv` of one arm without automatic resets; see there for the arguments."""
 
     def __init__(self, robot: Robot, task: Task, draw: Draw, *, reward: Reward | None = None):
         self.batch = ArmVectorEnv(robot, task, draw, nthread=1, reward=reward, autoreset_mode=AutoresetMode.DISABLED)

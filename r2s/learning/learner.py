@@ -274,7 +274,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Shift the target entropy as a Gaussian's entropy shifts if `share` multiplies its standard deviations."""
+        """Shift the target entropy like the entropy of a Gaussian whose standard deviations are scaled by `share`."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -301,7 +301,7 @@ class EntropyLearner(Learner):
         return out | {"alpha": self.log_alpha.detach().exp()}
 
     def entropy_losses(self, alpha: Tensor, value: Tensor, action: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        """Return actor loss, alpha loss and entropy for actions of `value` (B,) and log-density `log_prob` (B,)."""
+        """Return actor loss, alpha loss and entropy; value, log_prob: (B,), values and log-densities of `action`."""
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.entropy_goal)).mean()
         return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}

@@ -30,9 +30,9 @@ class UniformRandomization:
 
     Each friction parameter phi is center * U(1 - phi_relative, 1 + phi_relative); the paper uses phi_relative = 0.10.
     Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws
-    are independent, so some tensors belong to no body (see `physical`), mainly those of slender links; they are drawn
-    again. With inertia_relative = 0.05, all draws are valid for the Panda's links 4 and 7, 47 to 63 % for
-    links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate I_xx and I_yy of
+    are independent, so some tensors, mainly of slender links, belong to no body (see `physical`); r2s draws these
+    again. With inertia_relative = 0.05, the share of valid draws is 100 % for the Panda's links 4 and 7, 47 to 63 %
+    for links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate I_xx and I_yy of
     link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Each tensor element still spans its full +-5 %.
 
     Attributes:

@@ -5,9 +5,9 @@ only env_steps is limited, runs with equal seeds and equal numbers of threads ag
 resumption. If minutes are limited, the curriculum depends on the clock.
 
 The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
-one core, steps and updates alternate, with the same result. If physics and updates shared OpenMP threads, both would
-be slower, because OpenMP threads spin after an update for milliseconds on the cores that the physics needs, and
-because on a busy machine each OpenMP barrier waits for a thread that the system has suspended.
+one core, steps and updates alternate, with the same result. Physics and updates do not share OpenMP threads. Shared
+threads would slow both: after an update they spin for milliseconds on cores that the physics needs, and on a busy
+machine, each OpenMP barrier waits for a suspended thread.
 """
 
 import copy
@@ -73,7 +73,7 @@ class Loop:
             initial value.
         explore_end: ratio of final to initial exploration noise, which falls geometrically over the budget.
         eval_env_steps: env steps between two evaluations; a training ends with one more evaluation.
-        compile: compile the losses first, within the budget. concurrent: step the arms in a separate thread.
+        compile: compile the losses first, which uses budget.minutes. concurrent: step the arms in a separate thread.
         matmul: precision of float32 matrix products in updates, for torch.set_float32_matmul_precision: "medium"
             allows bfloat16 factors; "auto" selects the result of `fastest_matmul`.
 
@@ -198,7 +198,7 @@ class Training:
         self._demonstrator = demonstrator
         self.env_steps, self.updates, self.next_eval = 0, 0, loop.eval_env_steps
         if demonstrator and demonstrator.at_zero:
-            self.next_eval = 0  # the first policy, nearly the demonstrator, takes part in the selection
+            self.next_eval = 0  # the first policy nearly equals the demonstrator; evaluate it for the selection
         self.factor = env.reward.factor
         self.evaluation: dict[str, Any] = {}
         self._terms: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics

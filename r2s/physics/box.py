@@ -13,7 +13,7 @@ from r2s.physics.tip import default_plane, nominal_plane
 SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; the tip pushes below the hand
 PUSHED_AT = 0.4  # height at which the tip pushes, as a share of the box's height
 SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal pose, to either side
-FORWARD = 0.25  # the nominal box is ahead of the tip at home by this share of the base's distance to the table there
+FORWARD = 0.25  # nominal box's distance ahead of the tip at home, over distance from base to table below the tip
 # Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
 # from a carton on a smooth table to a block of wood on a dry table
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)
@@ -26,7 +26,7 @@ class TableFrame:
     """Coordinate frame on a table, at the nominal position of a box.
 
     Attributes:
-        origin: (3,) m, in the base frame. axes: (3, 3), unit vectors ahead (away from the base), left, up, in rows.
+        origin: (3,) m, in the base frame. axes: (3, 3), unit vectors as rows: ahead (away from the base), left, up.
     """
 
     origin: np.ndarray
@@ -61,7 +61,7 @@ class TableFrame:
 
 
 def table_frame(robot: Robot, point: Any = None, normal: Any = None) -> TableFrame:
-    """Return a work table's frame from point (3,) m and normal (3,); None: below, ahead of the home posture's tip."""
+    """Return a table's frame from point (3,) m and normal (3,); point=None: below and ahead of the tip at home."""
     place, up = nominal_plane(robot, point, normal)
     across = place - (place @ up) * up
     size = float(np.linalg.norm(across))

@@ -5,8 +5,8 @@ geoms, r2s checks only these geoms. Convex hulls replace meshes, as in MuJoCo, a
 distance fields. The check omits these pairs:
 
 - A geom and the table, if the geom's height is constant, because no joint or only vertical joint axes move the geom.
-- Two geoms of neighboring links, which touch at their joint, and two geoms closer than HOUSING_M at q_home, which can
-  belong to one joint's housing on links two joints apart, as in the Panda's shoulder.
+- Two geoms of neighboring links, which touch at their joint, and two geoms closer than HOUSING_M at q_home. Such
+  geoms can belong to one joint's housing although their links are two joints apart, as in the Panda's shoulder.
 """
 
 from collections.abc import Collection
@@ -86,7 +86,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Geometry: bodies (G, WIDTH), hull vertices (V, 3) m, body rows of `above` (A,) and `pairs` (P, 2), table m."""
+    """Geometry: bodies (G, WIDTH), hull vertices (V, 3) m, body indices above (A,), pairs (P, 2), table height m."""
 
     bodies: np.ndarray
     vertices: np.ndarray

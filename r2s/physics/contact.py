@@ -1,4 +1,4 @@
-"""Solve the contact of a tool's tip with a surface in a step of 1 ms, implicit in stiffness, damping and friction.
+"""Solve a 1 ms step of a tip's contact with a surface, by a method implicit in stiffness, damping and friction.
 
 The normal force is the mean of the law of Hunt and Crossley (surface.py) over the step. The mean of K d^e from the
 depth d0 to the depth d1 is (V(d1) - V(d0)) / (d1 - d0), where V is the potential of K d^e. This discrete gradient
@@ -10,9 +10,9 @@ The stiffness of tangential bristles is proportional to the normal force F (Canu
 1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with z_s = `bristle`. The friction
 -mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; in sliding it is mu F.
 
-The unknowns are the joint velocities at the end of the step. Both contact forces are linearized about a guess of the
+The unknowns are the final joint velocities of the step. Normal force and friction are linearized about a guess of the
 unknowns; the constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law solves
-these equations, so contact forces can start a joint at rest. `start_guess` writes the first guess. `add_contact`,
+these equations, so contact forces can move resting joints. `start_guess` writes the first guess. `add_contact`,
 `coming_velocity` and `next_guess` repeat until the guess is accurate, usually once. `finish_contact` ends the step.
 """
 
@@ -64,10 +64,10 @@ MARGIN = 1e-3  # m, a tip farther away cannot touch within a step: it would need
 FAR = 0.02  # m, a tip farther away would need 20 m/s to touch within a step
 ROUNDS = 12  # largest number of guesses in a step
 TOLERANCE = 1e-4  # allowed relative error of the normal force after the last guess
-LATE = 1e-2  # allowed error of the tangential force over the normal force, from guessed normal force and speed
-BOX_LATE = 1e-3  # allowed relative error of table friction, from the guessed speed of the box
+LATE = 1e-2  # allowed error of the tangential force, due to the guess, as a share of the normal force
+BOX_LATE = 1e-3  # allowed relative error of table friction, due to the guessed speed of the box
 NEGLIGIBLE = 1e-6  # N, force that is treated as 0
-SHORT = 1e-6  # path over depth, below which V(d1) - V(d0) is round-off and the force at mid-path replaces the mean
+SHORT = 1e-6  # ratio |d1 - d0| / depth below which V(d1) - V(d0) is round-off; then the force at mid-path is used
 
 
 @njit(cache=True, error_model="numpy")
@@ -130,7 +130,7 @@ def _from_box(contact, x, y, z):
 
 @njit(cache=True, error_model="numpy")
 def near(contact, place, anchor, axis, dq, h, jacobian):
-    """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch within the step.
+    """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch in this step.
 
     Call `near` only once per step: if the tip cannot touch the box, `near` also moves a sliding box by one step.
 
@@ -191,7 +191,7 @@ def _box_rate(contact):
 
 @njit(cache=True, error_model="numpy")
 def _bristles(contact, force, speed, h):
-    """Return the friction's spring, N/m, and damper, N s/m, for a normal force, N, and a sliding speed, m/s.
+    """Return spring constant, N/m, and damping, N s/m, of friction for a normal force, N, and a sliding speed, m/s.
 
     The friction force is -(spring z + damper v), with the deflection z before and the velocity v after the step.
     """
@@ -216,7 +216,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Return rate and speed, m/s, relative to a box that moves at `point` (3,) m/s in the contact; update `slide`."""
+    """Return penetration rate and sliding speed, m/s, relative to a box velocity `point` (3,) m/s; update `slide`."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]
@@ -286,7 +286,7 @@ def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def next_guess(contact, jacobian, h, coming, guess):
-    """Update the guess from the solved joint velocities `coming` (n,) rad/s; return whether the guess was good."""
+    """Return whether the guess was accurate, and update it from the solved joint velocities `coming` (n,) rad/s."""
     force, fast = guess[NORMAL_FORCE], guess[SPEED]
     rate, speed = _velocity(jacobian, coming, guess[SLID : SLID + 3])
     box_late = 0.0

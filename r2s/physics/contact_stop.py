@@ -27,7 +27,7 @@ SLIDES = 0.25  # ratio of friction in slow sliding to breakaway friction; 0.35 w
 RETREAT_M = 0.01  # m; this space is free, as the tip came from `task.clearance` = 15 mm above the plane
 LEAVES_S = 0.4  # s; then 0.1 s is left to brake. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml
 MOST = 0.25  # largest share of a joint's allowed speed that the outward motion uses
-GAIN = 0.5 * RATE  # 1/s, gain of the velocity loop: half of the latency budget remains for the resistance
+GAIN = 0.5 * RATE  # 1/s, gain of the velocity loop: half of the latency budget remains for the estimate R
 BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
 

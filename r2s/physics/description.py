@@ -99,7 +99,7 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf; return a message for each format that cannot represent the arm.
 
-    An arm with armature, like most arms, has neither arm.sdf nor a message about it, because SDF has no rotors.
+    For an arm with armature, like most arms, skip arm.sdf without a message, because SDF has no rotors.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
@@ -220,8 +220,8 @@ def write_world(
     """Write the SDF world that r2s/engines/gazebo.py and gazebo_classic.py simulate.
 
     The physics step is 1 ms; simulated time runs as fast as possible. The world has no gravity (libfranka's
-    convention), no limits of velocity or torque (the driver enforces these limits), and no friction (r2s applies the
-    friction torque). Joint damping of armature / 1 ms replaces rotors (SDF has none); r2s/engines cancels its torque.
+    convention), no limits of velocity or torque (r2s enforces both), and no friction (r2s applies friction torque).
+    Joint damping of armature / 1 ms replaces rotors (SDF has none); r2s/engines cancels the damping torque.
 
     Args:
         path: file to write. robot, dynamics: the arm. plugin: the world's plugin element. version: SDF version.

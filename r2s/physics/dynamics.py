@@ -144,7 +144,7 @@ def nominal_dynamics(
     """Return the dynamics that `conf/friction` and `conf/inertia` describe; a scalar value applies to all joints.
 
     phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). With phi1=None, frictionloss and damping in
-    the robot's file are Coulomb and viscous friction; for a joint without both, phi1 is PHI1 tau_max. family="auto"
+    the robot's file are Coulomb and viscous friction; for a joint with neither, phi1 is PHI1 tau_max. family="auto"
     keeps this law; any other family has parameters with the same friction at 1 rad/s. If a breakaway torque is
     None, the file's frictionloss replaces this torque.
 

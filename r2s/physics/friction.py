@@ -13,10 +13,10 @@ import numpy as np
 from r2s.compiled import njit, vectorize
 from r2s.errors import UserError, choices, nearest
 
-WIDTH_DQ = 0.01  # rad/s, speed over which Coulomb friction changes its sign; equal to the default dq_min of stiction
+WIDTH_DQ = 0.01  # rad/s, width of the sign change of Coulomb friction; equal to the default dq_min of stiction
 PRESLIDING = 1e-3  # rad, presliding distance if it is not identified; typical of a Panda's joints
-MICRO_DAMPING = 5e-3  # s, ratio of the bristles' damping to stiffness; damps their oscillation within a few periods
-FALLEN = 40.0  # square of speed over Stribeck velocity, above which exp(-FALLEN) is below the rounding error of 1
+MICRO_DAMPING = 5e-3  # s, bristle damping over bristle stiffness; bristle oscillations decay within a few periods
+FALLEN = 40.0  # (speed / Stribeck velocity)^2 above which the Stribeck term is below the rounding error of 1
 PHI = 8  # maximum number of parameters of a family
 VISCOUS = "viscous"  # name of the viscous parameter in every family that has one, Nm s/rad
 
@@ -108,7 +108,7 @@ class Family:
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
         """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of the family `other`.
 
-        If `phi` contains a viscous parameter and it is not optional in this family, its value is copied.
+        The value of a viscous parameter in `phi` is copied if the parameter is not optional in this family.
         """
         if other == self:
             return phi
@@ -265,7 +265,7 @@ def _bristle_native(p, v, h, memory):
     level = p[0] * (1.0 + side * p[1]) * (1.0 + p[3] * (1.0 + side * p[6]) * np.exp(-((v / p[4]) ** 2)))
     stiff = level / p[5]
     rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
-    # deflection during the coming step, at the present velocity
+    # the second term contains the deflection during the coming step, at the present velocity
     viscous = p[2] * (1.0 + s * p[7])
     return level * z + stiff * rate * (v - abs(v) * z) + viscous * v, stiff * rate * (1.0 - s * z) + viscous
 
@@ -354,7 +354,7 @@ def family_path(one: Family) -> str:
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
     """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s in steps of dt s.
 
-    z replaces sign(v): dz/dt = (v - |v| z) / distance (Dahl 1968), exactly from z = 0. distance: rad, one or (n,).
+    z replaces sign(v) and solves dz/dt = (v - |v| z) / distance (Dahl 1968) from z = 0. distance: rad, one or (n,).
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 

@@ -3,8 +3,8 @@
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
 With the damping D = 2 zeta (M # K_q), every mode has the damping ratio zeta. Here M is the mass matrix, K_q = J^T K J
-+ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. This damping is that of the
-double diagonalization of Albu-Schaeffer et al. (ICRA 2003), without eigenvectors. The null-space projector N is
++ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. D equals the damping of the
+double diagonalization of Albu-Schaeffer et al. (ICRA 2003), but needs no eigenvectors. The null-space projector N is
 dynamically consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force has a potential, even if
 clipped. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs;
 damping refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al.,
@@ -29,15 +29,15 @@ from r2s.physics.newton_euler import (
 # Parameters: cycles between two updates of D and N, 2 zeta, spring energies J at which force and moment saturate,
 # first level and size of the tank J, cycle s; indices in the command (-1: none), size of the target, number of task
 # axes (3 or 6); whether the law is hybrid, rate of its integrals 1/s, largest force and integral N. APPROACH: above 0
-# if the spring to the target bounds a hybrid force; 1: dq_r is only the direction of friction; SLIDES: the target
-# moves on the surface, which may be tilted
+# if the spring to the target bounds a hybrid force; 1: dq_r affects only the friction feedforward; SLIDES:
+# the target moves on the surface, which may be tilted
 HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
 DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
 K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
 TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip m in the last link, axes of this link in the home posture, gravity m/s^2
 APPROACH, HEAD = 43, 44
 SLIDES = 2  # a value of APPROACH
-# Behind HEAD, one row per joint: row of `links_of`, rotor inertia, errors of mass and first moment, offset, drag,
+# From HEAD on, one row per joint: row of `links_of`, rotor inertia, errors of mass and first moment, offset, drag,
 # friction at NODES speeds per direction, null-space or joint stiffness and its bounds, energy J at which this spring
 # saturates, home, presliding distance rad (0: no bristles), breakaway Nm (-, +), load-dependent friction Nm/Nm
 ROTOR, MASS_ERROR, MOMENT_ERROR, OFFSET, DRAG, FRICTION = 28, 29, 30, 33, 34, 36
@@ -52,14 +52,14 @@ SPRINGS = 4  # stiffnesses in the task's axes
 ROUNDS = 14  # iterations of the geometric mean: enough for squared frequencies with a ratio of 1e4
 FREE = 1.0  # rad/s, frequency that sets the damping of modes without a spring
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice REST_DQ
-# SETTLE_S: s, low-pass of the angles for friction; it cuts a Panda's encoder noise, 1.4e-5 rad, to a third. STEP:
-# bristles deflect in steps of this share of the presliding distance, at least ENCODER rad, ten times the cut noise
+# SETTLE_S: s, low-pass of the angles for friction; reduces a Panda's encoder noise, 1.4e-5 rad, to a third. STEP:
+# bristles deflect in steps of this share of the presliding distance, at least ENCODER rad, 10 times the reduced noise
 SETTLE_S, STEP, ENCODER = 5e-3, 0.1, 5e-5
 # rad/s. REST_DQ: speed below which a joint may rest, 3.5 times the noise of (q - MEAN) / SETTLE_S. DIRECTION_DQ:
 # width of friction's sign change over reference speed; press.py on twins 0 and 1: 0.003 to 0.01 perform alike
 REST_DQ, DIRECTION_DQ = 0.01, 0.003
-# SLOPE_RATE: 1/s, of the slope estimate; it settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING: m/s, below
-# it the estimate adapts slower; five times the tip's speed noise: 3e-3 rad/s (Panda) at levers of 0.5 m in 7 joints
+# SLOPE_RATE: 1/s; the slope estimate settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING: m/s, speed below
+# which the estimate adapts slower: 5 times the tip's speed noise, 3e-3 rad/s (Panda) at levers of 0.5 m in 7 joints
 SLOPE_RATE, SLIDING = 10.0, 0.02
 SMALLEST = 0.01  # share of a requested rise of stiffness; a smaller share is not halved again but becomes 0
 MOBILITY = 1e-3  # 1/kg, 1/(kg m^2): directions with less mobility, near a singularity, are treated as blocked
@@ -191,7 +191,7 @@ def task_energy(K, error, tilt, parameters):
 
 @njit(cache=True, error_model="numpy")
 def refill(q, n, parameters, memory, at):
-    """Add the energy, J, that damping dissipated since the last cycle to the tank; at: index of dq_r in `memory`."""
+    """Add to the tank the energy, J, that damping dissipated since the last cycle; at: index of dq_r in `memory`."""
     if memory[BEGUN] == 0.0:
         memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
         for j in range(n):

@@ -275,7 +275,7 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     stiffness (3) N/m and, for six axes, (1) Nm/rad. The task's target is next: position (3) m, optionally velocity
     (3) m/s and rotation vector from home (3) rad. `normal_force` describes the next entries, for hybrid control only.
     If APPROACH > 0, stiffness times the depth of the target below the tip bounds the normal force. If APPROACH is
-    SLIDES, the target is valid for the middle of the control period; a feedforward force (3) N ends the command.
+    SLIDES, the target is valid for the middle of the control period, and a feedforward force (3) N ends the command.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     frames, jacobian, place, velocity = np.empty((n, POSE)), np.empty((6, n)), np.empty(3), np.zeros(3)

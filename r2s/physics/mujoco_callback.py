@@ -1,12 +1,12 @@
 """Add friction, control law, safety filter and motors to MuJoCo's physics step, by a compiled callback.
 
-`install()` registers a native control callback that reads an arm's parameters in `jnt_user`, so `mujoco.batch.Batch`
-can simulate a different arm in each row at full speed. The callback computes friction (friction.py) and, after
-`Simulator.drive`, control law (control_laws.py), safety filter (safety_filter.py) and motor delay (actuation.py),
-which need feedback every millisecond. Stiction (stick_slip.py) and contact (contact.py) need the sum of all other
-forces. Therefore, r2s uses the control callback, which MuJoCo calls last before it computes accelerations.
+`install()` registers a native control callback. The callback reads each arm's parameters from `jnt_user`, so a batch
+of different arms runs at full speed. It computes friction (friction.py) and, after `Simulator.drive`, control law
+(control_laws.py), safety filter (safety_filter.py) and motor delay (actuation.py), which need feedback every
+millisecond. Stiction (stick_slip.py) and contact (contact.py) need the sum of all other forces. Therefore, r2s uses
+the control callback, which MuJoCo calls last before it computes accelerations.
 
-The step treats the friction torque tau_f linearly implicitly. With D = d tau_f / dv >= 0 at the current velocity v,
+A linearly implicit method integrates the friction torque tau_f. With D = d tau_f / dv >= 0 at the current velocity v,
 the callback adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. A step
 is accurate to first order, and stable even for friction slopes of real wrists, 3-10 Nm s/rad on 0.004-0.012 kg m^2.
 """
@@ -60,7 +60,7 @@ SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES, ROWS = 0, 1, 2, 3, 4, 5, 7,
 # After these rows: command, memory and parameters of the control law; with a tool, also push limit and contact.
 BRISTLE, SENT, MOTOR, CYCLE, LIMITED, FILTERED, EFFORT, NOISE, LINE = range(9)
 KEPT = LINE + SLOTS
-USUAL = 7  # number of joints for which `_drive` is compiled; other arms run slower
+USUAL = 7  # number of joints for which numba unrolls the loops of `_drive`; other arms run slower
 
 # the index of a friction law is its number in `jnt_user`
 BUILT_IN = (*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None))
@@ -68,7 +68,7 @@ BRISTLES, PRESLIDING = FAMILIES.index(BRISTLE_FAMILY), BRISTLE_FAMILY.names.inde
 
 
 def number(family: Family, hold: str) -> int:
-    """Return the number of a friction law in `jnt_user`; a user's law is compiled first, once per process."""
+    """Return the number that selects a friction law in `jnt_user`; compile a user's law first, once per process."""
     law = family.native if hold == "command" or family.sharp is None else family.sharp
     return BUILT_IN.index(law) if law in BUILT_IN else friction_address(law)
 
@@ -215,7 +215,7 @@ def _friction(sizes, user, q, dq, forces, places):
             friction += loaded * sign
             slope += loaded * steep
         slope = max(slope, 0.0)  # an implicit negative slope would remove inertia
-        # mj_passive has already subtracted dof_damping * v with the slope of the previous step: correct it
+        # mj_passive has already subtracted dof_damping * v; add back the part due to the previous step's slope
         force = (damping[j] - user[j, DAMPING]) * v - friction
         damping[j] = user[j, DAMPING] + slope
         drive = applied[j] + pull
@@ -257,7 +257,7 @@ def _control(n, user, fields):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _drive(n, user, fields, places):
-    """Apply conditioning, safety filter, delay and lag, in this order, to the applied torques.
+    """Apply `condition_joint`, safety filter, delay and lag, in this order, to the applied torques.
 
     If n is a constant, numba unrolls the loops, so that the filter takes half the time (benchmarks/law.py).
 

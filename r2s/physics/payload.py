@@ -1,6 +1,6 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A payload changes mass, center of mass and inertia tensor of the last link, which is exact in every simulator. An
+A payload changes mass, center of mass and inertia tensor of the last link. This model is exact in every simulator. An
 external force could not represent a payload, because the force would depend on the acceleration that it causes. The
 payload's frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
 """

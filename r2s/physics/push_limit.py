@@ -40,7 +40,7 @@ from r2s.physics.safety_filter import APPROACH, RATE, JointDynamics, bounded, jo
 from r2s.physics.safety_filter import WORK as FILTER_WORK
 from r2s.physics.tip import Tip, nominal_plane
 
-# Columns of a limit: settings, its state (R in N, the last speed in m/s, whether it has begun), and a stop's state
+# Columns of a limit: settings, its state (R in N, last speed in m/s, whether this speed is valid), and a stop's state
 # (contact_stop.py): phase, contact force N at its start, height m at which the tip left the surface, outward pull N
 FORCE_MAX, SPEED_NEAR, SLOPE, MARGIN, POINT, NORMAL, TIP, RADIUS, RESISTED, SPEED, BEGUN = (
     *(0, 1, 2, 3, 4, 7, 10, 13, 14, 15, 16),
@@ -88,14 +88,14 @@ class PushLimit:
         return out
 
     def at(self, robot: Robot, friction: np.ndarray, q: np.ndarray) -> tuple[float, float]:
-        """Return the effective mass, kg, at q (n,) rad, and the largest push, N, of joint friction (n,) Nm."""
+        """Return the effective mass, kg, at q (n,) rad, and the largest push, N, by joint friction (n,) Nm."""
         row = -self.normal @ Tip(robot)(q)[1]
         lever = InverseInertia(robot)(q[None])[0] @ row
         mass = 1.0 / float(row @ lever)
         return mass, mass * float(np.abs(lever) @ friction)
 
     def bound(self, robot: Robot, q: np.ndarray, stiffness: float, friction: float = 0.0) -> float:
-        """Return the largest force, N, at q (n,) rad on a surface with `stiffness`, N/m, and Coulomb `friction`.
+        """Return the largest contact force, N, at q (n,) rad on a surface with stiffness, N/m, and Coulomb friction.
 
         The result is infinite if surface friction can push a sliding tip inward without limit.
         """
@@ -119,7 +119,7 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None bounds the force on 1e5 N/m by 2 force_max.
+        force_max, speed_near: N and m/s, see `PushLimit`; None: the force on 1e5 N/m is at most 2 force_max.
         plane: point and normal; None: a work table below the home posture's tip. asked: N, largest force of a task.
         stop: a key of STOPS (contact_stop.py); None: "release".
 
@@ -190,7 +190,7 @@ def tip_motion(limit, kinematics, dq, row):
 
 @njit(cache=True, error_model="numpy")
 def push_bound(limit, arm, kinematics, last, friction, work):
-    """Return the largest allowed acceleration J M^-1 tau, m/s^2, of the tip into a surface; inf far from it.
+    """Return the largest allowed tip acceleration J M^-1 tau, m/s^2, into a surface; inf far from the surface.
 
     Args:
         limit: (COLUMNS,) from `PushLimit.columns`; this function updates the estimate R and the last speed.
@@ -251,7 +251,7 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     for j in range(n):
         mobility += row[j] * lever[j]
     # low, high: N, bracket of f; before, after: excess there. If no joint is at its bound, the first trial hits the
-    # middle of the tolerance CLOSE: at its edge, round-off would decide on another trial
+    # middle of the tolerance CLOSE: at the edge, round-off could cause another trial
     low, high, after, force = 0.0, np.inf, 0.0, (before + 0.5 * CLOSE) / mobility
     for _ in range(ROUNDS):
         for j in range(n):

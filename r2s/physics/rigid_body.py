@@ -47,7 +47,7 @@ def tensor_elements(tensor: np.ndarray) -> np.ndarray:
 def regressor(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the regressor (T, n, n, 10): the derivative of each joint torque by each link's standard parameters.
+    """Return the regressor (T, n, n, 10): derivatives of joint torques with respect to standard parameters.
 
     Args:
         robot: the arm, for its kinematics.

@@ -27,7 +27,7 @@ PANDA = "r2s:models/panda.xml"
 # FR3 reports its last torque as float32, which changes a torque step by up to 8e-6 Nm.
 RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm
-DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of this size
+DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of the Panda's size
 # Default payload limits, from a Panda's ratios (3 kg, 0.15 m, 87 Nm): payload weight times reach over the largest
 # torque limit, and distance of the payload's center over reach.
 PAYLOAD_SHARE, PAYLOAD_FAR = 0.33, 0.15
@@ -103,7 +103,7 @@ class Robot:
         """Compile the MuJoCo model.
 
         Args:
-            gravity: whether gravity acts; False: the arm compensates gravity (libfranka). True: link-side torque.
+            gravity: whether gravity acts; True for link-side torque, False for torque without gravity (libfranka).
             user: number of columns of `jnt_user`, which stores parameters of the callback (mujoco_callback.py).
             memory: number of doubles in `userdata`, the state of the callback.
             dt: time step, s.

@@ -7,11 +7,11 @@ import numpy as np
 
 from r2s.errors import UserError, choices
 
-LIGHTEST = 1 / 500  # least link mass / moving mass: real wrists have 1/170 (UR16e) to 1/20, placeholders 1/10,000
+LIGHTEST = 1 / 500  # smallest link mass / moving mass: real wrists have 1/170 (UR16e) to 1/20, placeholders 1/10,000
 HEAVIEST = 2.0  # largest link mass / mass of all other links: up to 0.8 for the upper arm of a real arm
 DEGREES_FROM = 30.0  # limits between 30 rad and 360 rad are taken for degrees
 VIRTUAL = 0.01  # m: a link with joints closer than this is part of a universal joint and needs no mass
-WEIGHT = 2.0  # over tau_max: largest plausible gravity torque in the worst posture
+WEIGHT = 2.0  # largest plausible gravity torque in the worst posture, as a multiple of tau_max
 POSTURES = 200  # number of random postures in which gravity torque is computed
 WIDEST = 2.0  # arm lengths: no part of a link lies farther from its center of mass
 DENSEST = 2e4  # kg/m^3, tungsten: no link has smaller moments than a tungsten ball of its mass

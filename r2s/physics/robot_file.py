@@ -1,7 +1,7 @@
 """Read the arm in an MJCF or URDF file, without elements of the simulation and with locked joints welded.
 
-The reader removes objects on free joints, as in scene files. The reader welds a gripper's fingers at the positions in
-`robot.lock`, so the fingers become part of the link that carries the gripper.
+The reader removes loose objects of MJCF scenes: bodies with free or ball joints only. A gripper's fingers are welded
+at the positions in `robot.lock`, so the fingers become part of the link that carries the gripper.
 """
 
 from collections.abc import Mapping

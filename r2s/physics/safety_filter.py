@@ -6,7 +6,7 @@ the low-pass (r2s/physics/actuation.py). The safety filter consists of three lim
 - Fading: the policy's torque fades out as a joint approaches its velocity limit or a position limit.
 - Acceleration limit: each joint's acceleration a = M^-1 (tau - Coriolis torque) satisfies -RATE (v + dq) <= a <= RATE
   (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within this limit, the filter selects
-  the torque nearest to the effort by Gauss' principle of least constraint, by adding torques of fictitious mechanical
+  the one nearest to the effort by Gauss' principle of least constraint: it adds the torques of fictitious mechanical
   stops. Joint friction only widens the limit, so an overestimated friction never accelerates a joint.
 - Rate limit: the filter clips the torque, and limits the torque rate by one factor for all joints. The command
   therefore moves straight from the last command to the new torque, within the convex set of the acceleration limit.
@@ -68,8 +68,8 @@ class JointDynamics(NamedTuple):
 def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
-    The filter adds inertia (column ADDED) to light joints, just enough that the largest target torque of the joint or
-    of a coupled joint passes at rest. DELAY_PHASE bounds the added inertia, which makes a loop faster than RATE.
+    The filter adds to light joints just enough inertia (column ADDED) that the largest target torque of any joint is
+    within the acceleration limit at rest. DELAY_PHASE bounds this inertia, which makes the loop faster than RATE.
 
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
@@ -84,7 +84,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     mobility = InverseInertia(robot)(robot.q_home[None])[0]
     inertia = 1 / np.diag(mobility)
     most = (DELAY_PHASE / (RATE * LATENCY_S) - 1) * inertia
-    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm at the joint that match the strongest action
+    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm, with the strongest target torque's effect
     out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.step_max
     return out

@@ -1,8 +1,8 @@
 """Simulator of many arms at once: `mujoco.batch.Batch` with friction, control law and safety filter in each step.
 
 The simulation has no gravity, and commanded torques exclude gravity (libfranka's convention), because the arm adds
-its own gravity compensation. The arm computes gravity compensation from nominal masses and centers of mass. The
-simulation adds the torque error of gravity compensation (r2s/physics/mujoco_callback.py).
+its own gravity compensation. The arm computes gravity compensation from the nominal links and the declared payload.
+The simulation adds the torque error of gravity compensation (r2s/physics/mujoco_callback.py).
 """
 
 from collections.abc import Mapping
@@ -181,7 +181,7 @@ class Simulator:
         return {name: array.copy() for name, array in self._arrays().items()}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore an output of `state`; the same torques then cause the same motion, bit for bit."""
+        """Restore a state that `state` returned; the same torques then cause the same motion, bit for bit."""
         for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com", "_offset", "_surfaces"):
             self._arrays()[name][:] = state[name]
         self.batch.set_const()

@@ -7,9 +7,9 @@ force is the mean distance between the base's points and the base's center. At r
 force -mu N z / `RIGID`. The deflection z follows dz/dt = u - |u| z / RIGID, in backward Euler; while the box slides,
 z / RIGID equals u / |u|.
 
-The box is not a body of the MuJoCo model, so training, twins and engines can share one compiled law, which solves
-joint friction and box motion together, and simulations without a box do not change. The box neither tilts nor lifts
-off (`check_size` in box.py). The tip does not touch the table; the tip's vertical force only changes the box's load.
+The box is not a body of the MuJoCo model, so simulations without a box do not change. Training, twins and engines
+share one compiled law, which solves joint friction and box motion together. The box neither tilts nor lifts off
+(`check_size` in box.py). The tip does not touch the table; the tip's vertical force only changes the box's load.
 
 In a step, the contact force on the tip is F = F0 - K d, where d is the change of the tip's velocity relative to the
 box. The box's velocity after the step is linear in F, with the mobility h W at the contact. Elimination of the box's
@@ -48,7 +48,7 @@ from r2s.physics.contact_layout import (
 RIGID = 1e-6  # m, largest elastic deflection of a box on its table
 STILL = 1e-6  # m/s, a slower box without contact is at rest: table friction stops a box from 4e-3 m/s within 1 ms
 ROUNDS = 30  # largest number of guesses of the box's speed
-CLOSE = 1e-4  # relative error of the speed at which the guesses end
+CLOSE = 1e-4  # relative error of the guessed speed at which the iteration ends
 
 
 @njit(cache=True, error_model="numpy")
@@ -86,7 +86,7 @@ def _grip(contact, speed, h):
 
 @njit(cache=True, error_model="numpy")
 def _free_change(contact, speed, h, out):
-    """Write a box's velocity change (4,) without tip force; return h * mobility: linear s/kg, angular s/(kg m^2)."""
+    """Write a box's velocity change (4,) without tip force; return changes per force s/kg and moment s/(kg m^2)."""
     spring, damper = _grip(contact, speed, h)
     reach, strain = contact[REACH], contact[STRAIN : STRAIN + 4]
     along = h / (contact[MASS] + h * damper)

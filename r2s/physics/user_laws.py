@@ -2,7 +2,7 @@
 
 Compiling the code of r2s for a new law would take half a minute in every process. So only the law is compiled, and
 the code of r2s calls it by address. A law of r2s has a small number instead of an address. Addresses are below 2^53,
-so that a float64 contains them exactly.
+so that a float64 represents them exactly.
 """
 
 from collections.abc import Callable

@@ -6,7 +6,7 @@ from r2s.errors import UserError
 from r2s.recordings.recording import Recording
 
 LEAST = 0.02  # rad RMS about a linear trend; a joint that moves less has no speed factor
-UNEXPLAINED = 0.03  # a speed factor is valid if it explains all but this share of the joint's mean square motion
+UNEXPLAINED = 0.03  # largest share of a joint's mean square motion that a valid speed factor leaves unexplained
 WRONG = 0.1  # a speed factor this far from 1 is an error; filters of dq and elastic gears change it by 1 to 2 %
 ALIKE = 0.05  # if the joints' speed factors spread less than this (relative), the clock or the unit of dq is wrong
 

@@ -104,7 +104,7 @@ def _encoding(head: bytes) -> str:
 
 def _separator(line: str) -> str:
     """Return a line's separator: the first of semicolon, tab and comma that the line contains, or "" for spaces."""
-    return next((mark for mark in ";\t," if mark in line), "")  # beside semicolons or tabs, commas are decimal
+    return next((mark for mark in ";\t," if mark in line), "")  # in lines with semicolons or tabs, commas are decimal
 
 
 def _split(line: str, separator: str) -> list[str]:

@@ -5,7 +5,7 @@ import numpy as np
 from r2s.errors import UserError
 
 LEAST_GAP_S, GAP_STEPS = 0.05, 5.0  # s and median steps; a pause exceeds both limits; lost frames cause shorter gaps
-SLOWEST_S = 0.2  # s; a longer median step means that t is not in seconds; below 5 Hz unit_checks.py checks nothing
+SLOWEST_S = 0.2  # s; a longer median step means that t is not in seconds; unit_checks.py needs at least 5 Hz
 SLACK = 1e-6  # relative tolerance for round-off: steps of a 20 Hz clock are not exactly 0.05 s
 
 

@@ -1,4 +1,4 @@
-"""Join recordings of one arm, with the same kind of torque, into one; clocks and trajectories do not change."""
+"""Join recordings of one arm, with the same kind of torque, into one; each keeps its clock and trajectories."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ DT = 1e-3  # s, common grid of recordings with different rates; r2s filters ever
 def joined(recordings: Sequence[Recording]) -> Recording:
     """Join recordings into one; if their rates or command periods differ, resample all of them to 1 kHz first.
 
-    Signals that a recording lacks are dropped. `period` becomes None; `Recording.in_phase` finds a common period.
+    Only signals that all recordings have are kept. `period` becomes None; `Recording.in_phase` finds a common period.
 
     Raises:
         UserError: the recordings differ in kind of torque or number of joints.

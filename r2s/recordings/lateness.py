@@ -30,7 +30,7 @@ class Lateness:
 
     @property
     def sure(self) -> np.ndarray:
-        """Lateness (n,) s to correct: `s`, but 0 for joints whose lateness is too small or too uncertain."""
+        """Lateness (n,) s to correct: `s`, but 0 where `s` is too small or too uncertain; nan remains nan."""
         seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
         return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
 

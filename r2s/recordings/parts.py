@@ -12,7 +12,7 @@ from r2s.recordings.recording import Recording
 
 M_MMAP_THRESHOLD, MAPPED = -3, 4 << 20  # option of glibc's mallopt(3); bytes
 LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of MB
-MANY = 10  # parts; more than these are pieces of a recording longer than LONG_S
+MANY = 10  # parts; only a recording longer than LONG_S has more
 
 
 def give_back(recording: Recording) -> None:
@@ -22,7 +22,7 @@ def give_back(recording: Recording) -> None:
 
 
 def _trim() -> None:
-    """Release freed memory to the operating system, and later blocks above MAPPED bytes as soon as they are freed."""
+    """Release freed memory to the operating system; later, release blocks above MAPPED bytes when they are freed."""
     libc: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
     if hasattr(libc, "malloc_trim"):  # musl has no malloc_trim
         libc.mallopt(M_MMAP_THRESHOLD, MAPPED)

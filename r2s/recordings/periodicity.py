@@ -41,7 +41,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return a track per stretch if `each`, else per part without restart or long pause; omit any below OVERLAP_S."""
+    """Return tracks of at least OVERLAP_S: one per stretch (`each`) or per part without restart or long pause."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]

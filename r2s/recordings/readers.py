@@ -1,4 +1,4 @@
-"""Read a `Recording` from .csv, .npz, .parquet, HDF5, a LeRobotDataset or a robot's log, by its column names."""
+"""Read a `Recording` by column names from .csv, .npz, .parquet, HDF5, a LeRobotDataset or a robot's log."""
 
 import os
 import zipfile

@@ -247,8 +247,8 @@ class Recording:
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        A repetition lasts at least 0.5 s, moves a joint by about 0.1 rad or more, and differs by less than 0.01 rad
-        RMS over the joints. `in_phase` also aligns repetitions after a clock restart.
+        In a repetition of at least 0.5 s, the RMS difference of each joint is below its tolerance (about 0.03 rad),
+        and a joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a clock restart.
         """
         return self._period_and_clock()[0]
 

@@ -11,18 +11,18 @@ import numpy as np
 Arrays = dict[str, np.ndarray]  # t (T,), trajectory (T,), q, dq, tau (T, n)
 
 MOST_SWAPPED = 10  # rows; a row that is farther out of place indicates two interleaved logs
-JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: q is misread if it jumps beyond all three, and back
+JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: misread q jumps by more than all three, and back
 AWAY, MOST_FAILED = 10, 0.01  # largest number of successive rows, and share of all rows, with misread q
-FIRST_STEP = 100  # median steps; the first valid stamp is farther than this from 0
-REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad: at a wrap, q jumps by a revolution give or take its motion, below NEAR
+FIRST_STEP = 100  # median steps; zero stamps are dropped only if the first valid stamp is larger than this
+REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad; at a wrap, q jumps by a revolution, plus or minus a motion below NEAR
 SLACK = 0.05  # rad by which a logged angle may exceed a joint limit
 LEAST_HELD = 2.0  # rows, least median length of a hold: a run of rows with equal values
-REGULAR = 0.8  # least share of equal holds (give or take a row); holds of a coarse encoder vary with speed
+REGULAR = 0.8  # least share of holds near the median length; the length varies for a coarse encoder
 MOVES = 0.2  # rad, least motion of a log in which holds are removed
 
 
 def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
-    """Sort rows by time and drop zero stamps, repeated, misread and incomplete rows; add a line per repair."""
+    """Sort rows by time; drop rows that are repeated, misread, incomplete or stamped 0; return a note per repair."""
     notes: list[str] = []
     whole = all(x.dtype.kind in "iuf" and len(x) == len(arrays["t"]) for x in arrays.values())
     if not whole or arrays["t"].ndim != 1 or len(arrays["t"]) < 3:

@@ -99,7 +99,7 @@ def bag_table(
 
     t starts at 0 and comes from the header stamps, or from bag time if all stamps are 0. Messages that lack joints of
     the robot, such as a gripper's, are ignored. Messages are sorted by time, and repeated messages are dropped. The
-    entry `reader_note` counts omitted messages: messages with stamp 0, and first messages without values.
+    entry `reader_note` counts omitted messages: those with stamp 0, and those before the first with values.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap file, or the folder of a ROS 2 bag.
@@ -140,7 +140,7 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    A log's order may differ, because some ROS 2 drivers sort joints by name. The first applicable rule decides: (1)
+    A log's order may differ, because some ROS 2 drivers sort joints by name. The first applicable rule is used: (1)
     `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix as in panda_joint1; (3) n names that
     differ only in a number, sorted by this number; (4) the first n names, if n is 1 or `model_joints` empty.
 

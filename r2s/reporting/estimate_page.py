@@ -67,7 +67,7 @@ def write_estimate_recording(
 
 
 def _log_columns(stream: rr.RecordingStream, table: pd.DataFrame, names: Sequence[str]) -> None:
-    """Log the columns that `names` lists over the column `t`, with the limits of the 95 % intervals."""
+    """Log each column in `names` over time, column `t`, with the limits of its 95 % interval."""
     index = [rr.TimeColumn("time", duration=table["t"].to_numpy())]
     colour = colours(["estimate"])["estimate"]
     for name in names:

@@ -54,7 +54,7 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
 
 
 def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
-    """Apply `compare_pages` to all {page: text}; return one table; of several pages, sections begin with the page."""
+    """Compare each page in {page: text}; return one table. With several pages, section names begin with the page."""
     parts = []
     for page, text in before.items():
         cells = compare_pages(text, now[page])

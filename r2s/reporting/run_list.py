@@ -16,8 +16,8 @@ from r2s.runs import status_of
 
 LOST = ("failed", "killed")
 COLUMNS = ["status", "age", "result"]
-LONGEST = 46  # letters; longer run names are cut in a terminal, where the time at their beginning identifies them
-LEAST = 20  # letters; a result is not cut to fewer than this
+LONGEST = 46  # letters to which a terminal cuts run names; the time at their beginning still identifies the runs
+LEAST = 20  # letters of a result that are always shown
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
@@ -106,7 +106,7 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
         count = len({row[name] for row in summary[what]})
         return f"{count} {'groups of runs' if what == 'scores' else 'adapters'} compared"
     rows = summary["reach"] if stage == "pipeline" else summary
-    if stage == "pipeline":  # only the arm, which is the goal of a pipeline
+    if stage == "pipeline":  # only the transfers to the arm, which are the goal of a pipeline
         rows = {where: row for where, row in rows.items() if not where.endswith((", mujoco", ", predicted"))}
     table = measures_of(folder)
     measure = table[table.transfer[0]]

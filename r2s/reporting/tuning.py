@@ -15,7 +15,7 @@ from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
 ORDERS = 2000  # random orders of a grid: the standard error of their mean is then 1 / 45 of their spread
-SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of the search's compute
+SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of the search's training time, summed over its trials
 
 
 def trials_table(study: Any, folder: Path) -> pd.DataFrame:
@@ -58,7 +58,7 @@ def read_grid(against: str, measure: str) -> list[Trained]:
 
 
 def against_table(trials: pd.DataFrame, measure: str, against: str | None, larger: bool) -> pd.DataFrame | None:
-    """Return the best values of search and grid after the `SHARES` of the search's compute; None without a grid.
+    """Tabulate the best values of search and grid at `SHARES` of the search's training time; None without a grid.
 
     The order of a grid's jobs is arbitrary, so the grid's best value is averaged over `ORDERS` random orders.
 

@@ -1,4 +1,4 @@
-"""Show the external force: a figure over time, and in rerun an arrow with a 95 % cone at the arm's tip."""
+"""Show the external force over time in a figure and, in rerun, as an arrow from the tip with a 95 % cone."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -86,7 +86,7 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
     """Return the 95 % cone of the force's direction as lines: the cone's edge, and four lines from tip to edge.
 
-    The edge is the ellipsoid with half axes `half`, projected onto the plane normal to the force.
+    In each direction normal to the force, the edge lies half a 95 % interval of the force from the arrow's end.
     """
     size = max(float(np.linalg.norm(force)), 1e-9)
     across = np.linalg.svd(force[None] / size)[2][1:]

@@ -57,8 +57,8 @@ def make_robot(cfg):
 def make_dynamics(cfg, robot, announce=False):
     """Return the dynamics of `base_dynamics`, prepared for contact if the task of conf/task touches a surface.
 
-    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. If this changes
-    the stiction model, print a line if `announce`.
+    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. If
+    `announce`, print a line when this changes the stiction model.
     """
     dynamics = base_dynamics(cfg, robot)
     if not getattr(target(cfg.task, "task"), "touches", False):
@@ -194,7 +194,7 @@ def is_simulated(cfg):
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is a simulated twin that needs no operator; such twins can run in parallel."""
+    """Return whether conf/arm is a twin without an emulated arm around it; such twins need no operator."""
     return is_simulated(cfg) and "operator" not in cfg.arm
 
 

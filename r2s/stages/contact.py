@@ -28,7 +28,7 @@ def contact_data(cfg, robot, file):
     file: `FileData` of the config, which names the columns of the files.
 
     Raises:
-        UserError: tool or commanded torque is missing, a validation has no data.contact, or a file is invalid.
+        UserError: the tool, commanded torque or data.contact is missing, or a file is invalid.
     """
     from r2s.identification.checks import check_recording
 
@@ -48,7 +48,7 @@ def contact_data(cfg, robot, file):
 
 
 def stated_stiffness(cfg, robot):
-    """Return the prior of the gears from identify.gears.stiffness and .accuracy; None if nothing is stated.
+    """Return the prior of gear stiffness from identify.gears.stiffness and .accuracy; None if unset.
 
     Raises:
         UserError: a value is invalid.
@@ -89,7 +89,7 @@ def pressed_surface(cfg, run, arm, plan):
     """Let the arm press on the surface, and return the `ContactData`; a resumed run reads its existing recording.
 
     Raises:
-        Stopped: the arm stopped; contact_until_stop.npz contains the paths completed before, if any.
+        Stopped: the arm stopped; contact_until_stop.npz contains the paths completed before the stop, if any.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.presses import record_presses

@@ -51,7 +51,7 @@ def loaded_data(cfg, robot, file, torque=None):
 
 
 def torque_of_calibration(cfg, given):
-    """Return the torque kind of the calibration; a recording of an arm with a payload needs the same kind.
+    """Return the kind of torque of the calibration, which a recording with a payload must have too.
 
     given: value of data.torque, or None if unset.
 

@@ -27,7 +27,7 @@ STEPS = {  # {first label of the step's commands: description}
 }
 STOPPED = 3  # exit status of a command that ended because the arm stopped, see r2s/cli.py
 MODELS = ("identified", "nominal")
-# labels with adapt=: computed torque on the identified model, and the policy of "identified" plus adapter
+# labels: with adapt=, computed torque, and the policy of "identified" plus adapter; identification of the surface
 COMPUTED, ADAPTED, SURFACE = "computed", "adapted", "surface"
 REFERENCE = "reference"  # for a task on a surface: hybrid control with the identified model, without learning
 ROWS = {
@@ -107,7 +107,7 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Return a step's commands in groups to run in parallel: one group, or one per command if an arm `moves`."""
+    """Group the commands of a step that run in parallel: all in one group, or if an arm `moves`, each in its own."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
@@ -270,7 +270,7 @@ def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
 
 
 def pipeline(cfg, overrides):
-    """Run every command in a separate process; write a table, a recording and a report that cover all commands."""
+    """Run every command in a separate process; write a table, a viewer recording and a report of all commands."""
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures
     from r2s.runs import read_summary

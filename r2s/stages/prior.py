@@ -31,7 +31,7 @@ class Earlier:
 
     @property
     def arm(self):
-        """The identified dynamics without an estimated payload, because r2s estimates the payload again."""
+        """The identified dynamics without the estimated payload, which r2s estimates anew."""
         x = self.x.copy()
         if "payload_mass" in self.space.blocks:
             x[self.space.where("payload_mass")] = 0.0
@@ -117,7 +117,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the start of a fit: `earlier.arm`, or if the kinds of torque differ `nominal` with the earlier links."""
+    """Return the start of a fit: `earlier.arm`; if the kinds of torque differ, `nominal` with the earlier links."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, or in a checkout
 PROGRAM = "python run.py" if CONF.parent != PACKAGE else "r2s"  # how the user starts r2s
 TRUST = (
-    "R2S_TRUST"  # environment variable: `trust=` for trainings of a resumed search, whose folder has the overrides
+    "R2S_TRUST"  # environment variable: `trust=` for trainings of a resumed search, with overrides from its folder
 )
 # matches resolvers such as ${oc.env:HOME}, nested ${a${b}} that may become a resolver, and an escaped $
 RESOLVER = re.compile(r"\$\{\s*(\w*)[^}]*(?::|\$\{)|\\\$")
@@ -59,18 +59,18 @@ def run_config(folder, trust=None):
 
 
 def replayed(cfg):
-    """Return a composed config; a config with overrides from a run folder must first pass `checked`."""
+    """Return a composed config; if its overrides come from a run folder, check the config with `checked` first."""
     return checked(cfg, "resume", os.environ[TRUST]) if TRUST in os.environ else cfg
 
 
 def checked(cfg, where, trust=None):
     """Return a run folder's config with resolved interpolations; raise UserError for untrusted code.
 
-    r2s calls every part (`_target_`) that a config names. So conf/ must name the same part in the same group, or a
-    module in `trust` must define the part. Resolvers such as ${oc.env:X} read the environment, so `trust` needs `oc`.
+    r2s calls every part (`_target_`) that a config names. This function refuses a part unless conf/ names it in the
+    same group or a module in `trust` defines it. Resolvers such as ${oc.env:X} need `oc` in `trust`.
 
     Args:
-        where: file name for error messages. trust: value of `trust=` (`modules`), instead of the config's `trust`.
+        where: file name for error messages. trust: value of `trust=`, see `modules`; replaces the config's `trust`.
 
     Raises:
         UserError: the config names untrusted code, which r2s has neither imported nor called.

@@ -210,7 +210,7 @@ def split_algo(cfg):
     check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
     demonstrations = settings.pop("demonstrations", 0)
     check_number("algo.demonstrations", demonstrations, "[0, inf)", whole=True)
-    residual_l2 = settings.pop("residual_l2", None)  # configs of earlier r2s have none
+    residual_l2 = settings.pop("residual_l2", None)  # configs of earlier versions have none
     if residual_l2 is not None:
         check_number("algo.residual_l2", residual_l2, "[0, inf)")
     loop = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}

@@ -52,7 +52,7 @@ class ConstrainedReward(Reward):
     """A reward with costs: its terms are those of `reward`, then the costs with the weights -lambda / limit.
 
     Args:
-        reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost, in its unit}.
+        reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost in the cost's unit}.
 
     Raises:
         UserError: a cost is unknown, or a limit is not positive.

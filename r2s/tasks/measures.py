@@ -88,7 +88,7 @@ class MeasureTable:
         transfer: measures that compare adapters episode by episode in transfers to an arm.
         diagnostics: columns of a transfer's second table; by default COMMON.
         corner: heading of the column of row labels. description: sentence that describes what a policy does.
-        error: name, unit and scale of `Episodes.distance`. error_levels: lines in its figure, in its unit.
+        error: name, unit and scale of `Episodes.distance`. error_levels: lines in the figure of this error.
         reward: name of `Episodes.reward`.
 
     By default, `comparison`, `curves`, `scores` and `transfer` contain the measures that `selection` lists.

@@ -5,7 +5,7 @@ import numpy as np
 from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.task import Episodes
 
-WINDOW_S = 1.0  # s, the RMS force error is measured in this time before the force step and before the end
+WINDOW_S = 1.0  # s, duration of the two windows of the RMS force error: before the force step and before the end
 IMPACT_S = 0.1  # s, duration of the impact, which begins at the first touch
 TOUCH_N = 0.5  # N, force above which the tip is in contact
 GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # limits of success: RMSE N in each window; overshoot N or share
@@ -44,8 +44,8 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
     force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the force step, and in
     the last second. Means over episodes: overshoot_N, largest excess over the new force in the direction of the step;
     overshoot_share, the same divided by the step; impact_N, largest force within IMPACT_S of the first touch;
-    contact, share of the time since the first touch with contact. All these exclude stopped episodes. success: share
-    of all episodes that have no stop, both RMS errors <= GOOD_N, and an overshoot within OVER_N or OVER_SHARE.
+    contact, share of time in contact after the first touch. All these exclude stopped episodes. success: share of all
+    episodes that have no stop, both RMS errors <= GOOD_N, and an overshoot within OVER_N or OVER_SHARE.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]

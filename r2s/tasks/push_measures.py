@@ -42,7 +42,7 @@ def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
     within_3cm, within_10deg: share of episodes with the box within 3 cm, or 10 degrees, of its goal throughout the
     last 0.5 s. success: share of episodes within both limits, without a stop, with the tip always above the table.
     distance_median_m, yaw_median_deg: median over episodes of the mean error in the last 0.5 s. force_peak_N: mean
-    over episodes of the largest force at a control step. on_table: share with a simulated tip in the table.
+    over episodes of the largest force at a control step. on_table: share of episodes with the tip in the table.
     """
     hold, box = round(HOLD_S * ctrl_hz), episodes.box
     assert box is not None

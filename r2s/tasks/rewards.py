@@ -16,7 +16,7 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # m, tanh scales of the precision bonus
-STILL = (0.2, 0.05)  # rad/s, tanh scales of the largest joint speed; the end effector may rest on that joint's axis
+STILL = (0.2, 0.05)  # rad/s, tanh scales of the largest joint speed; a joint can turn while the end effector rests
 TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 
 

@@ -48,7 +48,7 @@ class Arms(Protocol):
         ...
 
     def end(self) -> np.ndarray:
-        """End the episodes; return (width,) bool: whether each arm had stopped early."""
+        """End the episodes; return (width,) bool: whether each arm stopped early."""
         ...
 
 

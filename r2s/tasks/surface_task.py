@@ -30,8 +30,8 @@ LAG_M = 0.01  # m, lag of the tip behind its target, from damping at approach_sp
 # of elastic twin 0, policies wipe as well with 1 N, and worse than the controller alone with 5 N
 RESIDUAL = 0.1
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
-# 1/rad, see `cartesian_impedance`; low, because a null-space torque reaches the tip if joints stick. On models of
-# twins 0 and 1 the reference's force errors are similar from 0.02 to 0.05, and up to twice as large at 0.2
+# 1/rad, see `cartesian_impedance`; low, because with stuck joints a null-space torque pushes the tip. On models of
+# twins 0 and 1 the reference controller's force errors are similar from 0.02 to 0.05, and up to twice that at 0.2
 NULL_STIFFNESS = 0.05
 REGULAR = 1e-3  # m^2/rad^2, regularizes the force estimate to 0 in directions in which no joint moves the tip
 EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: middle of conf/dr/contact.yaml
@@ -48,7 +48,7 @@ class SurfaceTask(TipTask):
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         force: (low, high) N, range of the requested forces. force_rate: N/s, rate at which this force changes.
-        approach_speed: m/s, speed of the target along the nominal normal, thus the highest closing speed at contact.
+        approach_speed: m/s, speed of the target against the nominal normal: the highest closing speed at contact.
         clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
             from `point`. place, tilt: m and degrees, largest offset and tilt of the true plane from the nominal.
         point, normal: the nominal plane in the base frame, m; None: a work table below the tip in home posture.
@@ -223,7 +223,7 @@ class SurfaceTask(TipTask):
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, how far the target of the tip's center is below the nominal plane at the times t (m,) s.
 
-        It grows at `approach_speed` until the tip touches any allowed surface; then the force rises at `force_rate`.
+        It grows at `approach_speed` until the tip touches even the lowest surface, then by `force_rate` / stiffness.
         """
         height, K = goals[:, HEIGHT], self.spring
         touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` refers to the tip's center

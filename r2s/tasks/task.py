@@ -127,8 +127,8 @@ class Task(Protocol):
         observation_summary: terms and units of an observation, for the metadata of policy.onnx.
         reward_terms: names of the reward terms. paper_weights: (k,), their weights in `Episodes.reward`.
         pool: number of different goals in a training.
-        speed_noise: rad/s; in training, the speed noise of each arm has at least the standard deviation ~
-            U(0, speed_noise); with None or 0, training sets no lower bound.
+        speed_noise: rad/s; a training raises the standard deviation of each arm's speed noise to at least a random
+            value ~ U(0, speed_noise); None or 0: no lower bound.
         measure_table: the measures that `measures` returns, with their presentation (r2s/tasks/measures.py).
         may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
         touches: whether the tool touches a surface; simulated arms then need `Dynamics.surface`.

@@ -290,7 +290,7 @@ class TrackTask(BaseTask):
         """Return the measures of task track, one row of evaluations.csv.
 
         path_rmse_mm: RMS distance between end effector and reference over the steps of the paths without a stop.
-        path_max_mm: mean over the paths without a stop of the largest distance. within_x: share of steps with a
+        path_max_mm: each path's largest distance, averaged over paths without a stop. within_x: share of steps with a
         distance below x; steps of stopped paths never qualify. return_track: mean over paths of the summed reward.
         torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector, from cubic fits
         over JERK_S. stopped: share of stopped paths. q_left_rad, limited: see `r2s.tasks.rollout.measures`.

@@ -73,7 +73,7 @@ class WipeTask(SurfaceTask):
 
     @property
     def begin_s(self) -> float:
-        """Time, s, at which the path starts: the tip then touches any allowed surface with the full force."""
+        """Time, s, at which the path starts: the tip then presses even on the lowest surface with full force."""
         return self.down_s + self.force[1] / self.force_rate + REST_S
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
@@ -90,7 +90,7 @@ class WipeTask(SurfaceTask):
         """Stiffness K, N/m, and integral rate r, 1/s, of the default controller, from the tip's effective mass.
 
         To follow a path, the spring is as stiff as the latency allows: K = m w^2, with the smallest effective mass m
-        and w of `fastest_spring`. Critically damped, the largest effective mass M has the characteristic equation
+        and w of `fastest_spring`. With critical damping, the largest such mass M has the characteristic equation
         M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0, stable for r < r0 = 2 (K/M)^(1/2) (Routh, Hurwitz). r = STEADY r0.
         """
         masses = np.linalg.eigvalsh(self.inertia)

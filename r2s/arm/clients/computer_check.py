@@ -16,7 +16,7 @@ LIMITS = resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK
 
 
 def computer_findings(realtime: bool) -> list[Finding]:
-    """Check kernel and permissions; if `realtime`, libfranka requires both, so a missing one forbids motion."""
+    """Check kernel and permissions; if `realtime`, lack of a real-time kernel or of SCHED_FIFO forbids motion."""
     kernel = REALTIME.is_file() and REALTIME.read_text().strip() == "1"
     fifo, (priority, _), (memory, _) = _may_use_fifo(), *map(resource.getrlimit, LIMITS)
     locked = "unlimited" if memory == resource.RLIM_INFINITY else f"{memory / 2**20:.0f} MiB"

@@ -13,7 +13,7 @@ from r2s.physics.payload import LoadTorque, Payload, ee_pose
 from r2s.physics.rigid_body import nominal_torque
 from r2s.physics.robot import Robot
 
-# Both kinematics are exact and use the same q: they differ only by single precision (1e-7 m) and rounded robot files
+# At one q, the poses of arm and model differ only by single precision (1e-7 m) and rounded numbers in robot files
 PLACE_M, ANGLE_DEG = 1e-3, 0.2  # a tenth of the accuracy of a policy; 0.2 deg are 1 mm at 0.3 m
 LOAD_KG = 0.01  # 0.08 Nm at full reach: less than the friction of any joint, so the arm does not sink
 GRAVITY = 0.1  # m/s^2: 0.6 deg of tilt, 1 % of gravity compensation

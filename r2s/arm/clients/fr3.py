@@ -14,7 +14,7 @@ from r2s.arm.clients.libfranka import Client
 from r2s.arm.clients.panda import Panda
 from r2s.physics.robot import Robot
 
-STOP_DISTANCE = 0.02  # rad, braking distance of a joint from 0.2 rad/s, the speed that an FR3 allows there
+STOP_DISTANCE = 0.02  # rad, braking distance of a joint from 0.2 rad/s; at `margin` an FR3 allows 0.16 to 0.48 rad/s
 
 
 def within_fr3(robot: Robot) -> Robot:
@@ -68,7 +68,7 @@ class _FR3Client(Client):
         self._control, self._last = self._robot.start_torque_control(), [0.0] * 7
         while True:
             state, _ = self._control.readOnce()
-            # the arm may ignore commands until its success rate is above 0; the caller's first must not get lost
+            # the arm may ignore commands until its success rate exceeds 0; the caller's first one must not get lost
             if state.control_command_success_rate > 0:
                 return state
             self._control.writeOnce(self._package.Torques(self._last))

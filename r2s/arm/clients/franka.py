@@ -41,7 +41,7 @@ SETTLE_S = 3.0  # s, longest time to settle at the end of the path
 INTEGRAL_GAIN = 15.0  # share of tau_max per rad s; overcomes breakaway torque at the end of the path
 INTEGRAL_SHARE = 0.15  # share of tau_max, limit of the integral's torque
 ARRIVED = 2e-3  # rad from the target: the motion ends
-ACCEPTED = 1e-2  # rad from the target after SETTLE_S: accepted, because a real wrist's friction may hold it there
+ACCEPTED = 1e-2  # rad from the target after SETTLE_S: accepted, because friction may hold a real wrist there
 MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
 
 
@@ -67,7 +67,7 @@ class Franka:
         speed_share: factor on all allowed speeds in every motion.
 
     Raises:
-        UserError: the arm does not match the model; the arm has not moved.
+        UserError: the arm does not match the model, or an argument is out of range. The arm has not moved.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Franka:
         self._connection, self.findings = connection, self._compared(connection)
         limits = TORQUE_SHARE * robot.tau_max, 2 * friction_margin(robot)
         fence = CollisionCheck(robot, table=None)
-        # a strong reference back to the arm would keep it, and its connection, alive after its last user
+        # a strong reference to the arm would keep the arm and its connection alive after their last use
         self._loop = CommandLoop(
             weakref.proxy(self),
             Driver(robot, *limits, cutoff_hz=CUTOFF_HZ, fence=fence, speed_share=speed_share),

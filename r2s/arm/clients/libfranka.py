@@ -100,7 +100,7 @@ def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
 
 
 def is_reachable(address: str) -> bool:
-    """Return whether a computer answers at the address, if only by refusing a connection.
+    """Return False if all connections to the address time out; a refused connection or another error yields True.
 
     The FCI port is tried last, because a connection to this port occupies the arm's only client slot.
     """

@@ -74,7 +74,7 @@ class _Motion:
         if isinstance(state, Exception):
             self._thread.join()
             raise ArmStopped(one_line(state)) from state
-        return state  # None only follows an answer of None
+        return state  # None only after the answer None
 
     def answer(self, tau: np.ndarray | None) -> None:
         """Answer the last state from `next` with the command tau (7,) Nm; None ends the motion."""

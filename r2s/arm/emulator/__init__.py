@@ -1,1 +1,1 @@
-"""An emulated control box of a Franka arm, for the real clients: wire format, control cycle, server, process."""
+"""An emulated control box of a Franka arm, for the real clients: robot model, control cycle, server, process."""

@@ -262,7 +262,7 @@ class Control:
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
         """Filter the external torque, set wrench and contact flags; after a collision, return error and message.
 
-        As in libfranka, it is tau_J minus the model's torque: torque on the surroundings, plus errors of `DESK`.
+        As in libfranka, external torque is tau_J minus the torque of the box's model, which has the `DESK` settings.
         Unlike on a real arm, friction and model errors have no effect on the emulated external torque.
 
         Args:

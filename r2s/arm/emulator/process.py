@@ -35,7 +35,7 @@ class Emulator:
         version: FCI version: 5 for libfranka 0.9 (Panda), 10 for libfranka 0.18 and later (FR3).
         realtime: run at 1 kHz instead of in lock-step.
         faults: faults that the emulator injects.
-        max_missed: consecutive cycles without an answer that stop the arm. desk: settings of the box, see `Control`.
+        max_missed: consecutive unanswered cycles after which the arm stops. desk: settings of the box, see `Control`.
     """
 
     def __init__(
@@ -77,12 +77,12 @@ class Emulator:
 
 def _child(pipe, settings: tuple) -> None:
     make_arm, version, realtime, faults, max_missed, desk = settings
-    os.setsid()  # like a control box, it gets no signals from the terminal
+    os.setsid()  # like a control box, this process gets no signals from the terminal
     try:
         socket = open_port()
         arm = make_arm()
         arm.move_to(arm.robot.q_home)
-        arm.command(np.zeros(arm.robot.n))  # compile now; a client would time out meanwhile
+        arm.command(np.zeros(arm.robot.n))  # compile now, because a client would time out during compilation
         arm.stop()
         arm = make_arm()
         control = Control(arm, version, faults, max_missed, desk)

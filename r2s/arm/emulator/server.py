@@ -62,7 +62,7 @@ class Server:
 
     def _accept(self) -> None:
         tcp, _ = self._socket.accept()
-        if self._tcp is not None and _is_closed(self._tcp):  # the client reconnects before its end was processed
+        if self._tcp is not None and _is_closed(self._tcp):  # the client reconnected before this was noticed
             self._disconnect()
         if self._tcp is not None:
             tcp.close()

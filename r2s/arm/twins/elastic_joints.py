@@ -69,8 +69,8 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
     """Return a motor's velocity, rad/s, after h s under friction and all other torques, whose sum is `push`, Nm.
 
     Args:
-        p: parameters. i: joint index. w: present velocity, rad/s. middle: mid-step velocity, rad/s, for evaluating
-            friction, if it has the direction of w. load: gear torque, Nm. factor: scale of friction.
+        p: parameters. i: joint index. w: present velocity, rad/s. middle: rad/s, mid-step velocity, used
+            for friction if it has the motor's direction. load: gear torque, Nm. factor: scale of friction.
     """
     side = np.sign(w)
     if w != 0.0:

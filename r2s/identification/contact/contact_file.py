@@ -33,7 +33,7 @@ class IdentifiedSurface:
             (N/m at 10 N), height (m along the normal) and tilt_deg (angle from the normal).
         identifiable: {name: whether the recording determines this value}; names include plane and slope.
         draws: surfaces drawn from the posterior.
-        rigid_gears: the same for simulations with rigid gears, as r2s's; see `ContactEstimate`.
+        rigid_gears: the surface for simulations with rigid gears, such as r2s's; see `ContactEstimate`.
     """
 
     surface: Surface
@@ -112,7 +112,7 @@ def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurfac
         with np.load(path.with_name("contact_posterior.npz"), allow_pickle=False) as file:
             draws = {name: file[name] for name in file.files}
         found = _parse(document, draws)
-        if RIGID_GEARS not in document:  # a file from before gears were estimated
+        if RIGID_GEARS not in document:  # an older file, without estimated gears
             return found
         own = {name.removeprefix(f"{RIGID_GEARS}_"): values for name, values in draws.items() if RIGID_GEARS in name}
         return replace(found, rigid_gears=_parse(document[RIGID_GEARS], own))

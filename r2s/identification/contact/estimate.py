@@ -1,7 +1,7 @@
 """Identify a surface that an arm has pressed: stiffness, exponent, damping, friction and plane, with intervals.
 
 If an arm's encoders are on the motors, the gears' deflection adds to the penetration of the surface. A first estimate
-takes the gears as rigid; a second estimates their compliance with the surface, about a stated one if there is one.
+assumes rigid gears. A second one also estimates their compliance, with a prior about the stated stiffness, if any.
 """
 
 from collections.abc import Callable
@@ -30,9 +30,9 @@ from r2s.physics.surface import UNIT_DEPTH, Surface
 from r2s.recordings.recording import Recording
 
 STEPS, ROUNDS = 25, 4  # largest number of Jacobians per search; number of searches, each after a reweighting
-AT_BOUND = 0.02  # a stiffness nearer to a bound than this share of the logarithmic range is at the bound
+AT_BOUND = 0.02  # a stiffness is at a bound if its distance from the bound is below this share of the log range
 COVERED = (2.5, 97.5)  # %, percentiles of a 95 % interval
-# Standard deviations of errors that more data do not reduce (from friction laws and time steps): slope relative,
+# Standard deviations of errors that more data do not reduce (friction laws, time steps): slope and bristle relative,
 # damping s/m, height m, tilt rad; measured on simulated arms and surfaces (benchmarks/contact_identification.py).
 SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
 SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
@@ -45,17 +45,17 @@ class ContactEstimate:
 
     Attributes:
         surface: the estimate; `surface.point` is the mean of the tip centers in contact, projected onto the plane.
-        draws: posterior draws {name: (S, ...)} of the values of a `Surface`, its point and normal, of `slope`, the
-            slope of the force at LOAD, N/m, and of `gears`, the compliances (S, n) rad/Nm of the gears.
+        draws: posterior draws {name: (S, ...)} of the values, point and normal of a `Surface`; `slope`: slope of the
+            force curve at LOAD, N/m; `gears`: (S, n) rad/Nm, compliance of the gears.
         identifiable: {name: whether the data determine this value}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
         training: predicted and measured forces of fitted presses. validation: the same for unfitted presses, or None.
         gears: (n,) rad/Nm, compliance of the gears behind encoders on motors; 0: rigid gears or encoders on links.
-            Joints that contact and gravity hardly load keep the prior's ratio to the mean deflection.
+            A joint that is hardly loaded keeps its prior ratio to the mean deflection.
         stated: whether the stiffness of the gears was stated.
         tau_max: (n,) Nm, largest torques of the joints.
-        rigid_gears: the surface of the same recording for a simulation with rigid gears, which has the gears' springs
-            in its own; None in an estimate with rigid gears.
+        rigid_gears: the estimate for simulations with rigid gears, whose surface includes the compliance of the
+            gears; None in an estimate that assumes rigid gears.
     """
 
     surface: Surface
@@ -75,7 +75,7 @@ class ContactEstimate:
         return float(low), float(high)
 
     def deflection(self, gears: np.ndarray) -> np.ndarray:
-        """Return the mean deflection (...), rad, of gears of compliance (..., n) rad/Nm by the largest torques."""
+        """Return the gears' mean deflection (...) rad at the largest torques, for compliances (..., n) rad/Nm."""
         return (gears * self.tau_max).mean(-1)
 
     @property
@@ -106,7 +106,7 @@ def identify_contact(
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> ContactEstimate:
-    """Estimate the surface from a recording with contact; the estimate contains one with `rigid_gears`.
+    """Estimate the surface from a recording with contact, with elastic gears and, in `rigid_gears`, with rigid gears.
 
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
@@ -134,9 +134,9 @@ def identify_contact(
 
 
 def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | None, refit: Fit) -> Press | None:
-    """Return the errors of presses without influence on u (U,): those of `other`, else the last one after a `refit`.
+    """Return forces in presses that were not fitted: those in `other`, else the last, after a refit without it.
 
-    None: there is a single press.
+    Return None if there is no `other` and fewer than two presses.
     """
     if other is not None:
         return press_errors(other.reweighted(u), u, presses(other, u))
@@ -151,7 +151,7 @@ def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, 
     """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution for rigid gears u (8,).
 
     The weights remain those of rigid gears. The residual of elastic gears is smaller; weights from it would ignore
-    the error of the friction law: on elastic twins 0 to 9, 23 of 80 intervals would miss the truth instead of 9.
+    the error of the friction law: on elastic twins 0 to 9, 23 of 80 intervals would miss the true value, not 9.
     """
     return _fitted(problem, problem.space.with_gears(u))
 
@@ -200,7 +200,7 @@ def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None,
     identifiable = dict(zip(NAMES[3:], known[3:SURFACE].tolist(), strict=True))
     identifiable["slope"] &= bool(AT_BOUND < u[3] < 1 - AT_BOUND)  # gears may hide a stiff surface
     identifiable |= {"plane": bool(known[:3].all()), "stiffness": identifiable["slope"] and identifiable["exponent"]}
-    if len(u) > SURFACE:  # the mean deflection, against its prior
+    if len(u) > SURFACE:  # compare the mean deflection with its prior
         sure = half[SURFACE] / 2 < space.gears.width / SOFTEST / SHARPER
         identifiable["gears"] = bool(sure and u[SURFACE] < 1 - AT_BOUND)
     touched = problem.tip.centre[depth > 0].mean(0)

@@ -1,7 +1,7 @@
 """Export an identified surface to other simulators as contact parameters of MuJoCo and SDF, linearized at 10 N.
 
-MuJoCo's contact force is d (aref - a0) / A with impedance d, reference acceleration aref, acceleration a0 without
-contact and inverse mass A (MuJoCo documentation, Computation: Constraint model). A contact with small d is a spring
+MuJoCo's contact force is d (aref - a0) / A with impedance d, reference acceleration aref, inverse mass A and free
+acceleration a0 (MuJoCo documentation, Computation: Constraint model). A contact with small d is a spring
 and damper with coefficients solref / A (N/m, Ns/m). A high `impratio` makes friction stiff although d is small.
 """
 

@@ -22,20 +22,20 @@ EXACT = 1e-4  # lower limit of a row's sigma, relative to the joint's friction, 
 SEEN = 0.03  # standard deviations; errors of the arm's model with a smaller effect on all rows together are dropped
 FTOL = 1e-6  # a search ends when a step reduces the cost by less than this share
 STEP = 1e-5  # finite-difference step on the unit cube
-REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
+REACH = 10.0  # half-width of the unit cube along w, in standard deviations of w
 PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise below 40 Hz
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least squares over u (U,), surface and gears, and the arm's uncertainty w (r,), with a standard normal prior.
+    """Least squares over u (U,), surface and gears, and the arm's model errors w (r,) with a standard normal prior.
 
     Each of the R rows is a window in which a joint slides in one direction (see `TorqueResidual`). Resting joints
     have no rows, since their friction may have any value between the breakaway torques. A closed form eliminates w,
     because w acts linearly on the residual (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
-    If encoders are on the motors, gears deflect behind them: gravity moves the tip by the gears' `sag`, and the force
-    by a spring in series with the surface. Presses at places with different lever arms distinguish the two springs.
+    Encoders on the motors do not measure the gears' deflection: gravity moves the tip by `sag`, and in contact the
+    gears act as a spring in series with the surface. Presses with different lever arms distinguish the two springs.
 
     Attributes:
         torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
@@ -43,7 +43,7 @@ class ContactProblem:
         directions: (T, n, r) Nm, derivative of the residual torque with respect to w.
         sigma: (T, n) Nm, standard deviation of each residual torque, which the fit treats as independent.
         space: the space of the vectors u.
-        sag: (F, n, 3) m per rad/Nm; gravity moves the tip by minus the sum over j of sag[:, j] and the compliance j.
+        sag: (F, n, 3) m per rad/Nm; gravity moves the tip by minus the sum over j of sag[:, j] times compliance j.
     """
 
     torque: TorqueResidual
@@ -63,7 +63,7 @@ class ContactProblem:
 
     @property
     def rows(self) -> np.ndarray:
-        """(T, n) bool, whether the residual has a row for a joint's window at a moment."""
+        """(T, n) bool, whether the residual has a row for this window and joint."""
         return self.torque.seen
 
     @property

@@ -70,7 +70,7 @@ def _starts(
 def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return tip center (T, 3) m, force on the tip (T, 3) N, and (T,) whether the force is certainly above 0.
 
-    The force is a least-squares fit to joint torques below 10 Hz, with unknown friction of resting joints.
+    The force is a least-squares fit to joint torques below 10 Hz; resting joints, of unknown friction, hardly count.
     """
     space, motion = torque.space, torque.motion
     d = space.dynamics(x)

@@ -11,8 +11,8 @@ from r2s.physics.surface import UNIT_DEPTH, Surface
 
 LOAD = 10.0  # N, load at which slope and height are defined, so that slope and height depend little on the exponent
 # bounds from foam to steel; the entries for slope of the force at LOAD (N/m) and bristle (m) are logarithms
-TILT = 0.6  # rad about the first plane, whose error is at most the angle of friction
-HEIGHT = 0.02  # m about the first plane
+TILT = 0.6  # rad, largest tilt from the first guess of the plane, whose error is at most the friction angle
+HEIGHT = 0.02  # m, largest distance from the first guess of the plane
 BOUNDS = {
     "tilt_a": (-TILT, TILT),
     "tilt_b": (-TILT, TILT),
@@ -28,11 +28,11 @@ LOWER, UPPER = np.array(list(BOUNDS.values())).T
 WIDTH = UPPER - LOWER
 SURFACE = len(NAMES)  # number of values of a surface; u has 1 + n further values if the gears are elastic
 FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
-# Deflection of gears, rad, by the joints' largest torques. The prior is normal with rigid gears at its center; strain
+# Deflection of gears, rad, at the largest torques: standard deviation of a normal prior about 0; upper bound. Strain
 # wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
 DEFLECTION, SOFTEST = 0.01, 0.05
-SCATTER, FARTHEST = 0.2, 0.6  # standard deviation and bound of a joint's deflection about the arm's, as shares of it
-LEAST_ACCURATE = 0.4  # of a stated stiffness; two standard deviations then fit into FARTHEST and below SOFTEST
+SCATTER, FARTHEST = 0.2, 0.6  # standard deviation and limit of a joint's relative deviation from mean times `shape`
+LEAST_ACCURATE = 0.4  # largest allowed `accuracy`; two standard deviations then stay within FARTHEST and SOFTEST
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Gears:
 
     Attributes:
         shape: (n,) deflection of each joint, relative to the mean over joints.
-        center, width: mean and standard deviation, rad, of the mean deflection. scatter: standard deviation of a
-            joint's relative deflection.
+        center, width: mean and standard deviation, rad, of the mean deflection.
+        scatter: relative standard deviation of a joint's deflection.
         stated: whether the stiffness of the gears was stated.
     """
 
@@ -65,8 +65,8 @@ def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float 
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints.
-        stiffness: Nm/rad, one value per joint, or that of the strongest joint; other joints then twist as far by
-            their largest torque. accuracy: relative standard deviation of the stiffness.
+        stiffness: Nm/rad, one value per joint, or that of the strongest joint; at their largest torques, all joints
+            then twist by the same angle. accuracy: relative standard deviation of the stiffness.
 
     Raises:
         UserError: a stiffness is not positive, `accuracy` is not in (0, LEAST_ACCURATE], or the gears are too soft.
@@ -94,8 +94,8 @@ class SurfaceSpace:
     """The space of surfaces near a plane through `origin` (3,) m with unit normal `normal` (3,).
 
     A vector u contains two tilts of the plane about axes through `origin`, the tip's height along the normal under
-    the force LOAD, and five values of the force law. If the gears are elastic, it also contains their deflection by
-    the largest torques, and the deviation of each joint from it.
+    the force LOAD, and five values of the force law. If the gears are elastic, u also contains their mean
+    deflection at the largest torques, and each joint's relative deviation from this mean times `Gears.shape`.
 
     Attributes:
         tau_max: (n,) Nm, largest torques of the joints. gears: prior of their deflection by these torques.
@@ -128,14 +128,14 @@ class SurfaceSpace:
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
 
     def compliance(self, u: np.ndarray) -> np.ndarray:
-        """Return the compliance (..., n) rad/Nm of the gears for u (..., U); without values for gears, zeros."""
+        """Return the compliance (..., n) rad/Nm of the gears for u (..., U); 0 if u lacks values for gears."""
         if u.shape[-1] == SURFACE:
             return np.zeros((*u.shape[:-1], len(self.tau_max)))
         relative = 1.0 + FARTHEST * (2.0 * u[..., SURFACE + 1 :] - 1.0)
         return SOFTEST * u[..., SURFACE, None] * self.gears.shape * relative / self.tau_max
 
     def with_gears(self, u: np.ndarray) -> np.ndarray:
-        """Return the surface u (8,) with values for gears at the center of their prior: (8 + 1 + n,)."""
+        """Append the gears' prior means to a surface's vector u (8,); return the new vector (8 + 1 + n,)."""
         return np.concatenate([u, [self.gears.center / SOFTEST], np.full(len(self.tau_max), 0.5)])
 
     def prior(self, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface, normal_force
 
 NEWTON = 10  # iterations for two springs in series; relative error below 1e-6 for exponents of 1 to 2
-SHALLOW = 1e-6  # share of the deflection that stays in the surface, so that its slope is defined
+SHALLOW = 1e-6  # least share of the surface in the deflection, so that the slope of the surface's force is defined
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class TipMotion:
         centre: (F, 3) m, center of the tip. radius: m, radius of the tip.
         axes, origins: (F, n, 3), joint axes, and points on these axes, in the base frame. dq: (F, n) rad/s, velocity.
         play: m, largest tip path by encoder noise alone; a path shorter than `play` only bends bristles elastically.
-        compliance: (n,) rad/Nm, by which the contact's torque deflects the gears behind encoders on the motors; (0,):
+        compliance: (n,) rad/Nm, compliance of the gears, whose deflection motor encoders do not measure; (0,):
             rigid gears.
     """
 
@@ -92,7 +92,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
     let bristles relax. Therefore a path shorter than `play` only bends bristles elastically.
 
     Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
-    with compliances C and the force F g = F (n - mu z). Their deflection along the surface is part of `bristle`.
+    with compliances C and the force F g = F (n - mu z). `bristle` includes the gears' deflection along the surface.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play, compliance = settings
@@ -155,8 +155,8 @@ def _contact(motion, settings, point, normal, law, tau, out):
 def _in_series(soft, K, exponent, damping, depth, rate):
     """Return force, depth and its rate at a surface behind a spring of compliance `soft`, m/N, by Newton's method.
 
-    depth, rate: m, m/s, the sum of both deflections and its rate. The rate of the surface's depth is that of two
-    springs without damping.
+    depth, rate: m, m/s, the sum of both deflections and its rate. The computed rate of the surface's depth neglects
+    damping.
     """
     if soft <= 0.0 or depth <= 0.0:
         return normal_force(K, exponent, damping, depth, rate), depth, rate

@@ -42,8 +42,8 @@ RIGID = 1e-8  # rad, creep length of a joint that does not creep
 DRIFT = 3e-4  # rad/s, prior sigma of a slow drift: a resting joint may still settle
 SIDES = "negative", "positive"
 KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
-WORSE = 1.01  # if the misfit of a fit with `Slide` exceeds the free fit's by this ratio, use the free fit
-BACK = 0.0, 0.03, 0.1  # initial values of U: distances below the last command, as shares of the ramp
+WORSE = 1.01  # if the misfit of a fit with `Slide` exceeds the free fit's by this factor, use the free fit
+BACK = 0.0, 0.03, 0.1  # initial values of U: distances below the last command, relative to the ramp's rise
 DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, which a short motion does not determine
 STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # initial creep length, rad, and share of the guessed slide time
 
@@ -110,14 +110,14 @@ class Slide:
 def estimate_breakaway(
     ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, slide: Slide | None = None
 ) -> Breakaway:
-    """Estimate the command at which each ramped joint broke away, from t, q and tau.
+    """Estimate from t, q and tau of ramps the commands at which joints broke away.
 
     The estimate is NaN if the joint moves by less than MOVED rad along the ramp, or moves before the command rises.
 
     Args:
         ramps: recorded ramps at any rate, in which the command rises from rest (falls for sign -1). For an encoder
-            noise of 2e-5 rad, the error is the rate times 0.5 ms (small inertia) to 3 ms (large inertia).
-        delay, lag: s, dead time and time constant between command and torque; the hold of the command adds to these.
+            noise of 2e-5 rad, the error is the ramp's rate times 0.5 ms (small inertia) to 3 ms (large inertia).
+        delay, lag: s, dead time and time constant between command and torque; r2s adds the hold of the command.
         slide: parameters of the motion after release; None: use only the free fit.
 
     Raises:
@@ -192,7 +192,7 @@ def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarr
 
 
 def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Fit all parameters to x (T,) rad under commands u (T,) Nm; return U, Nm (NaN: below all u), and misfit, rad."""
+    """Fit all parameters to x (T,) rad under commands u (T,) Nm; return U, Nm (NaN: about u[0]), and misfit, rad."""
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -276,7 +276,7 @@ def _parts(x: np.ndarray) -> tuple[int, slice]:
 
 @njit(cache=True)
 def _slides(t, u, U, kappa, z, damping, jump, fall):
-    """Return the positions (C, T) of `_slide` for parameters (C,), with one `fall`."""
+    """Return the positions (C, T) of `_slide` for parameters (C,) and a common `fall`."""
     out = np.empty((len(U), len(t)))
     for c in range(len(U)):
         out[c] = _slide(t, u, U[c], kappa[c], z[c], damping[c], jump[c], fall)
@@ -305,7 +305,7 @@ def _slide(t, u, U, kappa, z, damping, jump, fall):
             w = v
             for _ in range(60):
                 e = hold * np.exp(-max(at + 0.5 * h * (v + w), 0.0) / z)
-                left, steeper = 0.0, 0.0  # share of the friction that has not fallen yet, and its slope
+                left, steeper = 0.0, 0.0  # share of friction's decrease still to come, and its slope
                 if fall > 0.0:
                     ratio = 0.5 * (v + w) / fall
                     left = np.exp(-ratio * ratio)

@@ -1,9 +1,9 @@
 """Estimate the presliding distance, over which the bristles of friction with memory bend after a reversal.
 
 The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
-bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters. Between
-some of them, such as offset and asymmetry, only reversals decide. The last steps of the search therefore vary them
-together with the distance, but only the distance is returned.
+bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters. But
+only reversals distinguish some of them, such as offset and asymmetry. The last steps of the search therefore vary
+these parameters together with the distance, but only the distance is returned.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,14 +25,14 @@ from r2s.physics.dynamics import Dynamics
 from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
-WINDOW_S, STRIDE = 0.2, 5  # s; ms; for the replays, because friction reverses within about 50 ms
-TRIED = 9  # distances, evenly spaced in their logarithm; within the usual bounds, neighbors differ by a factor of 1.8
-STEPS, FTOL = 4, 1e-2  # of the search for the distance alone: most steps, least relative gain
-JOINT_STEPS, SMALL = 4, 0.05  # steps of the joint search: most; change of the distance (relative) after which it ends
+WINDOW_S, STRIDE = 0.2, 5  # s; ms; of the replays, which are short because friction reverses within about 50 ms
+TRIED = 9  # number of log-spaced distances; within the usual bounds, neighbors differ by a factor of 1.8
+STEPS, FTOL = 4, 1e-2  # search for the distance alone: most steps; least relative gain of a step
+JOINT_STEPS, SMALL = 4, 0.05  # search that also varies WITH: most steps; it ends below this relative change
 # parameters whose errors change the estimated distance; viscous friction, inertia and delay change it by 1 % or less
 WITH = ("coulomb", "asymmetry", "rise", "offset")
-# lower limit of the logarithm's standard deviation: windows start with bristles that bent along a smoothed velocity,
-# so even with true values of all other parameters, injected distances were found with errors of up to 1.5 %
+# lower limit of the logarithm's standard deviation: a window's first bristle state comes from smoothed velocity, so
+# in tests estimates of known distances erred by up to 1.5 %, even with true values of all other parameters
 MIN_SIGMA = 0.02
 RIDGE = 1e-6  # information added to every value on the unit cube, as a distance may have a flat prior and no data
 
@@ -82,8 +82,8 @@ def estimate_presliding(
 def nearest_distance(data: ReplayResidual) -> np.ndarray:
     """Simulate TRIED distances, each in all joints at once; return each joint's best distance (n,) on the unit cube.
 
-    Weights from the residual at a distance several times too small would suppress all reversals, so a search must not
-    start there.
+    A search must not start at a distance that is several times too small: weights from the residual at this distance
+    would suppress all reversals.
     """
     u = np.tile(np.linspace(0.0, 1.0, TRIED)[:, None], data.space.n)
     cost = (data(data.space.from_unit(u)) ** 2).reshape(TRIED, -1, data.space.n).sum(1)

@@ -1,10 +1,10 @@
 """Compute the standard error of breakaway commands from repeated ramps.
 
 Friction varies between ramps, because of posture, load and cables. Two ramps per joint and direction hardly determine
-a variance, because a 95 % interval by Student's t with one degree of freedom is +-12.7 standard errors. Therefore r2s
+a variance: by Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors. Therefore r2s
 averages a joint's variance with the mean variance of all joints of the same size, which weighs as much as
 PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small, because joints of the
-same size differ in scatter, on twins by factors of 3 and more. Without repeats, the standard deviation is REPEATS.
+same size differ in scatter, on twins by factors of 3 and more. Without any repeats, r2s assumes the scatter REPEATS.
 """
 
 from typing import NamedTuple
@@ -18,14 +18,14 @@ REPEATS = 1e-3  # standard deviation between repeated ramps, relative to tau_max
 
 
 class Certainty(NamedTuple):
-    """Standard error `sigma` (n, 2) Nm of mean release commands (NaN: no release); Student's degrees of freedom."""
+    """Standard error (n, 2) Nm of mean release commands (NaN: no release), and its degrees of freedom (n, 2)."""
 
     sigma: np.ndarray
     freedom: np.ndarray
 
 
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
-    """Return standard errors of the mean commands at release; joints of equal limit tau_max (n,) Nm are of one size.
+    """Return standard errors of the mean commands at release; joints with equal tau_max (n,) Nm have the same size.
 
     If no joint of a size has repeated ramps, r2s assumes the mean scatter of all joints, in proportion to tau_max.
     """

@@ -9,7 +9,7 @@ from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 
-# relative standard deviation between breakaway command and friction at standstill, due to creep and onset
+# standard deviation of net torque minus friction, relative to the command; due to creep and the onset of sliding
 SIGMA = 0.03
 LEAST = 1e-3  # relative to tau_max; all smaller commands have the same standard deviation
 

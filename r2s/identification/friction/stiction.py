@@ -18,9 +18,9 @@ from r2s.recordings.recording import Recording
 
 HORIZON, WINDOWS = 0.5, 60  # length (s, enough for stops) and number of the replays that choose a model
 SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # in `scan_breakaway`: windows, passes, and how many passes are coarse
-SCAN_BATCH = 12  # candidates replayed at once: 600 arms, which take a third of the memory of 36 candidates
-LEAST = 5e-4  # least friction to which the scan range is proportional, relative to tau_max
-POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points in a coarse pass; per side in a fine pass; divisor of its step
+SCAN_BATCH = 12  # candidates replayed at once, with 50 windows each; 36 candidates need three times the memory
+LEAST = 5e-4  # lower limit of the friction that determines the scan range, relative to tau_max
+POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # coarse pass: points; fine pass: points per side, and divisor of the step
 
 
 def choose_stiction(
@@ -75,7 +75,7 @@ def scan_breakaway(
 
     A gradient search would fail, because the replay error jumps if a joint starts to slide one step sooner. A pass
     varies one breakaway torque at a time and minimizes the replay error of its joint. Coarse passes scan from 0 to
-    `largest` (n,) Nm, fine passes ever more finely around the best value. Two are coarse: joints affect each other.
+    `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, because joints affect each other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

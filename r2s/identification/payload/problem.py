@@ -14,12 +14,12 @@ from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass
 from r2s.physics.rigid_body import LinkInertia, nominal_torque
 from r2s.recordings.recording import Recording
 
-# standard deviations of changes since the calibration: friction, relative (warming changes friction by as much within
-# minutes, WARMED in adaptation); offset over friction; link-side offset over the largest torque (conf/identify)
+# standard deviations of changes since the calibration: friction, relative (WARMED in adaptation: warming within
+# minutes); offset, relative to friction; link-side offset, relative to the largest torque (conf/identify)
 FRICTION_DRIFT, OFFSET_DRIFT, SENSOR_DRIFT = 0.07, 0.02, 7e-4
-LOAD_FRICTION = 0.015  # Nm of gear friction per Nm of load (adaptation/tuning.py: PAYLOAD_FRICTION)
+LOAD_FRICTION = 0.015  # standard deviation of friction, Nm per Nm of load (adaptation/tuning.py: PAYLOAD_FRICTION)
 RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; recordings longer than LONG_S (s) have fewer
-REACH = 10.0  # standard deviations of an arm direction from the centre to a face of the unit cube
+REACH = 10.0  # half-width of the unit cube along w, in standard deviations of w
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10) and constant (r,) of the model errors gain @ phi + constant that best fit a payload phi."""
+        """Gain (r, 10), constant (r,): gain @ phi + constant are the model errors w of least cost given phi (10,)."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
@@ -67,7 +67,7 @@ class Rows:
         return root / size, np.linalg.lstsq(root.T, size * b, rcond=None)[0]
 
     def best_arm(self, phi: np.ndarray) -> np.ndarray:
-        """Return the errors w (r,) of the arm's model that best fit a payload phi (10,)."""
+        """Return the arm's model errors w (r,) of least cost given a payload phi (10,)."""
         gain, constant = self._eliminated
         return gain @ phi + constant
 
@@ -76,7 +76,7 @@ class LoadedTorque:
     """The torque residual of an arm with an unknown payload.
 
     Args:
-        arm: the arm, identified without payload. recording: motion with payload, and the same kind of torque.
+        arm: the arm, identified without payload from the same kind of torque. recording: motion with payload.
         declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque.
     """
@@ -128,7 +128,7 @@ class LoadedTorque:
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Linearize the residual at `payload` (parameters phi (10,)); weights exclude the torque of errors w (r,)."""
+        """Linearize the residual at `payload` (parameters phi (10,)); weights ignore torque from errors w (r,)."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

@@ -21,15 +21,15 @@ from r2s.recordings.parts import joined_arrays
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 250  # rate at which torques are evaluated before averaging
-CUTOFF_HZ = 40.0  # cutoff for angles before differentiation: velocity noise biases a curved friction law
+CUTOFF_HZ = 40.0  # cutoff for angles before differentiation: velocity noise would bias the mean of curved friction
 NORMAL = 0.6745  # median magnitude of a normal variable over its standard deviation
-SHORTEST, LONGEST = 0.024, 0.1  # s, half the length of a window
+SHORTEST, LONGEST = 0.024, 0.1  # s, limits of half the length of a window
 GUARD = 8e-3  # s between a window and a stop, because the low-pass spreads the stop over this time
-STEADY = 0.2  # relative change of velocity allowed over PRESLIDING, for a friction law with memory
+STEADY = 0.2  # largest relative change of velocity over the distance PRESLIDING, for a friction law with memory
 STEADY_ROWS = 101  # rows of the polynomial fit to test STEADY; over five rows, noise looks like acceleration
 MAX_LATENCY = 0.04  # s, longest latency of a command
 HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of eighths of the step for which a command is held
-# quadrature of a first-order lag, over exp(-x); the last points have less than 1e-10 of the weight
+# Gauss-Laguerre quadrature for a first-order lag; the omitted four points have less than 1e-10 of the weight
 LAG_POINTS, LAG_WEIGHTS = (x[:12] for x in np.polynomial.laguerre.laggauss(16))
 
 

@@ -28,8 +28,8 @@ class ReplayResidual:
 
     The error of a window is modeled as Z b + e. For each joint, b ~ N(0, diag(d)) contains the errors of start angle
     and start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise.
-    The covariance of Z b + e whitens the error. Finite differences yield Z. The recording yields first values of d
-    and s, the residual later values. `clusters` (R,) is the block of each row; before a fit, a window is one block.
+    The covariance of Z b + e whitens the error. Finite differences yield Z. First values of d and s come from
+    the recording, later values from a fit. `clusters` (R,) is each row's block; before a fit, each window is a block.
 
     Args:
         space: the parameters. recording, windows: the data, see `cut_windows`. stride: ms, averaging time of angles.
@@ -170,8 +170,8 @@ def _random_effects(
     """Estimate the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e by maximum evidence.
 
     MacKay's fixed-point iteration (Neural Computation 4(3), 1992) starts at `sigma` and `noise`. The variance of b is
-    sum(mean^2) / (number of well-determined b). The mean of b over all windows is excluded, because a wrong
-    parameter (mostly an offset) causes this mean. The standard deviation of b is at least `min_sigma` (K,).
+    the sum of its squared estimates over the number of well-determined b. Their average over windows is subtracted
+    first, because a wrong parameter (mostly an offset) causes it. The standard deviation of b is >= `min_sigma` (K,).
     """
     _, rows, k = z.shape
     n = len(noise)

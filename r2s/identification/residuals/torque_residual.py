@@ -26,21 +26,21 @@ from r2s.recordings.lateness import from_q, lateness
 from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
-STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, small against the residual's curvature
-MAX_CORRELATION = 40  # rows, longest correlation length: a slowly drifting residual is worth more than one row
+STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, too small for curvature to matter
+MAX_CORRELATION = 40  # rows, limit of the correlation length: a slowly drifting residual still counts as several rows
 MIN_SIGMA = 1e-9  # Nm
-MOST_ROWS = 30_000  # longer recordings (from 5 min at 100 Hz) get fewer rows per s; the cutoff needs 20 per s
+MOST_ROWS = 30_000  # recordings above 5 min (at 100 Hz) get fewer rows per s; for a cutoff of 10 Hz, 20 per s suffice
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
 AT_ONCE = 8  # candidates whose link torques are computed in one pass over the regressor
 PART = 2048  # number of moments whose Jacobian is in memory at once
-FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
+FULLY_BENT = 4.0  # presliding distances; bristles then bend to 98 % from rest, and to 96 % after a reversal
 
 
 class TorqueResidual:
     """Immutable torque residual of a zero-phase filtered recording.
 
     The constructor computes the regressor of rigid-body torque once. Friction is computed from velocities with a
-    higher cutoff, then filtered like the recorded torque, in which the filter smooths friction steps at reversals.
+    higher cutoff. It is then filtered like the recorded torque, so that reversals are equally smooth in both.
 
     Args:
         space: the parameters to estimate. recording: a recording or a planned motion, which is not filtered.
@@ -69,7 +69,7 @@ class TorqueResidual:
             if slowest:
                 of: Any = partial(SlidingMotion.of, slowest=slowest, slid=slid)
             else:
-                # with commands, velocity is the slope of q, because logged dq lags by a filter or a step
+                # for commanded torque, use the derivative of q: logged dq is late, by a filter or a step
                 late = from_q(robot.n) if self.commanded else lateness(recording, cutoff_hz)
                 late = late.as_logged if space.nominal.late_alike else late
                 of = partial(SmoothMotion.of, cutoff_hz=cutoff_hz, late=late)
@@ -85,7 +85,7 @@ class TorqueResidual:
         self._sharp = bool(slowest)
         self._mean_sign = {memory: m.filtered(self._sign(memory, slice(None))) for memory in (False, True)}
         self.block = blocks_of(m.t, self._rigid.q, self._period)
-        # blocks for held-out rows; rows at equal clock share a block, or else short trajectories would dominate
+        # blocks of held-out rows; rows at equal times share a block, as otherwise short trajectories would dominate
         self.half_second: np.ndarray = np.unique(np.floor(m.t / BLOCK_S), return_inverse=True)[1]
         self.lead_s, self._external = 0.0, np.zeros(1)
         self._weights = self._weights_at(self._seen_errors(space.start), fitted=False)
@@ -110,13 +110,13 @@ class TorqueResidual:
         return self._with(space=space).reweighted(space.start, fitted=False)
 
     def with_lead(self, lead_s: float) -> "TorqueResidual":
-        """Return a copy for a simulator with implicit friction at the velocity `lead_s` s ahead of the motion."""
+        """Return a copy for a simulator with implicit friction; `_friction` explains `lead_s` in s."""
         return self._with(lead_s=lead_s)
 
     def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
         """Return a copy for bristles that bend over `presliding_rad` (n,) rad during the motion of `recording`.
 
-        The copy has weights as before a fit. To save memory, the copy shares motion and regressors with the original.
+        The copy is weighted as before a fit. To save memory, the copy shares motion and regressors with the original.
         """
         of = partial(self._of, presliding_rad=presliding_rad)
         bristle = np.concatenate([of(piece).bristle for piece in _pieces(recording, of)])
@@ -136,7 +136,7 @@ class TorqueResidual:
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: parts of an earlier evaluation, of which parts with equal parameters are reused.
+        known: parts of an earlier evaluation; a part is reused if the parameters in it are equal.
         """
         d, own = dynamics, self._known(dynamics, known)
         # a link-side sensor's gain does not scale friction
@@ -147,9 +147,9 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None, links: np.ndarray | None = None) -> "_Known":
-        """Return the parts of an error that are slow to compute, or parts of `like` with equal parameters.
+        """Return the parts of an error that are slow to compute; parts of `like` with equal parameters are reused.
 
-        links: (T, n) Nm, torque of the links of `d` if it is known.
+        links: (T, n) Nm, torque of the links of `d`; None: compute this torque.
         """
         m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
         if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
@@ -167,7 +167,7 @@ class TorqueResidual:
         return _Known(standard, d.armature, torque, d.phi, friction, late, recorded)
 
     def _recorded(self, delay: float, lag: float, signal_delay: float) -> np.ndarray:
-        """Return the recorded torque (T, n) Nm: commands after hold, delay and lag; measured torque at its time."""
+        """Return the recorded commands (T, n) Nm after hold, delay and lag, or measured torque without its delay."""
         m = self.motion
         if self.commanded:
             return m.command(delay, lag)
@@ -177,14 +177,14 @@ class TorqueResidual:
         """Return the sign of friction at a slice of the F instants; memory: whether the friction law has a memory."""
         if memory:
             return self.motion.bristle[rows]
-        dq = self.motion.friction_dq[rows]  # in windows without stops, friction is fully developed
+        dq = self.motion.friction_dq[rows]  # in windows without stops, friction has fully changed sign
         return np.sign(dq) if self._sharp else np.tanh(dq / WIDTH_DQ)
 
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
         """Return the unfiltered friction torque in Nm at a slice of the F instants.
 
-        A simulator with implicit friction evaluates friction at the velocity of the previous step, `lead_s` earlier,
-        and adds a correction if friction rises with speed.
+        A simulator with implicit friction uses the velocity `lead_s` s earlier or, if friction rises with speed,
+        `lead_s` s later.
         """
         dq, sign = self.motion.friction_dq[rows], self._sign(d.family.has_memory, rows)
         if not self.lead_s:
@@ -236,11 +236,11 @@ class TorqueResidual:
     def _changes(
         self, x: np.ndarray, stepped: np.ndarray
     ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
-        """Return the torque error (T, n) at x, and [(block, indices in x, change)] to `stepped`.
+        """Return the torque error (T, n) at x, and [(parameter block, indices in x, change)] to `stepped`.
 
-        A change is that of torque (T, n), or that of standard parameters (n, 10 n, L) for L parameters of links.
-
-        One evaluation per block suffices: friction acts on its joint only; torque is linear in standard parameters.
+        A change is one of torque (T, n) or, for L parameters of links, one of standard parameters (n, 10 n, L).
+        The latter need no evaluation, because torque is linear in standard parameters. A joint's value in another
+        parameter block affects only this joint's torque, so one evaluation steps the values of all joints.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -280,8 +280,8 @@ class TorqueResidual:
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
         """Return a copy with rows divided by their standard deviation, estimated from the error at x (P,).
 
-        The standard deviation of a joint is the RMS error, halved unless x was `fitted`, times the root of the
-        correlation length. For means over windows, the standard deviation also contains encoder noise, which is
+        A joint's standard deviation is the RMS error times the square root of the correlation length, halved unless
+        x was `fitted`. For means over windows, the standard deviation also contains encoder noise, which is
         larger in short windows. If x was `fitted`, the correlation of the error determines the length of blocks.
         """
         r = self._seen_errors(x)

@@ -21,7 +21,7 @@ from r2s.recordings.recording import Recording
 
 STATE_SAMPLES = 31  # ms, length of the local fit for a window's start state
 HALF = STATE_SAMPLES // 2
-SHORTEST = 0.25  # least share of the full window length; even shorter windows add less information than they cost
+SHORTEST = 0.25  # least share of the full window length; shorter windows contain too little information
 MOVED = 0.02  # rad, least range of motion of a moving joint
 # scatter of breakaway commands between postures, relative to the largest tau_max (a Panda: 0.1 Nm of 87 Nm)
 SCATTER = 0.1 / 87.0
@@ -61,11 +61,11 @@ class Windows:
     def bristles(self, d: Dynamics) -> np.ndarray:
         """Return the presliding state (..., W, n) at the start of each window, for dynamics with batch axes (...).
 
-        The recorded velocity determines the state, from 0 at the trajectory's start. Without memory, the state is 0.
+        The state starts from 0 in each trajectory and follows the recorded velocity. Without memory, it is always 0.
         """
         if not d.family.has_memory:
             return np.zeros((len(self.at), self.dq.shape[1]))
-        named = "presliding" in d.family.names[: d.phi.shape[-1]]  # a user's law may lack it
+        named = "presliding" in d.family.names[: d.phi.shape[-1]]  # a user's law may lack this
         distance = d.phi[..., d.family.names.index("presliding")] if named else np.full(d.phi.shape[:-1], PRESLIDING)
         kinds, kind = np.unique(distance.reshape(-1, distance.shape[-1]), axis=0, return_inverse=True)
         pieces = [self.dq[a:b] for a, b in pairwise([*self.begins, len(self.dq)])]
@@ -84,13 +84,13 @@ def cut_windows(
 
     Args:
         limit: largest number of windows; a longer recording yields `limit` evenly spaced windows.
-        slowest: rad/s. A window ends when a joint is slower; the next starts when all are faster, as a tiny parameter
-            change can shift a joint's breakaway by a step and disturb all. Joints that never move are ignored.
+        slowest: rad/s. A window ends when a joint is slower; the next one starts when all joints are faster. A tiny
+            change of a parameter could shift a slow joint's breakaway. Joints that never move are ignored.
         edges: (n, 2) Nm, lower and upper breakaway command of each joint, widened by SCATTER. A slow joint ends a
             window only if its command lies between its two breakaway commands.
 
     Raises:
-        UserError: no trajectory is as long as a window, or all joints hardly ever move at the same time.
+        UserError: no trajectory is as long as a window, or at almost all times a joint is slower than `slowest`.
     """
     grid = recording.resample(SIM_DT)
     steps = round(seconds / SIM_DT)

@@ -16,7 +16,7 @@ class LeastSquares:
 
     Attributes:
         max_evaluations: most Jacobians. ftol: least relative gain for another step. minutes: time limit.
-        level: what to minimize: "residual" for `Problem.data` or, within seconds, "torque" for the torque residual.
+        level: what to minimize: "residual" for `Problem.data`, "torque" for the torque residual (takes seconds).
     """
 
     max_evaluations: int = 40

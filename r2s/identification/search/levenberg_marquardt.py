@@ -1,7 +1,7 @@
 """Solve bounded least squares on the unit cube by Levenberg-Marquardt, with several damping factors tried in a batch.
 
 scipy's trust-region solver would be slower: it tries one step at a time, and at every step it factors the whole
-Jacobian (14,000 rows, 110 columns) by SVD, which takes longer than the physics.
+Jacobian (14,000 rows, 110 columns) by SVD, which takes longer than the simulation.
 """
 
 import time
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 DAMPING = 1e-3  # first damping factor, relative to the diagonal of J^T J (Marquardt's scaling)
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # limits: the least allows a pure Gauss-Newton step, the most no step at all
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # lower limit: a pure Gauss-Newton step; upper limit: almost no step
 TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful one
 RETRIES = 3  # batches of trials per Jacobian
 
@@ -29,7 +29,7 @@ def minimize(
 
     Args:
         residual: maps (C, P) to (C, R). linearize: maps (P,) to parts of residual (r,) and Jacobian (r, P).
-        start, max_evaluations, ftol, minutes: see least_squares.py. name: name of the search in progress rows.
+        start, max_evaluations, ftol, minutes: see least_squares.py. name: name of this search for `report`.
         report: function that receives a row of progress after every step.
     """
     u, damping, began = np.clip(start, 0.0, 1.0), DAMPING, time.perf_counter()

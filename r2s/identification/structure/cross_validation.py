@@ -22,7 +22,7 @@ GUARD_S = 0.1  # s, gap between fitted rows and a held-out block, as the low-pas
 
 
 def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
-    """Return (fitted part, held-out part) for each fold; a fold holds out `blocks` blocks with gaps of GUARD_S."""
+    """Return (fitted part, held-out part) of each fold; a fold holds out `blocks` blocks between gaps of GUARD_S."""
     period = recording.period or np.inf
     clock = recording.t % period if recording.period else recording.t
     edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))

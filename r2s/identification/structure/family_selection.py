@@ -10,18 +10,18 @@ from r2s.identification.structure.cross_validation import CrossValidation, clear
 from r2s.physics.dynamics import with_family
 from r2s.physics.friction import FAMILIES, Family
 
-# largest ratio of a simpler friction family's torque error to the least one, in windows of motion. On simulated arms
-# (independent_arms.py, seeds 1 to 31) it was 1.00 to 1.20 for Coulomb friction, 1.86 to 6.8 for falling friction
+# largest ratio of a simpler family's torque error to the least error in windows of motion; the ratio was 1.00 to 1.20
+# on simulated arms with Coulomb friction, 1.86 to 6.8 with falling friction (independent_arms.py, seeds 1 to 31)
 CLOSE = 1.45
 
 
 def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float = 0.0) -> dict[str, Any]:
-    """Return {"error": (F,) held-out torque error over the least error, "best": index} for the F friction families.
+    """Return {"error": (F,) held-out torque error relative to the least, "best": index} for the F friction families.
 
-    r2s selects a family with more parameters only if it predicts torque clearly better. Rows of slow motion would
-    show whether friction falls with velocity, but the low-pass mixes friction at rest into these rows. If `slowest`
-    > 0 (rad/s), r2s therefore compares the friction families without memory again, only over windows with faster
-    joints (modulating_functions.py), and returns the new errors. Families with memory need different windows.
+    r2s selects a family with more parameters only if it predicts torque clearly better. Rows of slow motion
+    show whether friction falls with velocity, but the low-pass mixes friction at rest into them. If `slowest` > 0
+    (rad/s) and the best family has no memory, r2s compares the families without memory again, over windows in which
+    joints are faster than `slowest` (modulating_functions.py), and returns the new errors.
 
     Raises:
         UserError: the recording is too short to hold out motion.
@@ -41,7 +41,7 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
 def _compare(
     cv: CrossValidation, families: Sequence[Family], terms: Sequence[str], slowest: float = 0.0, close: float = 1.0
 ) -> tuple[np.ndarray, int] | None:
-    """Return friction families' torque errors (F,) over the least one, and the choice; None without held-out data.
+    """Return families' torque errors (F,) relative to the least, and the chosen index; None without held-out data.
 
     r2s selects the first family whose relative error is at most `close` or not clearly above that of the best family.
     """

@@ -20,16 +20,16 @@ from r2s.identification.structure.cross_validation import RATE_HZ, CrossValidati
 from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
-SURE = 4.0  # standard deviations: 3, plus a third, as 95 % intervals covered only 85 % under model error
-UNCLEAR = 2.0  # standard deviations above the estimate, up to which a delay may be
+SURE = 4.0  # standard deviations: 3, plus a third, as model error reduced the coverage of 95 % intervals to 85 %
+UNCLEAR = 2.0  # standard deviations between an estimated delay and the largest plausible one
 BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted motion have similar speeds
 
 
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether to estimate the delay of torque, "alike": whether torque and dq are equally late}.
 
-    If dq is on time, or its lateness unknown, r2s estimates the delay unless it is clearly below LATE_S: with 0, the
-    interval would miss a delay that is not clear. If dq is late, r2s first fits torque with corrected dq. If torque
+    If dq is on time, or its lateness unknown, r2s estimates the delay of torque unless it is clearly below LATE_S: a
+    delay fixed at 0 would have no uncertainty. If dq is late, r2s first fits torque with corrected dq. If torque
     then clearly has a delay, r2s corrects torque and dq. Otherwise it corrects only dq if this lowers the error of
     held-out torque by more than one standard error, else it uses torque and dq as logged and treats both as equally
     late. With folds < 2, it corrects only dq.
@@ -55,7 +55,7 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
 def torque_delay(cv: CrossValidation, terms: Sequence[str]) -> tuple[float, float]:
     """Fit `terms`, which include the delay of torque; return its absolute value and standard deviation, s."""
     space = cv.space(terms)
-    recording = cv.recording if cv.recording.period else cv.recording.in_phase()  # repetitions are one block
+    recording = cv.recording if cv.recording.period else cv.recording.in_phase()  # repetitions share blocks
     data = TorqueResidual(space, recording, cutoff_hz=cv.cutoff_hz, rate_hz=RATE_HZ)
     u, problem = fit_torque(Problem.of(data, data, cv.prior))
     problem = problem.reweighted(u, fitted=True)

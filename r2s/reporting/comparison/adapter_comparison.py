@@ -1,4 +1,4 @@
-"""Compare adapters by transfers of one policy, in tables of a row per adapter and a column per arm condition.
+"""Compare adapters by their transfers, in tables with a row per adapter and a column per condition of the arm.
 
 Means are over arms and episodes. The bootstrap is paired: all rows of a condition share the drawn arms and the drawn
 episodes of each arm.
@@ -30,7 +30,7 @@ class AdapterComparison:
         measures: {key: compared measure}. headline: the measure that summarizes a row.
         scores: a line per measure, condition and row: `mean`, 95 % interval `low` to `high`; `difference` from the
             row `reference` (None: no reference); 95 % interval `worse_low` to `worse_high` of how much worse it is;
-            numbers of `stopped`, requested (`asked`) and averaged (`episodes`) episodes, and of `arms`.
+            numbers of `stopped` episodes, of those common to all rows (`asked`), of averaged `episodes`, of `arms`.
         losses: table with a line per condition and row. `value` is the mean of the headline measure in the condition;
             `nominal` is its mean over the same arms and episodes in the nominal condition.
         costs: table with a line per row. `us` is the adapter's computing time per cycle, microseconds.
@@ -172,7 +172,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return {path: short path}, where short paths are the last path components, as few as distinguish all paths."""
+    """Return {path: short path}. A short path is the last components of the path, as few as distinguish all paths."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -181,7 +181,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the reference of row `name`: the adapt=none row of its policy, else the only adapt=none row or None."""
+    """Return the reference of row `name`: its policy's adapt=none row, else the only adapt=none row, else None."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]
@@ -189,7 +189,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Return a line about a row: its headline measure in its worst condition, and where `reference` is better."""
+    """Return a line about a row: its headline measure in its worst condition, and where its reference is better."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:

@@ -18,14 +18,14 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     """Return the settings of conf/arm that differ from their nominal values, such as {"payload": 1.0}.
 
     Args:
-        arm: config of the arm. typed: overridden config keys; overridden arm keys ("arm.live") are settings, too.
+        arm: config of the arm. typed: overridden config keys; those of the arm ("arm.live") count as settings, too.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
     values = {k: _plain(arm[k]) for k in keys if k in arm and k not in IDENTITY}
 
     def empty(key: str, value: Any) -> bool:
-        return "payload" in key and not isinstance(value, str) and not _size(value)  # a string is a payload.yaml
+        return "payload" in key and not isinstance(value, str) and not _size(value)  # a string is a run folder
 
     return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and not empty(k, v)}
 

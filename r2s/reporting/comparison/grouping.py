@@ -61,7 +61,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
     names = [_joined(seeds[0].algo, p) for seeds, p in zip(sets, parts, strict=True)]
     for name in list(names):
         twins = [k for k, other in enumerate(names) if other == name]
-        if len(twins) > 1:  # they differ in settings without an override, as in an experiment's file
+        if len(twins) > 1:  # they differ in settings without an override, such as those of +experiment=
             changed = differing([sets[k][0].settings for k in twins])
             for k in twins:
                 more = {_short(s): sets[k][0].settings[s] for s in changed if s in sets[k][0].settings}

@@ -79,7 +79,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return scores (S,) at S held-out seeds: of the setting that is best at the other seeds, and the median score.
+    """Return two scores (S,) at S held-out seeds: of the best setting at the other seeds, and the median of settings.
 
     Args:
         settings: {seed: score} of each setting; a larger score is better. Only seeds common to all settings are used;

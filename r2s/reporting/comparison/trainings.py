@@ -21,7 +21,7 @@ READ = (
     *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
 )
 ALIKE = ("robot", "task")  # config groups with equal values in comparable runs
-# key of `origin` -> why runs that differ in the key are not comparable: code affects results, the machine speed
+# key of `origin` -> why runs that differ in it are not comparable: code affects results, a machine affects speed
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
@@ -40,7 +40,7 @@ class Trained:
         origin: commit, machine, threads and device from meta.json, each may be None; of a controller only the commit.
         typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether the run used +experiment=toy, a training too short for the policy to learn.
-        minutes: budget of the run in minutes; None if the budget is in env_steps.
+        minutes: budget of the run in minutes; None if the run has a budget in env_steps.
         measures: measures of the task. curve: evaluations.csv, measured on the goals that select the best policy.
         last: measures of the last policy, from summary.json, on goals that were not used for selection.
     """
@@ -230,7 +230,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """List names as ["a, b (failed)", "c (unfinished)"]: `most` names per reason, cut to `width` letters."""
+    """List names as ["a, b (failed)", "c (unfinished)"]: up to `most` names per reason, of up to `width` letters."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

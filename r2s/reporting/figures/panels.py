@@ -13,7 +13,7 @@ from r2s.tasks.measures import Measure
 DPI = 120
 WIDTH = 12.0  # inches
 LEGEND_WIDTH = 160  # number of letters that fit into WIDTH, in one line of the legend
-# inches around and between panels: matplotlib's own layouts measure every text, which takes most of a figure's time
+# fixed inches around and between panels: matplotlib's layout engines are slow, because they measure every text
 LEFT, RIGHT, TOP, BOTTOM, ACROSS, DOWN, LINE = 0.8, 0.15, 0.75, 0.5, 0.85, 0.75, 0.22
 LETTER = 0.085  # inches per letter of a tick label left of the first panel
 TITLE, AGAIN = 0.9, 0.2  # inches added to the heights of the rows: once, and for each row after the first

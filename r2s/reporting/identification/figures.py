@@ -15,7 +15,7 @@ from r2s.reporting.figures.log_rows import thin, without_pauses
 from r2s.reporting.figures.panels import joint_panels, log_axis, panels
 
 LONGEST = 30.0  # s of torque in a figure; more would look like a solid band
-SCANS = {  # searches in the history without comparable costs -> title and color of the shaded area
+SCANS = {  # searches whose costs in the history are not comparable -> title and color of the shaded area
     "family": ("comparison of friction families", "#9aa0a6"),
     "terms": ("choice of terms", "#57ab5a"),
     "breakaway": ("search for breakaway", "#c9a227"),
@@ -57,13 +57,13 @@ def torque_figure(
 def position_figure(
     path: Path, windows_q: np.ndarray, predicted: Mapping[str, np.ndarray], dt: float = SIM_DT
 ) -> Path:
-    """Draw the open-loop error: the difference of predicted {label: (W, S, n)} and measured windows_q (W, S, n), rad.
+    """Draw the open-loop error: |predicted - measured|, for {label: (W, S, n)} and windows_q (W, S, n), rad.
 
     `dt` is the time step of the S rows, s. Lines are medians over the W windows; bands contain 90 % of the windows.
     """
     colour, t = colours(predicted), dt * np.arange(1, windows_q.shape[1] + 1)
     title = f"open-loop error over {len(windows_q)} windows: median and 90 % band"
-    early = windows_q.shape[1] // 20  # before this row the error is the noise of the start state
+    early = windows_q.shape[1] // 20  # before this row, the error is mainly noise of the start state
     with joint_panels(path, windows_q.shape[2], title) as axes:
         for j, axis in enumerate(axes):
             bottom = np.inf

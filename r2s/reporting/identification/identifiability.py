@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """List the parameter combinations that only the prior determines; only count those of parameters kept nominal."""
+    """List combinations that only the prior determines; of those of parameters kept nominal, give just the number."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}

@@ -34,7 +34,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
     if set(LINK) & set(space.blocks):
         tables["links, nominal → identified"] = _links(robot, found)
     dynamics = found.dynamics
-    if np.any(dynamics.breakaway) and not dynamics.family.has_memory:  # laws with presliding model rest themselves
+    if np.any(dynamics.breakaway) and not dynamics.family.has_memory:  # laws with presliding model stiction
         rule = "of the net torque at the joint" if dynamics.stiction_model == "net" else "of command and offset"
         tables[f"breakaway, Nm {rule}"] = _breakaway(robot, found)
     return tables | error_tables(robot, summary)

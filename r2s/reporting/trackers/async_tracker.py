@@ -15,7 +15,7 @@ from typing import Any
 from r2s.reporting.trackers.tracker import Tracked, Tracker, flat
 
 MOST_WAITING = 10_000  # largest number of rows that wait for a slow tracker: some megabytes
-LAST_S = 60.0  # s that a run waits for each tracker at its end
+LAST_S = 60.0  # s for which a run, at its end, waits for each tracker
 FILES = ("recording.rrd", "report.html", "report.md", "parameters.yaml", "policy.onnx", "measures.json")
 
 

@@ -11,7 +11,7 @@ from r2s.files import write_json
 from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
-FILE = "trackers.json"  # file in the run folder with the trackers' run ids, which a resumed run continues
+FILE = "trackers.json"  # file in the run folder with the run's id in each tracker, which a resumed run uses again
 WRITING = Lock()  # every tracker has its own thread, and all threads write FILE
 
 

@@ -84,7 +84,7 @@ def _picture(name: str, title: str) -> rrb.View:
 
 
 def _learning_tab(curves: Iterable[Measure], pictured: bool) -> rrb.Container:
-    """Return a tab with learning curves as plots, and if `pictured` as a figure; the timeline `time` has none."""
+    """Return a tab of learning curves: plots over env_steps or wall_clock and, if `pictured`, the figure."""
     plots = _plots({m.heading: entity(LEARNING, m.title) for m in curves}, rrb.Corner2D.RightBottom)
     live = rrb.Grid(*plots, grid_columns=3, name="plots: select the timeline env_steps or wall_clock below")
     return rrb.Tabs(*[_picture(LEARNING, "figure")] * pictured, live, active_tab=0, name="learning")

@@ -30,7 +30,7 @@ def write_recording(path: str | os.PathLike, robot: Robot, content: Content) -> 
     path = Path(path)
     episodes = {label: sequence for label, sequence in content.episodes.items() if sequence}
     content = replace(content, episodes=episodes)
-    name = path.absolute().parent.name.replace(".", "-")  # the viewer stores layouts by this name, without dots
+    name = path.absolute().parent.name.replace(".", "-")  # name of the viewer's stored layout, without dots
     stream = rr.RecordingStream(f"r2s {name}")
     with atomic_write(path) as part:
         stream.save(part, default_blueprint=blueprint(robot, content))
