@@ -1,6 +1,7 @@
 """Freeze an adapter in contact, because adapters treat a contact force as a model error and push against the force.
 
-In contact, the gate keeps the torque from REWIND cycles before the contact's detection, and freezes the estimate.
+In contact, the gate freezes the estimate and returns the torque that the adapter added REWIND cycles before
+the detection.
 """
 
 from typing import Protocol

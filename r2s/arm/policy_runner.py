@@ -156,7 +156,7 @@ class PolicyRunner:
         return len(self._angles)
 
     def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
-        """Return state, effort (n,) Nm, whether the episode was stopped, and the number of filtered cycles."""
+        """Return state, effort (n,) Nm, whether the episode was stopped, and in how many cycles the filter acted."""
         driver = self._loop.driver
         return self._loop.state, driver.effort, self._stopped, driver.limited
 
@@ -219,7 +219,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Convert an `ArmState`, effort (n,) Nm, stop flag and share of filtered cycles to a `State` of one arm."""
+    """Convert an `ArmState`, effort (n,) Nm, stop flag and share of cycles with an active filter to a `State` of one arm."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],

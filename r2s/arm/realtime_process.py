@@ -204,7 +204,7 @@ class RealtimeRunner:
             serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, effort (n,) Nm, whether the episode was stopped, and the number of filtered cycles."""
+        """Return cycle, state, effort (n,) Nm, whether the episode was stopped, and cycles with an active filter."""
         while (latest := self._channel.state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")

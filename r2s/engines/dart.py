@@ -28,7 +28,7 @@ class DartEngine:
         armature: (n,) kg m^2, armature of the joints; None: the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
-    This engine has no velocity limits, as MuJoCo has none, because such limits would hide a policy's violations.
+    This engine sets no velocity limits, like MuJoCo, because such limits would hide a policy's violations.
     """
 
     def __init__(

@@ -259,7 +259,7 @@ def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def feedforward(q, parameters, frames, jacobian, memory, at, out):
-    """Add the torques that cancel friction, gravity errors, offset and drag to `out`; at: index of dq_r in memory."""
+    """Add to `out` the torques that cancel friction, gravity errors, offset and drag; at: index of dq_r in memory."""
     n = len(q)
     m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all links beyond a joint
     M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # mass and first moment of these links

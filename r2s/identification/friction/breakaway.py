@@ -90,7 +90,7 @@ class Breakaway:
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """Parameters of an identified arm that describe a joint's motion after release, for K ramps.
+    """Parameters of the motion after breakaway, predicted by an identified arm, for each of K ramps.
 
     Attributes:
         kappa: (K,) rad/s^2 per Nm, inverse inertia of the ramped joint while the other joints rest.
@@ -118,7 +118,7 @@ def estimate_breakaway(
         ramps: recorded ramps at any rate, in which the command rises from rest (falls for sign -1). For an encoder
             noise of 2e-5 rad, the error is the ramp's rate times 0.5 ms (small inertia) to 3 ms (large inertia).
         delay, lag: s, dead time and time constant between command and torque; r2s adds the hold of the command.
-        slide: parameters of the motion after release; None: use only the free fit.
+        slide: an identified arm's motion after breakaway; None: use only the fit that needs no model of the arm.
 
     Raises:
         UserError: delay or lag is out of range.

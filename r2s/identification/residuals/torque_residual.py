@@ -40,7 +40,7 @@ class TorqueResidual:
     """Immutable torque residual of a zero-phase filtered recording.
 
     The constructor computes the regressor of rigid-body torque once. Friction is computed from velocities with a
-    higher cutoff. It is then filtered like the recorded torque, so that reversals are equally smooth in both.
+    higher cutoff, then filtered as the recorded torque, so that both change equally fast when a joint reverses.
 
     Args:
         space: the parameters to estimate. recording: a recording or a planned motion, which is not filtered.
