@@ -219,7 +219,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Convert an `ArmState`, effort (n,) Nm, stop flag and share of cycles with an active filter to a `State` of one arm."""
+    """Convert an `ArmState`, effort (n,) Nm, stop flag and share of filter activity to a `State` of one arm."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
