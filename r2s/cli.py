@@ -77,7 +77,7 @@ def run_hydra(typed):
         try:
             job()
         except Exception as error:
-            if type(error).__name__ != "TerminatedWorkerError":  # of joblib
+            if type(error).__name__ != "TerminatedWorkerError":  # joblib's error
                 raise
             raise UserError(
                 "the system ended a worker of the sweep, probably because memory is short; repeat the command with "
@@ -179,7 +179,7 @@ def differing(saved, cfg, most=3, counts=lambda key: True):
 
 
 def typed_overrides(folder):
-    """Return the overrides with which the user started the run of a folder."""
+    """Return the overrides with which the user started the run in a folder."""
     from r2s.runs import read_meta
 
     words = loaded(folder / "overrides.yaml")

@@ -163,7 +163,7 @@ class Run:
         return self._meta
 
     def memo(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays that `make` computes; if checkpoints/<name>.npz exists, read the arrays from it instead.
+        """Return the arrays that `make` computes; if checkpoints/<name>.npz exists, read them from this file.
 
         A resumed run skips computations whose results are saved.
 

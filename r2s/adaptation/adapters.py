@@ -50,7 +50,7 @@ class AdapterContext:
         return apply_correction(self.arm, correction), noise
 
     def gated(self, adapter: Holdable) -> Adapter:
-        """Return the adapter; if the robot has a tool, wrap it in a `ContactGate`, which freezes it in contact."""
+        """Return the adapter; for a robot with a tool, wrap the adapter in a `ContactGate`."""
         if self.robot.tool is None:
             return adapter
         wrench = WrenchObserver(self.robot, self.dynamics)

@@ -1,6 +1,6 @@
 """Convert an identified arm to arrays for compiled functions: links, friction and latency.
 
-A table per joint represents any friction law: its columns are speeds. At the presliding deflection z in [-1, 1],
+One table per joint, whose columns are speeds, represents any friction law. At the presliding deflection z in [-1, 1],
 friction equals z times the row FORWARD (z >= 0) or BACKWARD (z < 0), plus the row SPEED_ONLY.
 """
 

@@ -25,10 +25,10 @@ from r2s.physics.robot import SIM_DT
 def detect(thresholds, floor, state):
     """Test whether a contact begins or ends, if any joint moves; friction of resting joints hides forces.
 
-    Two tests check the hypothesis that no force acts: the first tests the force, the second an impact. An
-    impact raises the filter's variances, which would hide the impact from the first test. The second test keeps the
-    covariance from before a sudden rise of the innovations, for at most IMPACT cycles, and low-passes the force,
-    because vibrating gears make the estimated force oscillate.
+    A force test and an impact test check the hypothesis that no force acts. An impact raises the filter's variances,
+    which would hide the impact from the force test. The impact test therefore keeps the covariance from before a
+    sudden rise of the innovations, for at most IMPACT cycles. The impact test low-passes the force, because vibrating
+    gears make the estimated force oscillate.
     """
     x, P, contact, calm, smooth = state.x, state.P, state.contact, state.calm, state.smooth
     n = state.joints.shape[1]

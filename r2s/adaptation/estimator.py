@@ -4,7 +4,7 @@
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A call takes about 15 us, or 50 us at the end of a span. The property `now` takes longer; it reports the payload as a
+A call takes about 15 us, or 50 us at the end of a span. Reading `now` takes longer. `now` reports the payload as a
 physical body, whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1), 2018).
 """
 
@@ -40,7 +40,7 @@ class Estimate:
     offset_half: np.ndarray
     rests: bool  # no joint slides
     odds: float  # log odds of a payload change
-    changed: bool  # a payload change was detected at this moment
+    changed: bool  # a payload change was detected in this span
     beyond: bool = False  # mass - mass_half exceeds the largest payload, to which compensation is limited
 
 
@@ -173,8 +173,8 @@ class Estimator:
 def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the physical body nearest to x (10,): mass kg, center (3,) m, tensor (3, 3) kg m^2 about the center.
 
-    The data determine mass and first moments well, so both stay unchanged. The nearest non-negative second moment
-    about the center replaces the estimate, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
+    Mass and first moments stay unchanged, as the data determine them well. The nearest non-negative second moment
+    about the center replaces the estimated one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
     """
     m = float(x[0])
     if m <= 0.0:

@@ -11,7 +11,7 @@ w = c*^2 / (c*^2 + s^2). Since c^2 - s^2 is an unbiased estimate of c*^2, r2s ch
 If |c| is below s, w is 0. The formula is the positive-part James-Stein estimator (1961) of a single number.
 
 The feedforward follows the motion without delay, but a low-pass over one span smooths the torque step at a new
-estimate. Without this low-pass, a torque step twists elastic gears, the Kalman filter mistakes the twist for a new
+estimate. Without this low-pass, a torque step twists elastic gears, the Kalman filter explains the twist by a new
 payload, and the new estimate causes another step: on an elastic development twin, steps of 30 Nm repeated at 25 Hz.
 """
 

@@ -9,7 +9,7 @@ The state of an arm with n joints has N = 10 + 4 n components:
 
 The filter processes the momentum residual of one joint after the other. Breakaway or a vibrating gear causes large
 residuals for one or two spans. Huber's function (Robust Statistics, 1981) therefore reduces the weight of innovations
-beyond HUBER standard deviations. The filter still follows a payload change, whose innovations stay large for longer.
+beyond HUBER standard deviations. The filter still follows a payload change, with large innovations for more spans.
 """
 
 from typing import NamedTuple
@@ -41,7 +41,7 @@ class Noise(NamedTuple):
     model: np.ndarray  # (n,) Nm, model error
     correlation_s: float  # s, correlation time of the model error
     reversal: np.ndarray  # (n,), added model error after a change of friction, relative to that change
-    level: np.ndarray  # (n,) Nm, as in `ArmModel`
+    level: np.ndarray  # (n,) Nm, friction level as in `ArmModel`
     breakaway: np.ndarray  # (n,) Nm, as in `ArmModel`
     inertia: np.ndarray  # (n, n) kg m^2, inertia missing in the model, mostly of rotors
     latency: np.ndarray  # (n, n) s, latency missing in the model
@@ -49,8 +49,8 @@ class Noise(NamedTuple):
     friction_drift: float  # 1/sqrt(s), random walk of relative friction
     offset_drift: np.ndarray  # (n,) Nm/sqrt(s), random walk of the offsets
     rest_drift: float  # kg^2/s, growth of the mass variance at rest, where payload changes are invisible
-    payload_drift: float  # 1/sqrt(s), relative to the payload's prior
-    adaptation: float  # growth of white noise under surprising innovations, per span; 0: none
+    payload_drift: float  # 1/sqrt(s), random walk of the payload, relative to its prior
+    adaptation: float  # growth of white noise per span while innovations exceed the prediction; 0: none
     prior: np.ndarray  # (N,) standard deviations of the initial state
     mean: np.ndarray  # (N,), mean of the initial state
 
@@ -64,12 +64,12 @@ class Filter(NamedTuple):
     information: np.ndarray  # (ONSETS, 4, 4), information matrix of the jump
     vector: np.ndarray  # (ONSETS, 4), information times the estimated jump
     counts: np.ndarray  # (5,), SPANS: all spans; AT_REST: successive spans at rest; USED, NEXT, SINCE_JUMP
-    log_odds: np.ndarray  # (2,), MEAN: log odds over all onsets; ONSET: index of the likeliest one
+    log_odds: np.ndarray  # (2,), MEAN: log of the mean odds of all onsets; ONSET: index of the likeliest onset
     innovations: np.ndarray  # (2, n) Nm and Nm^2, innovations and their variances
-    # (n,), white variance relative to `Noise`, at least 1; it grows if innovations stay large, as when a gear
-    # vibrates under a load that no recording has
+    # (n,), variance of white noise relative to `Noise`, at least 1; grows while innovations stay large, as when a
+    # gear vibrates under a load that no recording contains
     noise_scale: np.ndarray
-    work: np.ndarray  # (2, N), scratch: P h^T; variance of the friction from the payload, per joint
+    work: np.ndarray  # (2, N), scratch: P h^T; per joint, variance of friction due to the payload
 
     @staticmethod
     def fresh(noise: Noise) -> "Filter":
@@ -115,7 +115,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Increase variances for a pause of `seconds`, at most to the prior's; the payload may have changed meanwhile."""
+    """Increase variances, at most to the prior's, because the payload may change in a pause of `seconds`."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:
@@ -151,7 +151,7 @@ def _predict_joint(filter, noise, residual, j):
         P[error, error] += model**2 * (1.0 - fade * fade)
     P[error, error] += noise.reversal[j] ** 2 * noise.level[j] * residual.friction_path[j]
     most = model**2 + (2.0 * noise.reversal[j] * noise.level[j]) ** 2
-    if P[error, error] > most:  # limit to an unknown error's variance; keep the correlations
+    if P[error, error] > most:  # limit to the variance of an unknown model error; keep the correlations
         for i in range(N):
             if i != error:
                 P[error, i] *= np.sqrt(most / P[error, error])

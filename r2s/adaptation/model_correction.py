@@ -1,6 +1,6 @@
 """Correct the identified model by a fit to recordings without a payload.
 
-An identification omits model terms that hardly improve the fit. A payload estimate needs these terms, because a
+An identification omits model terms that hardly improve the fit. A payload estimate needs such terms, because a
 torque error of 0.1 Nm at a lever arm of 0.5 m looks like a mass of 20 g. The correction therefore fits the terms of
 every joint (`TERMS`), missing inertia and latency, mass and first moments of every link, and the compliance of every
 gear. Each parameter has a prior with mean zero and a typical standard deviation, so the fit is a ridge regression
@@ -43,7 +43,7 @@ class ModelCorrection(NamedTuple):
 
 
 def fit_model_correction(robot: Robot, arm: ArmModel, residuals: list[MomentumResidual]) -> ModelCorrection:
-    """Fit a correction to residuals of `arm` without a payload; joints that hardly moved get no joint terms."""
+    """Fit a correction to residuals of `arm` without a payload; terms of joints that hardly moved stay zero."""
     n = robot.n
     shared, own, y, sliding = _columns(robot, arm, residuals)
     sliding = sliding & (sliding.sum(0) >= tuning.LEAST_SPANS)
@@ -98,7 +98,7 @@ def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
 def corrected_residuals(
     robot: Robot, arm: ArmModel, correction: ModelCorrection, residuals: list[MomentumResidual]
 ) -> list[MomentumResidual]:
-    """Return residuals and friction of the corrected arm, inertia and latency included, from `residuals` of `arm`."""
+    """Convert `residuals` of `arm` to those of the corrected arm, with corrected friction, inertia and latency."""
     shared, own, y, _ = _columns(robot, arm, residuals)
     terms = own * np.concatenate([correction.joints, correction.inertia, correction.latency], 1)
     y = y - shared @ np.concatenate([correction.links.ravel(), correction.compliance]) - terms.sum(-1)

@@ -2,7 +2,7 @@
 
 The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q) (De Luca and Mattone, ICRA 2003). Let S_j be the
 screw axis of joint j about the base origin, and h_j the total momentum of all bodies that joint j moves. Then p_j is
-S_j . h_j, and element j of C^T dq is dS_j/dt . h_j, both linear in each body's mass, first moments and tensor.
+S_j . h_j, and element j of C^T dq is dS_j/dt . h_j. Both products are linear in each body's inertial parameters.
 """
 
 from typing import NamedTuple

@@ -6,7 +6,7 @@ averages at a distance of one span, T s. The residual is linear in the unknown p
 
 The moving average has triangular weights over two spans, so y averages torque by a quadratic spline over three spans.
 Elastic gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm. Sampling once per span would
-alias this vibration to a few hertz. Of a 60 Hz vibration, the triangle passes 2.4 % and the spline 0.4 %.
+alias this vibration to a few hertz. The triangle passes 2.4 % of a 60 Hz vibration, the spline 0.4 %.
 """
 
 from typing import NamedTuple
@@ -22,10 +22,10 @@ from r2s.physics.newton_euler import WORK, equations
 from r2s.physics.robot import SIM_DT
 
 CYCLE, COMMAND, ENDED = range(3)  # indices of `counts`: cycles of this span, all commands, ended spans (at most 3)
-BEFORE, INTEGRAL = range(2)  # rows of `model`, `friction`, `payload`: value a cycle ago; integral over the span
+BEFORE, INTEGRAL = range(2)  # rows of `model`, `friction`, `payload`: value in the last cycle; integral over the span
 # rows of `sums`: residual Nm s, friction Nm s, momentum Nm s, q, dq, motor torque Nm
 RESIDUAL, FRICTION, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
-# first index of `sums`: falling, rising side in this span; rising side in the last span; triangle that ended there
+# first index of `sums`: falling, rising side in this span; rising side, whole triangle of the last span
 FALLING, RISING, LAST_RISING, LAST_WHOLE = range(4)
 RISING_SUM = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of a rising side; the falling side has SPAN - 1 to 0
 STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in spans 1 and 2
@@ -45,7 +45,7 @@ class ResidualState(NamedTuple):
     sums: np.ndarray  # (4, SUMS, n), triangle sums
     payload_sums: np.ndarray  # (4, n, 10)
     motor_spans: np.ndarray  # (2, n) Nm, mean motor torque of the last two spans, latest first
-    slid: np.ndarray  # (2, n), 1 if the joint slid throughout: the last span, the span before it
+    slid: np.ndarray  # (2, n), 1 if the joint slid throughout the span; rows: last span, last but one
     terms: MomentumTerms  # terms of this cycle
     work: np.ndarray
 

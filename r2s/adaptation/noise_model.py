@@ -62,7 +62,7 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
     """Return the momentum residuals of all spans of a recording with commanded torque."""
     n, out = recording.n_joints, []
-    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # arrays as in live signals
+    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # array type of an arm's signals
     for stretch in recording.stretches:
         state, r = ResidualState.fresh(n), MomentumResidual.empty(n)
         for k in range(stretch.start, stretch.stop):
@@ -78,9 +78,9 @@ def fit_noise(
 
     The motion `train` yields a first model correction. The noise is fitted to the residuals of the corrected model in
     the motion `other`: covariances at lags of 60 to 300 ms yield a joint's model error, and the remaining variance
-    yields white noise that grows with the momentum rate. Scaling each joint's noise then matches the variance of the
-    innovations to the prediction. A common factor then limits the odds of a payload change to the number of spans.
-    Both motions determine the returned correction and the prior means of friction and offsets.
+    yields white noise that grows with the momentum rate. Each joint's noise is then scaled to give innovations the
+    predicted variance. A factor on all noise then limits the odds of a payload change to the number of spans.
+    `train` and `other` together determine the returned correction and the prior means of friction and offsets.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)
@@ -144,7 +144,7 @@ def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
 
 
 def _with_model(prior: np.ndarray, model: np.ndarray, momentum: np.ndarray) -> np.ndarray:
-    """Return a copy of `prior` with new standard deviations (n,) of the model errors and of the momentum errors."""
+    """Return a copy of `prior` with new standard deviations (n,) of the model errors and the momentum-rate errors."""
     out = prior.copy()
     out[-2 * len(model) :] = np.concatenate([model, momentum])
     return out
@@ -169,7 +169,7 @@ def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.nd
 
 
 def _largest_odds(noise: Noise, residuals: list[MomentumResidual]) -> float:
-    """Return the largest log odds of a payload change in a motion whose payload does not change."""
+    """Return the largest log odds of a payload change in a motion without payload change, after its first tenth."""
     return float(_run(noise, residuals)[2][len(residuals) // 10 :].max())
 
 

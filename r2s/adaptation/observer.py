@@ -6,7 +6,7 @@ the mean over three spans (momentum_residual.py), and tau the command after the 
 filter_s dd^/dt = d - d^ yields the estimate d^.
 
 If a joint does not slide throughout the three spans, stiction may hold it, and the residual only bounds d. The
-estimate of d then changes only as far as the bounds require, because stiction supports the arm as in training.
+estimate of d then changes only as far as the bounds require, because stiction also supports the arm in training.
 """
 
 import numpy as np

@@ -35,7 +35,7 @@ def fit_correction(
         unloaded: two recordings with commanded torque and without a payload, for example those of the identification.
             Without recordings (None), the correction is zero and the model error a tenth of the friction level.
     """
-    arm = make_arm_model(robot, replace(dynamics, declared_payload=np.zeros(4)))  # as during the identification
+    arm = make_arm_model(robot, replace(dynamics, declared_payload=np.zeros(4)))  # identification declares none
     prior = prior_of(*posterior) if posterior is not None else None
     if unloaded is None:
         return ModelCorrection.none(robot.n), default_noise(arm, prior)

@@ -1,10 +1,10 @@
 """Detect sudden payload changes (jumps), and correct the Kalman filter's estimate after a jump; compiled.
 
-This is a generalized likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). Each of the last ONSETS spans
-is a possible onset of a jump. For each onset, the test stores the Kalman filter's response to a jump (signature) and
+The generalized likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976) treats each of the last ONSETS spans
+as a possible onset of a jump. For each onset, the test stores the Kalman filter's response to a jump (signature) and
 computes the odds of a jump under a prior. If no jump occurs, the odds averaged over the onsets have expectation 1,
 and exceed x with a probability of at most 1 / x (Markov's inequality). A threshold equal to the number of tests in
-ten hours thus allows one false alarm in ten hours; one per hour is the aim, as model errors have heavier tails.
+ten hours thus allows one false alarm in ten hours. Model errors have heavier tails, so the aim is one per hour.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ MEAN, ONSET = range(2)  # indices of `Filter.log_odds`
 
 @njit(cache=True)
 def begin_onset(filter):
-    """Add the present span to the possible onsets of a jump, in place of the oldest one if all slots are used."""
+    """Add the present span to the possible onsets of a jump, in place of the oldest onset if all slots are used."""
     at = filter.counts[NEXT]
     filter.signature[at] = 0.0
     filter.information[at] = 0.0

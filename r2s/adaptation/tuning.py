@@ -1,7 +1,7 @@
 """Tuning constants of the package adaptation, each with unit and source.
 
 Constants without a named source are estimates of the order of magnitude. benchmarks/payload.py tested all constants
-together on development twins (seeds 0 to 9). Its argument NAME=VALUE changes one constant for a test.
+together on development twins (seeds 0 to 9). The benchmark's argument NAME=VALUE changes one constant for a test.
 """
 
 import numpy as np
@@ -38,7 +38,7 @@ CORRELATED_SPANS = 15  # spans with the same model error: 0.3 s, see CORRELATION
 PAYLOAD_MASS, PAYLOAD_CENTRE, PAYLOAD_TENSOR = 0.5 / np.sqrt(3), 0.5 / np.sqrt(5), 4e-3 / (3.0 * 0.15**2)
 WARMED = 0.07  # relative change of friction with temperature since the identification, standard deviation
 FRICTION_DRIFT = 0.007  # 1/sqrt(s): 7 % in 100 s
-OFFSET_DRIFTED, OFFSET_DRIFT = 0.02, 0.003  # share of the friction level; the same per sqrt(s)
+OFFSET_DRIFTED, OFFSET_DRIFT = 0.02, 0.003  # shares of the friction level: change since identification; per sqrt(s)
 # 1/s, share of the squared largest payload, 0.02 kg^2/s for a Panda's 3 kg: after 1 s, the mass interval spans the
 # masses that stiction hides, breakaway torque / (lever arm g), 0.1 to 0.25 kg
 REST_DRIFT = 0.02 / 3.0**2
@@ -52,7 +52,7 @@ LAGS = range(3, 16)  # spans, lags at which residuals no longer share the noise 
 FINEST_SHARE = 0.03  # share of the friction level: smallest model error that a fit may yield
 SECOND_HALF = 0.7  # factor on noise that was fitted to half of the motion; benchmarks/payload.py part=events,quiet
 LEAST_SCALE, MOST_SCALE, SCALINGS = 0.5, 1.5, 8  # scaling of the noise: bounds of one step, most steps
-OUTLIER = 3.0  # standard deviations at which innovations are clipped, because the filter weighs larger ones less
+OUTLIER = 3.0  # standard deviations at which innovations are clipped, as the filter weights larger ones less
 
 # Kalman filter (kalman.py)
 MOMENTUM_CORRELATION = 5.0  # correlation time of the momentum-rate error, in CORRELATION_S
@@ -70,60 +70,60 @@ SETTLING_SPANS = round(0.5 / T)  # spans after a rest in which the payload is co
 REPLACED = 2.0 * chi2.isf(T / 3600.0, 4)
 
 # reported estimate (estimator.py)
-LEAST_MASS = 0.02 / 3.0  # share of the largest payload, 0.02 kg of a Panda's 3 kg: a smaller mass gets no center
+LEAST_MASS = 0.02 / 3.0  # share of the largest payload, 0.02 kg of a Panda's 3 kg: no center for a smaller mass
 FRICTION_CURVE = 0.02  # share of friction: error of its speed dependence, which one factor cannot represent
 
 # feedforward (feedforward.py)
 BLENDING = -np.expm1(-SIM_DT / T)  # per cycle: a new estimate takes effect over one span
 ACCELERATION_S = 1 / RATE  # s, low-pass of accelerations: a loop of this rate tolerates the latency of an arm
 
-# wrench (wrench_filter.py, wrench.py); benchmarks/wrench.py measures them on independent arms and twins in contact
+# wrench (wrench_filter.py, wrench.py); benchmarks/wrench.py tests the values on independent arms and twins in contact
 SPEED_NOISE, ANGLE_NOISE = 3e-3, 2e-5  # rad/s, rad: sensors of a Panda, for all arms
-ANGLE_RATE = 60.0  # 1/s, crossover: slower motion from angles, faster motion from measured speeds
-SLOW_RATE, FAST_RATE = 40.0, 200.0  # 1/s, low-passes of the speed: to detect rest, for friction
+ANGLE_RATE = 60.0  # 1/s, crossover: speeds of slow motion from angles, of fast motion from measured speeds
+SLOW_RATE, FAST_RATE = 40.0, 200.0  # 1/s, low-passes of the speed (slow speed, fast speed)
 LAG = SLOW_RATE / (FAST_RATE - SLOW_RATE)  # lag of the fast low-pass at constant acceleration / (fast - slow speed)
-# shares of the speed noise: a joint moves if its slow speed is above the first (four standard deviations); it rests
-# if its fast speed is below the third, and its slow speed below the second or STILL cycles have passed
+# times the speed noise: a joint moves if its slow speed is above MOVES (four standard deviations); a joint rests if
+# its fast speed is below STILL_SPEED, and its slow speed is below RESTS or STILL cycles have passed
 MOVES, RESTS, STILL_SPEED, STILL = 0.4, 0.2, 1.2, 25
-REVERSES = 1.2  # times the speed noise: a larger fast speed determines the side of friction
-SIDE_NOISE = 1.0  # times the speed noise: standard deviation of the speed that determines the side of friction
+REVERSES = 1.2  # times the speed noise: a larger speed determines the direction of friction (side)
+SIDE_NOISE = 1.0  # times the speed noise: standard deviation of the speed that determines the side
 CREPT, CREEP_RATE = 1.5, 50.0  # times the angle noise: displacement of a creeping joint; 1/s, its low-pass
 # shares of the squared distance of the breakaway edges: friction variance in the middle of presliding, in motion; at
 # rest, if the friction family has bristles
 BRISTLES, BRISTLES_AT_REST = 0.06, 0.02
 MOMENTUM_NOISE = 1.33  # times the speed noise: white noise of the filtered speeds in momenta
-# 1/s, high-pass of momenta; 1/s, low-pass of its square; factor from the result to momentum noise (vibrating gears)
+# 1/s, high-pass of momenta; 1/s, low-pass of the square; factor on the mean square: momentum noise
 SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
 FRICTION_NOISE_S = 0.02  # s, correlation time of the friction model's error
 # friction error: share of the friction level, plus share of the least tau_max, 3 mNm for a Panda's wrist of 12 Nm
 WRENCH_FRICTION, LEAST_FRICTION = 0.03, 3e-3 / 12.0
 INERTIA_SHARE = 0.05  # inertia error, as a share of a joint's net torque
 STIFFNESS = 4e4  # N/m, assumed stiffness of the surroundings: force per motion of the tip
-FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s, s: largest force rate from STIFFNESS, its correlation time
-TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s, if innovations exceed TOUCH variances; gain of their low-pass
+FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s, largest force rate from STIFFNESS; s, correlation time of the force rate
+TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s, if innovations exceed TOUCH variances; gain of a low-pass
 HAND_RATE = 0.3  # N/sqrt(s), random walk of the force, also on an arm at rest
-EDGE_SHARE = 0.7  # per cycle: share by which a resting joint's friction is moved back to its edge
-# share of the force variance that a creeping tip would cause in a stiff environment; the same with bristles, where
+EDGE_SHARE = 0.7  # per cycle: share by which friction beyond a breakaway edge is moved back to the edge
+# share of the force variance that a creeping tip would cause on stiff surroundings; this share with bristles, where
 # joints creep without breaking away (a surface of 9e4 N/m)
 CREEP_SHARE, BRISTLE_CREEP = 0.3, 5.0
 MOMENT_ARM = 0.1  # m, lever arm of forces on an arm without a tool, which scales the moment
 FREE_FORCE = 0.1  # N, standard deviation of the force at the beginning of a motion
 # N per kg of the largest payload, per axis, 0.25 N for a Panda's 3 kg: error beyond the filter's covariance
 FORCE_FLOOR = 0.25 / 3.0
-CONFIRMED, RELEASED = 15, 50  # cycles above the threshold until a contact begins, below RELEASE until it ends
-RELEASE = 0.25  # threshold of release, share of the contact threshold
+CONFIRMED, RELEASED = 15, 50  # cycles above the contact threshold until a contact begins, below RELEASE until it ends
+RELEASE = 0.25  # share of the contact threshold: a smaller squared force ends a contact
 # cycles for which the impact test keeps a covariance, longer than stiff impacts; 1/s, low-pass of the force
 IMPACT, IMPACT_RATE = 30, 100.0
-SUDDEN, USUAL_RATE = 2.0, 1.0  # an impact exceeds this multiple of the usual innovations; 1/s, their low-pass
-BLOCK_S, TAIL = 0.5, 0.2  # s per maximum; share of the largest maxima from which the tail is fitted
+SUDDEN, USUAL_RATE = 2.0, 1.0  # an impact exceeds this multiple of the usual innovations; 1/s, for their mean
+BLOCK_S, TAIL = 0.5, 0.2  # s of motion per maximum; share of the maxima, the largest, in the tail fit
 ALARMS_PER_HOUR = 1.0
 # m, path of the tip after which a force that points down is a weight; share of the force that may be horizontal; path
-# subtracted per path with another force
+# subtracted per path along which the force does not point down
 WEIGHT_PATH, WEIGHT_SHARE, WEIGHT_LOSS = 0.05, 0.3, 5.0
-UNCALIBRATED = 2.0  # contact threshold / threshold for Gaussian noise, without recordings of free motion
+UNCALIBRATED = 2.0  # without recordings: contact threshold / GAUSSIAN (wrench.py)
 
 # wrench with a surface (wrench_fusion.py)
 DIFFERENCE_RATE, TEST_RATE, DEPTH_RATE = 50.0, 10.0, 100.0  # 1/s, low-passes: force difference, its test, depth rate
 REFUSED = 3.0  # standard deviations of the tested difference: an error of momentum lasts for seconds
 SURFACE_DRAWS = 16  # largest number of posterior draws
-SURFACE_SHARE, SURFACE_FLOOR = 0.02, 0.15  # share of the force; N: error of the law on left-out presses
+SURFACE_SHARE, SURFACE_FLOOR = 0.02, 0.15  # error of the law on held-out presses: share of the force; N

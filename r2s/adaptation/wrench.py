@@ -5,13 +5,13 @@
     observer.force, observer.force_half, observer.in_contact
 
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
-tool (wrench_filter.py). A contact begins when the squared force, in units of its covariance, exceeds a threshold for
-15 ms while a joint moves: a chi-square test of the hypothesis that no force acts. A second test detects impacts
-(contact_detection.py). Together, both tests aim at one false alarm per hour of similar motion. The least threshold,
-GAUSSIAN, assumes independent normal errors in each cycle. For larger errors, `contact_thresholds` computes the
-thresholds from recordings without contact: the largest squared force of each half second has an exponential tail
-(extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997,
-section 3.3), which the function extrapolates to an hour. Without such recordings, only the first test is used.
+tool (wrench_filter.py). A contact begins when the squared force, in units of the force's covariance, exceeds a
+threshold for 15 ms while a joint moves. This force test is a chi-square test of the hypothesis that no force acts. An
+impact test detects impacts (contact_detection.py). The two tests together aim at one false alarm per hour. The least
+threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors, `contact_thresholds` computes
+the thresholds from recordings without contact. The largest squared force of each half second has an exponential tail
+(extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, 3.3),
+which is extrapolated to an hour. Without recordings, the observer uses only the force test.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,8 +34,8 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 ALARMS_PER_TEST = tuning.ALARMS_PER_HOUR / 2  # per hour
-GAUSSIAN = float(chi2.isf(ALARMS_PER_TEST * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
-SQUARES = ["square", "impact_square"]  # columns of the tests
+GAUSSIAN = float(chi2.isf(ALARMS_PER_TEST * SIM_DT / 3600.0, 3))  # threshold for independent normal errors
+SQUARES = ["square", "impact_square"]  # columns with the squared forces of the two contact tests
 BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; fewest blocks for a threshold
 
 
@@ -48,8 +48,8 @@ class WrenchObserver:
         tool: tool of the robot; None for a robot without a tool.
 
     Args:
-        robot, dynamics: the identified arm. thresholds: contact thresholds; None: twice GAUSSIAN, without the test
-            for impacts.
+        robot, dynamics: the identified arm. thresholds: as the attribute; None: twice GAUSSIAN for the force test,
+            and no impact test.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):
@@ -91,7 +91,7 @@ class WrenchObserver:
     def carry(self, payload: np.ndarray) -> None:
         """Set the inertial parameters (10,) of a payload that the model lacks, in the payload frame (momentum.py)."""
         n, state = len(self._arm.level), self._state
-        state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # the payload's current momentum
+        state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # momentum of the change of payload
         state.payload[:] = payload
 
     @property
@@ -101,7 +101,7 @@ class WrenchObserver:
 
     @property
     def hangs(self) -> bool:
-        """Whether the force is a payload's weight, because it pointed down while the tip moved by 5 cm."""
+        """Whether the force pointed down along 5 cm of the tip's path, and therefore is a payload's weight."""
         return bool(self._state.contact[HANGING] > tuning.WEIGHT_PATH)
 
     @property
@@ -136,7 +136,7 @@ class WrenchObserver:
 
     @property
     def squares(self) -> np.ndarray:
-        """(2,), squared forces of both tests; a contact begins once one exceeds its threshold for 15 ms."""
+        """(2,), squared forces of force test and impact test; `thresholds` are their limits."""
         return self._state.contact[[SQUARE, IMPACT_SQUARE]]
 
     @property
@@ -167,7 +167,7 @@ def observe_recording(
     """Return a table with one row per millisecond: wrench, half widths of its 95 % intervals, contact, tip position.
 
     Args:
-        estimator: estimates the payload, whose effect is subtracted. With a tool, contact freezes this estimate.
+        estimator: estimates a payload, whose effect is subtracted; with a tool, contact freezes the estimate.
         report: called with each new estimate of the payload.
     """
     recording = at_rate(robot, recording)
@@ -191,7 +191,7 @@ def observe_recording(
             rows[k] = np.concatenate([[recording.t[k]], values, [touches], observer.squares, observer.tip])
             if touches and not (k > stretch.start and rows[k - 1, touch]):
                 begun = k
-            if observer.hangs:  # a payload's weight: no contact since `begun`
+            if observer.hangs:  # the force is a payload's weight: erase the contact from row `begun` on
                 rows[begun:k, touch] = 0.0
     names = [f"force_{c}_N" for c in "xyz"] + [f"moment_{c}_Nm" for c in "xyz"]
     columns = [c for name in names[: len(observer.wrench)] for c in (name, f"{name}_half")]

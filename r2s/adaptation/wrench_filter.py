@@ -6,14 +6,14 @@ measured in every cycle (momentum.py). Momentum obeys dp/dt = u - f + J^T wrench
 and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 
 The uncertainty of a joint's friction depends on whether the joint moves (wrench_friction.py).
-- A joint in motion measures the wrench precisely, because the joint's friction error b is small and has a short
-  correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain.
-- A joint at rest only bounds the wrench. The friction of this joint balances all other torques, and may be any torque
-  between the negative and the positive breakaway torque (edges). The variance of this friction is at most that of a
-  uniform distribution between the edges. If the friction family has bristles, their deflection, and so the friction,
-  follows from the angle of the joint, with a smaller variance.
-The filter assumes that the wrench changes as the tip moves, as in a stiff environment. If all joints rest, only a
-person's hand can change the force, and friction hides changes between the edges.
+- The momentum of a joint in motion determines the wrench precisely, because the friction error b is small and has a
+  short correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain.
+- A joint at rest only bounds the wrench. Friction at rest balances all other torques, and may be any torque between
+  the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of a
+  uniform distribution between the edges. If the friction family has bristles, the joint angle determines the bristle
+  deflection, and so friction, with a smaller variance.
+The filter assumes that the wrench changes as the tip moves on stiff surroundings. If all joints rest, the filter
+assumes that only a person's hand changes the force. Joint friction hides any change below breakaway.
 """
 
 import numpy as np
@@ -49,7 +49,7 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def update_wrench(arm, tip, noise, thresholds, state, q, dq, tau):
-    """Process one cycle; `state.x` and `state.P` begin with the wrench and its covariance.
+    """Process one cycle; the first elements of `state.x` and `state.P` are the wrench and its covariance.
 
     Args:
         arm: `ArmModel`. tip: (3,) m, position of the tip in the last link's frame. noise: `WrenchNoise`.
@@ -62,7 +62,7 @@ def update_wrench(arm, tip, noise, thresholds, state, q, dq, tau):
         joints[ANCHOR] = q
     share, slow, fast = SIM_DT * tuning.ANGLE_RATE, SIM_DT * tuning.SLOW_RATE, SIM_DT * tuning.FAST_RATE
     speed = state.column[:n]
-    for j in range(n):  # speed from dq at high and from q at low frequencies, without lag
+    for j in range(n):  # complementary filter: speed from dq at high and from q at low frequencies
         speed[j] = dq[j] + (q[j] - joints[ANGLE, j]) * tuning.ANGLE_RATE
         joints[ANGLE, j] += share * (q[j] - joints[ANGLE, j]) + SIM_DT * dq[j]
         joints[SLOW, j] += slow * (speed[j] - joints[SLOW, j])
@@ -93,14 +93,14 @@ def update_wrench(arm, tip, noise, thresholds, state, q, dq, tau):
     weigh(arm, state)
     counts[CYCLE] += 1
     state.commands[counts[COMMAND] % SLOTS] = tau
-    delay = arm.latency[0] - EARLY  # no semi-implicit step here
+    delay = arm.latency[0] - EARLY  # EARLY is for simulations only
     motor_torque(state.commands, joints[MOTOR], counts[COMMAND], delay, arm.latency[1], joints[MOTOR_MEAN])
     counts[COMMAND] += 1
 
 
 @njit(cache=True, error_model="numpy")
 def _shake(state):
-    """Update each joint's mean squared high-frequency momentum, which is due to gear vibration."""
+    """Update the mean square of each joint's high-frequency momentum, which gear vibration causes."""
     joints, rate = state.joints, SIM_DT * tuning.SHAKE_BAND
     for j in range(joints.shape[1]):
         if state.counts[CYCLE] == 0:
@@ -174,7 +174,7 @@ def _predict(noise, state):
 def _hidden(noise, joints, j):
     """Return mean, Nm, and variance, Nm^2, of the friction of joint j at rest, before a measurement.
 
-    With bristles, the angle determines the friction; else it may lie anywhere between the breakaway edges.
+    With bristles, the angle determines friction; else friction may lie anywhere between the breakaway edges.
     """
     square = (noise.edges[j, 1] - noise.edges[j, 0]) ** 2
     if noise.presliding[j] > 0.0:
@@ -229,7 +229,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Limit the friction of joints at rest to the breakaway torques (edges), its variance to that of `_hidden`."""
+    """For each joint at rest, limit friction to the breakaway torques (edges), and variance to that of `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)
@@ -241,7 +241,7 @@ def _keep_within_edges(noise, state):
             mean, hidden = _hidden(noise, joints, j)
             if variance > hidden:
                 _update(state, gain, mean - friction, hidden * variance / (variance - hidden))
-            if beyond != 0.0:  # P is unchanged: in later cycles, the same edge adds no information
+            if beyond != 0.0:  # leave P unchanged: repeated use of an edge adds no information
                 state.x[:] += tuning.EDGE_SHARE * beyond / max(variance, 1e-9) * (P @ gain)
 
 

@@ -93,11 +93,11 @@ def known_torque(arm, noise, state, q):
                 P[b + j, b + j] = noise.friction[j] ** 2
             joints[FRICTION, j] = model
         else:
-            if not rested:  # friction balances all other torques: no error
+            if not rested:  # friction at rest follows from the torque balance, without a model error
                 x[b + j] = 0.0
                 P[b + j] = 0.0
                 P[:, b + j] = 0.0
-            if noise.presliding[j] > 0.0:  # the angle shows the bristles' deflection
+            if noise.presliding[j] > 0.0:  # the angle determines the bristles' deflection
                 moved = joints[MOVED, j]
                 side = 1.0 if moved > 0.0 else -1.0
                 joints[FRICTION, j] = _model(arm, noise, state, j, q[j], side, 0.0, abs(moved))[0]
@@ -148,11 +148,11 @@ def _unlagged(joints, j):
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, of friction whose direction is wrong with probability p: 4 f^2 p (1 - p)."""
+    """Return the variance, Nm^2, of friction f with wrong sign (probability p), 4 f^2 p (1 - p), and presliding."""
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # approximately the normal cdf
-    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # for presliding, whose law is known only roughly
+    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # presliding, whose law is uncertain
     return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent)
 
 

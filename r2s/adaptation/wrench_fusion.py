@@ -6,8 +6,8 @@ Kalman update along the normal n combines F_s with the force F from momentum, wh
 F + P n (F_s - n . F) / (n . P n + s^2). A low-pass first filters F_s - n . F, because the measured angles are noisy.
 
 The force F_s is wrong if the tip touches a different surface or if the identified surface has moved. An innovation
-test (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore refuses a surface
-if the low-passed difference exceeds REFUSED standard deviations. The estimate ignores a refused surface until the
+test (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore rejects a surface
+if the low-passed innovation exceeds REFUSED standard deviations. The estimate ignores a rejected surface until the
 motion ends, because with a small force any surface would pass the test.
 """
 
@@ -44,7 +44,7 @@ def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle
 
 
 class FusedWrench(WrenchObserver):
-    """A `WrenchObserver` whose force estimate also uses an identified surface; contact detection does not.
+    """A `WrenchObserver` whose force estimate also uses an identified surface; contact detection ignores the surface.
 
     Args:
         surface: identified surface. draws: samples of its posterior (r2s/identification/contact/contact_file.py).
@@ -68,7 +68,7 @@ class FusedWrench(WrenchObserver):
         super().__init__(robot, dynamics, thresholds)
 
     def begin(self) -> None:
-        """Start a motion from rest, and trust the surface again if an earlier motion refused it."""
+        """Start a motion from rest, and use the surface again, even if the innovation test rejected it before."""
         super().begin()
         self._memory = np.zeros(6)
         self._memory[TRUSTED] = 1.0
@@ -106,7 +106,7 @@ class FusedWrench(WrenchObserver):
 
 @njit(cache=True, error_model="numpy")
 def surface_force(law, k, tip, rate):
-    """Return normal force, N, and depth, m, of a tip (3,) m that penetrates at `rate` m/s, by row k of `law.law`."""
+    """Return force, N, and depth, m, of a tip (3,) m that penetrates at `rate` m/s, from row k of `law.law`."""
     row = law.law[k]
     depth = law.radius
     for c in range(3):

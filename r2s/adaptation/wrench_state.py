@@ -16,9 +16,9 @@ COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
 # above its threshold; SURPRISE over the last second; cycles since a sudden rise of SURPRISE above it
 SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, USUAL, SURPRISED, ENTRIES = range(11)
 # rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; successive slow cycles; reference angle at
-# rest, motion since, creep of this cycle, rad; modeled friction now, a cycle ago, Nm; known torque without motor and
-# friction, mean of the last cycle with both, motor torque, its mean in the coming cycle, Nm; variance of the measured
-# momentum (Nm s)^2; presliding deflection; two low-passes of the momentum Nm s, mean square of its fast part
+# rest, motion since rest began, creep of this cycle, rad; modeled friction now, a cycle ago, Nm; known torque without
+# motor and friction, mean known torque with both, motor torque, its mean in the coming cycle, Nm; variance of the
+# measured momentum (Nm s)^2; presliding deflection; two low-passes of the momentum Nm s, mean square of its fast part
 ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
 MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)
 
@@ -45,7 +45,7 @@ class WrenchState(NamedTuple):
     contact: np.ndarray  # (ENTRIES,), see SURPRISE to SURPRISED
     calm: np.ndarray  # (3, 3) N^2, covariance of the force in the impact test
     smooth: np.ndarray  # (3,) N, low-passed force in the impact test
-    payload: np.ndarray  # (10,), payload beyond the model, in the payload frame (momentum.py)
+    payload: np.ndarray  # (10,), parameters of a payload that the model lacks, in the payload frame (momentum.py)
     commands: np.ndarray  # (SLOTS, n) Nm, the last commands
     place: np.ndarray  # (3,) m, tip in the base frame
     jacobian: np.ndarray  # (6, n), Jacobian of the tip's position (3 rows) and rotation (3 rows)

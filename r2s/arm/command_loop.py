@@ -3,7 +3,7 @@
 Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives
 only the driver's torques; tests/test_command_loop.py checks that no other code commands an arm. Every cycle checks
 for a stop request (r2s/arm/stop_request.py). Once the driver has brought the arm to rest, the loop ends the arm's
-motion and raises ArmStopped with the reason.
+motion and raises ArmStopped with the reason of the stop.
 """
 
 import time
@@ -23,10 +23,10 @@ from r2s.physics.robot import SIM_DT
 # Settings of `CommandLoop.rest`, which damps a moving arm; the values are our choice
 REST_S = 0.5  # s, longest duration
 REST_RATE = 15.0  # 1/s, decay rate of the joint speeds under damping
-REST_SHARE = 0.2  # of tau_max, limit of the damping torque
+REST_SHARE = 0.2  # share of tau_max, limit of the damping torque
 STILL = 0.02  # rad/s, a slower joint is treated as at rest
 SLIDING = 0.05  # rad/s, replaces STILL after SLIDES_S: damping cannot stop a joint that friction does not hold
-SLIDES_S = 0.04  # s
+SLIDES_S = 0.04  # s, see SLIDING
 
 
 class CommandLoop:
@@ -40,8 +40,8 @@ class CommandLoop:
     Args:
         arm: the arm. driver: limits the torques of all motions of this loop.
         log: receives (state, torque) of every cycle before the torque is sent.
-        adapter: called once per cycle; its torque is added in the next cycle. If the adapter raises an exception, the
-            driver receives no more commands and so stops the arm; then the loop raises this exception.
+        adapter: called once per cycle; the driver adds its torque in the next cycle. If the adapter raises an
+            exception, the driver receives no more commands and so stops the arm; then the loop raises the exception.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class CommandLoop:
     def rest(self, hold: np.ndarray | None = None) -> None:
         """Damp the motion for at most 0.5 s, until the arm rests under the command `hold` (n,) Nm.
 
-        If the arm is not in contact, `resist` adjusts `hold` so that it brakes joints that continue to move.
+        Unless the arm is in contact, `resist` adjusts `hold` to brake the joints that continue to move.
         If `hold` is None, as after a contact, the final command is zero.
         """
         inertia, robot = 1 / np.diag(self._inverse(self.state.q[None])[0]), self.arm.robot
@@ -142,7 +142,7 @@ class CommandLoop:
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:
-        """Complete a stop that the driver began before the motion ended, and raise ArmStopped with the reason.
+        """If the driver is stopping the arm, complete the stop and raise ArmStopped with the reason.
 
         Raises:
             StopRequested, ArmStopped: as `__call__`.
@@ -153,7 +153,7 @@ class CommandLoop:
     def halt(self, reason: str) -> None:
         """Damp the arm to rest under zero command, and raise ArmStopped with `reason`.
 
-        If the driver is already stopping the arm, do nothing, because this stop causes the deviation.
+        If the driver is already stopping the arm, do nothing, because a stop itself leads off the planned motion.
         """
         if self.driver.stopping is not None:
             return

@@ -30,7 +30,7 @@ STILL = 0.02  # rad/s, a slower joint is treated as at rest
 # rad/s, natural frequency of the spring that `resist` adds to a joint that keeps sliding during a stop. Our choice:
 # half of RATE of the safety filter, because the filter damps this spring.
 SPRING = 15.0
-RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while it drives a moving joint; our choice
+RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while driving a moving joint; our choice
 ADDED = 0.3  # share of tau_max that an adapter may add; enough for friction and 1.5 kg anywhere in a Panda's reach
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
 TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` would come too near
@@ -46,7 +46,7 @@ class Memory(NamedTuple):
         held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop without contact still applies this sum.
         share: (m,), factor on the allowed speeds, which is 1 in a motion and decreases in a stop (`_brake`).
         cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, and the stop's start.
-        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the filter changed a torque.
+        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the safety filter acted.
         rests: (m,), whether each arm is at rest. commanded: (m,), whether each arm has received a command.
         least: (m, K) m, smallest allowed distances between the bodies of the fence's K pairs.
         push: (m, COLUMNS), parameters and state of the push limit (push_limit.py); (m, 0): no push limit.
@@ -214,8 +214,8 @@ def drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
-        q, dq: (m, n) rad, rad/s, measured. applied: (m, n) Nm, torques of the last cycle. given, bounds, model: see
-            the classes. control: number and parameters of the control law. memory: `Memory`, updated in place.
+        q, dq: (m, n) rad, rad/s, measured. applied: (m, n) Nm, torques of the last cycle. given, bounds, model:
+            see the classes. control: number and parameters of the control law. memory: `Memory`, updated in place.
     """
     out, (m, n) = np.empty_like(memory.sent), q.shape
     number, parameters = control

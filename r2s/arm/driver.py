@@ -2,7 +2,7 @@
 
 Each cycle checks that the command is finite and recent (watchdog). The control law (r2s/physics/control_laws.py)
 computes a target torque, which passes soft start and low-pass. The torque of an adapter (r2s/adaptation/adapter.py)
-is added. The same safety filter as in training (r2s/physics/safety_filter.py) limits the sum. Finally, the
+is added. The safety filter, which training also uses (r2s/physics/safety_filter.py), limits the sum. Finally, the
 driver limits the change from the torque that the arm applied in the last cycle. The driver has no clock and no
 connection to an arm: states and commands are its only inputs, so tests can run it on a million adversarial inputs.
 
@@ -43,11 +43,11 @@ DEADLINE_S = 0.05  # s; the driver stops an arm without a new finite command for
 PERIODS = 2.5  # control periods of the policy
 DAMP_S = 0.5  # s, longest time to bring an arm to rest
 Q_INSIDE = 0.02  # rad; the driver stops an arm that comes this close to a position limit
-DQ_INSIDE = 0.95  # share of the velocity limits above which the driver stops the arm
+DQ_INSIDE = 0.95  # the driver stops an arm above this share of a velocity limit
 
 
 def spring(robot: Robot) -> np.ndarray:
-    """Return the stiffness (n,) Nm/rad that `resist` needs, from the nominal inertia in the home posture."""
+    """Return the spring stiffness (n,) Nm/rad for `resist`, from the nominal inertia in the home posture."""
     return SPRING**2 / np.diag(InverseInertia(robot)(robot.q_home[None])[0])
 
 
@@ -61,8 +61,8 @@ class DriverBatch:
         robot: provides limits and nominal links. torque: (n,) Nm, largest target torque of each joint.
         m: number of arms. cutoff_hz: cutoff of the low-pass. period_s: s, time between two policy commands.
         soft_start_s: s over which the target torque fades in at the start of a motion; 0: no fade.
-        friction: (n,) Nm, friction level of each joint. rotors: (n,) kg m^2, see `Dynamics.armature`; None: those of
-            `robot`. control: control law that maps commands to torques; None: commands are torques (n,) Nm.
+        friction: (n,) Nm, friction level of each joint. rotors: (n,) kg m^2, as `Dynamics.armature`; None: as
+            `robot.armature`. control: control law that maps commands to torques; None: commands are torques (n,) Nm.
         fence: pairs of bodies; the driver stops an arm before the bodies of a pair touch; None: no fence.
         speed_share: factor on all allowed speeds, in (0, 1].
         push_limit: limits the contact force and the approach speed of the robot's tool; None: no limit.
@@ -128,7 +128,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, torque that a stop applies: compensation, and contact torque if the stop holds a contact."""
+        """(m, n) Nm, torque of a stop: adapter torque and `hold`, plus contact torque if the stop holds a contact."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -136,7 +136,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether the driver has a `push_limit`, so that a stop can hold, release or retreat from a contact."""
+        """Whether the driver has a `push_limit`, so that a stop can hold a contact, release the tool, or retreat."""
         return bool(len(self._push))
 
     @property
@@ -170,7 +170,7 @@ class DriverBatch:
                 an arm's adapter torque is not finite, the driver ignores this torque and the arm's new command.
             hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. A stop
                 still applies the last sum of `hold` and `added`, clipped to ADDED * tau_max.
-            contact: (m,), whether each arm is in contact; None: no contact. Stops in contact apply no compensation.
+            contact: (m,), whether each arm is in contact; None: False. In contact, a stop omits `hold` and `added`.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)
@@ -232,12 +232,12 @@ class Driver:
 
     @property
     def held(self) -> np.ndarray:
-        """(n,) Nm, torque that a stop still applies, see `DriverBatch.held`; in contact, compensation is zero."""
+        """(n,) Nm, torque that a stop still applies; see `DriverBatch.held`."""
         return self._drivers.held[0]
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop can hold, release or retreat from a contact; see `DriverBatch.decides_contact`."""
+        """Whether a stop can hold a contact, release the tool, or retreat; see `DriverBatch.decides_contact`."""
         return self._drivers.decides_contact
 
     @property

@@ -1,6 +1,6 @@
 """Run episodes on a twin in parallel: each chunk of goals runs on a new twin with the same seed.
 
-The division into chunks does not depend on the number of cores, so neither do the results. Each chunk has its own
+The results do not depend on the number of cores, because the division into chunks does not. Each chunk has its own
 stream of sensor noise. A twin with temperature-dependent friction is cold at the start of each chunk.
 """
 
@@ -63,7 +63,7 @@ def run_parallel_episodes(
             done[chunk] = _run_chunk(job, chunk, after(chunk * CHUNK))
     else:
         context = multiprocessing.get_context("fork")
-        finished = context.Value("l", 0)  # goals, of all processes
+        finished = context.Value("l", 0)  # goals that all processes have finished
         with ProcessPoolExecutor(min(workers, len(chunks)), context, _initialize, (job, finished)) as pool:
             waiting = {pool.submit(_run_as_process, chunk): chunk for chunk in chunks}
             try:
@@ -75,7 +75,7 @@ def run_parallel_episodes(
                 raise UserError(
                     "a process that ran episodes was killed, as for lack of memory; threads=1 runs all in one process"
                 ) from None
-            except BaseException:  # Ctrl-C does not wait for the episodes that run
+            except BaseException:  # on Ctrl-C, do not wait for running episodes
                 for process in multiprocessing.active_children():
                     process.terminate()
                 raise
@@ -90,7 +90,7 @@ def run_parallel_episodes(
     return replace(each[0], **together), [stop for _, stops, _ in parts for stop in stops], timing
 
 
-_job: Any = None  # arguments that a forked process got from `_initialize`
+_job: Any = None  # arguments that a forked process received from `_initialize`
 _finished: Any = None  # shared number of finished goals
 
 

@@ -24,9 +24,9 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import State, Task
 
-LOGGED_S = 1.0  # s before a stop that are logged, at 1 kHz
-SMOOTHING_CYCLES = 20  # cycles on each side of a cycle; the speed error from encoder noise is then 2e-4 rad/s
-ATTEMPTS = 3  # most attempts to bring an `Operated` arm to its start; the operator must agree to each new one
+LOGGED_S = 1.0  # s of motion before a stop that are logged, at 1 kHz
+SMOOTHING_CYCLES = 20  # cycles, half window of `smooth_speeds`: encoder noise causes a speed error of 2e-4 rad/s
+ATTEMPTS = 3  # most attempts to bring an `Operated` arm to its start; the operator must agree to each new attempt
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Stop:
     """Why an episode ended early.
 
     Attributes:
-        episode: number from 0. when: time in the episode, or "on the way to its start". reason: reason of the stop.
+        episode: index from 0. when: time in the episode, or "on the way to its start". reason: reason of the stop.
         log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, command Nm.
     """
 
@@ -68,7 +68,7 @@ class PolicyRunner:
 
     Attributes:
         stops: stops that ended episodes early. timing: see `Timing`.
-        done: number of `place` calls after which `halted` was None, even if the arm stopped on the way.
+        done: number of episodes begun: `place` calls after which `halted` was None.
         speeds: (1, T, n) rad/s, joint speeds after each control step of the last episode, see `smooth_speeds`.
         halted: why no further episode runs: a request to stop, the operator's refusal after a stop, or too many
             failed attempts to reach a start. None: not halted.
@@ -111,8 +111,8 @@ class PolicyRunner:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move to starts (1, n) rad and begin episode `first` there.
 
-        If the arm stops on the way, the episode ends. An `Operated` arm makes up to ATTEMPTS attempts if its operator
-        agrees to each new one. If the operator refuses or all attempts fail, this and later episodes do not run.
+        If the arm stops on the way, the episode ends. An `Operated` arm makes up to ATTEMPTS attempts if the operator
+        agrees to each new attempt. If the operator refuses or all attempts fail, no episode runs from now on.
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []
@@ -156,7 +156,7 @@ class PolicyRunner:
         return len(self._angles)
 
     def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
-        """Return state, effort (n,) Nm, whether the episode was stopped, and in how many cycles the filter acted."""
+        """Return state, effort (n,) Nm, whether stopped, and in how many cycles the safety filter acted."""
         driver = self._loop.driver
         return self._loop.state, driver.effort, self._stopped, driver.limited
 
@@ -219,7 +219,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Convert an `ArmState`, effort (n,) Nm, stop flag and share of filter activity to a `State` of one arm."""
+    """Convert an `ArmState`, effort (n,) Nm, stop flag and filter rate to a `State` of one arm."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],

@@ -72,7 +72,7 @@ def record_presses(
     The rows have the format of `r2s.arm.recorder.record`. The recorded time has gaps of PAUSE_S between paths.
 
     Args:
-        arm: moves above the start of each path, and is always stopped at the end. dynamics: the arm's dynamics.
+        arm: moves above the start of each path, and always stops at the end. dynamics: the arm's dynamics.
         seed: random seed of the paths. progress: called after every path with (paths done, total).
         timing: receives the durations of the cycles.
 

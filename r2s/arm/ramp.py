@@ -23,20 +23,20 @@ from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 # The ramp
-SLOW_TAU_MAX = 40.0  # Nm: joints with at least this tau_max have a large inertia, move late, and get a slower ramp
+SLOW_TAU_MAX = 40.0  # Nm: joints with at least this tau_max have a large inertia and get a slower ramp
 SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; at 4 Nm/s light links move visibly within ms
 MAX_SHARE = 0.2  # share of tau_max, default for the largest torque of a ramp
 AFTER_MOTION = 5  # cycles recorded after the joint has moved
-STRAY = DEVIATION  # rad: a ramp ends if any joint moves this far; an arm this far from its pose moves back to it
+STRAY = DEVIATION  # rad: a ramp ends if any joint moves this far; an arm this far off its pose returns to the pose
 POSE_MARGIN = 0.15  # rad from a pose to the position limits; more than any joint moves in one ramp
-UNFILTERED_HZ = 1e30  # disables the driver's low-pass: a ramp has no steps, and joints at rest need a command of 0
-# The stop after a ramp: a PID controller with three equal real poles brakes each joint, then the torque is released
+UNFILTERED_HZ = 1e30  # disables the driver's low-pass, because a ramp has no steps to smooth
+# The stop after a ramp: a PID controller with three equal real poles brakes each joint, then the torque fades out
 BANDWIDTH = 20.0  # rad/s, of the three poles: well damped with 5 ms of delay and 3 ms of lag
 DAMPED_CYCLES = 20  # cycles of damping only, because a spring would slowly pull a joint back to where braking began
-BRAKE_SHARE = 0.1  # share of tau_max for braking: small enough that the rate limit adds no delay
+BRAKE_SHARE = 0.1  # largest braking torque / tau_max: so small that the rate limit adds no delay
 BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; attempts to stop before the next ramp starts anyway
-RELEASE_CYCLES = 10  # cycles of the release, of the rest before a ramp, and of mean angles for speeds in braking
-# rad/s, mean speeds: release begins with all joints below SLOW, the next joint below STILL; rest: below SLIDING
+RELEASE_CYCLES = 10  # cycles in which the torque fades, of the rest before a ramp, and of mean angles in braking
+# rad/s, mean speeds: braking ends with all joints below SLOW, the next joint below STILL; at rest: below SLIDING
 SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
@@ -69,14 +69,14 @@ def ramp(
     all other joints stay 0. The ramp ends when the joint has moved by MOVED, its command reaches `largest`, or any
     joint has moved by STRAY. The recording omits the stop after each ramp. The rows have the format of
     `r2s.arm.recorder`. If the error of gravity compensation exceeds a joint's friction, the joint slides at zero
-    command. Braking then finds a constant command that stops this joint, and the joint's ramp starts at this command.
+    command. Braking finds the constant command that stops such a joint; the joint's ramp starts at this command.
 
     Args:
-        arm: moves to each pose, and is always stopped at the end.
-        poses: (P, n) rad, at least 0.15 rad inside the position limits. The arm does not move if it would come too
-            close to the table or to itself, at a pose or on the way (r2s/excitation/paths.py).
+        arm: the arm, which moves to each pose and always stops at the end.
+        poses: (P, n) rad, at least 0.15 rad inside the position limits. No motion starts if the arm would come too
+            close to the table or to itself at a pose or on a path (r2s/excitation/paths.py).
         rate: (n,) or one number, Nm/s, slope of the ramps; default: 2.2 for joints with tau_max of at least 40 Nm, 4
-            for weaker joints, and proportionally less below 12 Nm.
+            for weaker joints, and in proportion to tau_max below 12 Nm.
         largest: (n,) or one number, Nm, largest command of a ramp; default 20 % of tau_max.
         progress: called after every ramp with (ramps done, total); it must return within the 1 kHz cycle.
         timing: receives the durations of the cycles.
@@ -94,7 +94,7 @@ def ramp(
     # all joints in one direction, then in the other, so that each joint rests in between
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
-    # the ramp of a joint that slid starts at the command that stopped it; 2 * most bounds the unknown friction
+    # most: a ramp's largest command, plus the command that stops a sliding joint; 2 * most bounds friction
     most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
     timing = timing or Timing()
     how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot), "speed_share": speed_share(arm)}
@@ -152,7 +152,7 @@ class _Drive:
         return self._loop.state
 
     def settle(self) -> None:
-        """Raise ArmStopped if the driver is bringing the arm to rest."""
+        """If the driver is stopping the arm, complete the stop and raise ArmStopped."""
         self._loop.settle()
 
     def end(self) -> None:
@@ -189,7 +189,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints (`next_joint` below STILL), then release their torque; repeat if a joint still moves."""
+        """Brake all joints (`next_joint` below STILL), then fade the torque out; repeat if a joint still moves."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -198,7 +198,7 @@ class _Drive:
             still = self.rest()
             if still.all():
                 return
-            if attempt:  # not in the first attempt, after which bristles that spring back may cause motion
+            if attempt:  # not after the first attempt, when bristles that spring back may cause motion
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:
@@ -251,7 +251,7 @@ def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.nd
 
 
 def _positive(name: str, value, default: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Return `value`, by default `default`, as (n,); raise UserError unless all elements are in (0, `most`]."""
+    """Return `value` (None: `default`) as an array (n,); raise UserError unless all elements are in (0, `most`]."""
     n = len(default)
     array = per_joint(f"ramp.{name}", default if value is None else value, n, f"{n} joints")
     good = (array > 0) & (array <= most)

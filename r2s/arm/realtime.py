@@ -1,4 +1,4 @@
-"""Set the computer up for real time during a motion, and measure timing to see whether the settings suffice."""
+"""Prepare the computer for real time during a motion, and measure whether commands arrive in time."""
 
 import ctypes
 import gc
@@ -18,7 +18,7 @@ PRIORITY = 80  # of SCHED_FIFO; libfranka's own thread has the highest, 99
 SWITCH_S = 1e-4  # longest wait for Python's global lock while another thread computes; the default is 5 ms
 LOCK_ALL = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT of mlockall(2): pages stay in memory after first use
 LEAST_SUCCESS = 0.99  # share of the commands that must reach the arm in time
-SUCCESS_CYCLES = 100  # cycles over which the arm averages its success rate; before that the average is incomplete
+SUCCESS_CYCLES = 100  # cycles over which the arm averages its success rate; earlier averages are incomplete
 _warned: set[str] = set()
 
 

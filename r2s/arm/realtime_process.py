@@ -34,9 +34,9 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot
 from r2s.tasks.task import State, Task
 
-START_S = 240.0  # longest time for the process to import, compile and connect to its arm
+START_S = 240.0  # longest time for the arm's process to import, compile and connect to the arm
 POLL_S = 2e-4  # s between two reads of shared memory, a fifth of a cycle
-EXIT_S = 5.0  # s for the arm to come to rest at the end; its process gets SIGTERM after 2 EXIT_S, SIGKILL after 4
+EXIT_S = 5.0  # s for the arm to come to rest at the end; 2 EXIT_S: SIGTERM to the arm's process, 4 EXIT_S: SIGKILL
 READ_ATTEMPTS = 10  # most attempts to read a slot that is being written; then `Slot.read` returns None
 
 
@@ -95,13 +95,13 @@ class Channel(NamedTuple):
 class RealtimeRunner:
     """Runs episodes on an arm, with its driver, in a separate process; implements `r2s.tasks.rollout.Arms`.
 
-    `with RealtimeRunner(...) as arms`: the process opens the arm, and always stops and closes it at the end.
+    `with RealtimeRunner(...) as arms`: the arm's process opens the arm, and stops and closes the arm at the end.
 
     Attributes:
         robot: the arm's model. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
-        open_arm: picklable function that opens the arm in its process; returns the arm or a context manager for it.
+        open_arm: picklable function that the arm's process calls; opens and returns the arm, or its context manager.
         robot: a model with the arm's number of joints. task, friction: see `PolicyRunner`.
         settings: further arguments of `PolicyRunner`; an adapter runs in the arm's process.
 
@@ -204,7 +204,7 @@ class RealtimeRunner:
             serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, effort (n,) Nm, whether the episode was stopped, and cycles with an active filter."""
+        """Return cycle, state, effort (n,) Nm, whether stopped, and in how many cycles the safety filter acted."""
         while (latest := self._channel.state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")
@@ -222,7 +222,7 @@ class RealtimeRunner:
         return state
 
     def _receive(self, kind: str, timeout_s: float | None = None) -> Any:
-        """Return the next message of this kind from the arm's process; meanwhile, ask the operator if required."""
+        """Return the next message `kind` from the arm's process; pass the arm's questions on to the operator."""
         try:
             while True:
                 if timeout_s is not None and not self._line.poll(timeout_s):
@@ -247,7 +247,7 @@ def _serve(
     channel: Channel,
 ) -> None:
     """Open the arm, run the requested episodes, and end when the policy's process closes the connection `line`."""
-    os.setsid()  # so that signals of the terminal reach only the other process
+    os.setsid()  # so that signals of the terminal reach only the policy's process
 
     def forward(reason: str) -> bool:
         line.send(("operator", reason))
@@ -265,14 +265,14 @@ def _serve(
             stack.callback(arm.stop)
             operator = None
             if isinstance(arm, Operated):
-                operator, arm.operator = arm.operator, forward  # the other process has the terminal
+                operator, arm.operator = arm.operator, forward  # the policy's process has the terminal
             runner = PolicyRunner(arm, task, **settings)
             line.send(("ready", (arm.robot, operator)))
             while True:
                 _, starts, first = line.recv()
                 _run_episode(runner, starts, first, line, channel)
     except (EOFError, ConnectionError):
-        return  # the other process has ended
+        return  # the policy's process has ended
     except Stopped as error:
         line.send(("failed", ArmStopped(f"the process that drives the arm received {error}")))
     except Exception as error:
@@ -297,7 +297,7 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
-    """Wait for the first command of the episode, then yield a new command, or None, for each cycle until the end.
+    """Wait for the first command of an episode, then yield a new command or None for each cycle of the episode.
 
     Args:
         last: number of commands that the policy wrote in earlier episodes.

@@ -1,4 +1,4 @@
-"""Record an excitation on an arm, simulated or real, with the same code and the same safety checks."""
+"""Record an excitation on an arm; a simulated and a real arm share all code and safety checks."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +24,7 @@ from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
 
-TORQUE_SHARE = 0.8  # share of tau_max that the driver allows; the same as in excitation/motion_checks.py
+TORQUE_SHARE = 0.8  # share of tau_max that the driver allows; equal to that in excitation/motion_checks.py
 PROGRESS_EVERY = 500  # cycles
 MIN_ROWS = 100  # a stopped recording with fewer rows is discarded
 

@@ -89,7 +89,7 @@ class SimulatedArm:
         n = self.robot.n
         q = self._sim.q[0] + self._noise[0] * self._rng.normal(size=n)
         dq = self._sim.dq[0] + self._noise[1] * self._rng.normal(size=n)
-        # the simulation excludes gravity, so this tau_J is a copy of the command: do not record it as 'measured'
+        # the simulation excludes gravity, so tau_J is a copy of the command: do not record tau_J as 'measured'
         carried, declared = (
             mass_and_moment(self.robot, x) for x in (self._payload if self._carries else None, self.declared_payload)
         )

@@ -16,13 +16,13 @@ from r2s.errors import Stopped
 
 # signals of a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; no process can handle SIGKILL and SIGSTOP
 SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP)
-PARENT = "R2S_PARENT"  # environment variable: pid of the process whose end stops every motion here
-FOLLOW_S = 0.1  # s between two checks that the parent still runs
+PARENT = "R2S_PARENT"  # environment variable: pid of the process whose end stops every motion of this process
+FOLLOW_S = 0.1  # s between two checks whether the parent process still runs
 GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s each) before a KeyboardInterrupt
 
 
 class _Request:
-    """The stop request of this process; `ending`: a motion stops because of it; `served`: no motion runs any more."""
+    """The stop request of this process; `ending`: a motion is stopping; `served`: no motion runs any more."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -97,8 +97,8 @@ def handled_signals(
     """Convert each signal of SIGNALS to a stop request while an arm is open in this process.
 
     If no motion has responded GRACE_S after the request, the main thread gets a KeyboardInterrupt, and this context
-    raises `Stopped` with the signal's name. If its block ends before a motion has responded, the context also raises
-    `Stopped`, as later code may move the arm. The context acts only in the main thread, as Python requires.
+    raises `Stopped` with the signal's name. The context also raises `Stopped` if its block ends before a motion has
+    responded, as code after the block may move the arm. The context acts only in the main thread, as Python requires.
 
     Args:
         forward: function that the signal handler calls with each signal's number.

@@ -50,7 +50,7 @@ class TrackingController:
         self._theta = np.zeros((3, robot.n))
         friction = friction_margin(robot)
         self._theta_max = np.array([OFFSET_SHARE * robot.tau_max, friction, friction])
-        # inertia of each joint with the other joints free; a joint of small inertia must adapt slowly
+        # inertia of each joint without torque on the other joints; the estimate of a light joint must adapt slowly
         inertia = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
         self._gain = ADAPTATION_RATE * SIM_DT * BANDWIDTH**2 * inertia  # Nm per rad/s, see `__call__`
         self._correction = CORRECTION_SHARE * robot.tau_max
@@ -89,8 +89,8 @@ class TrackingController:
 class LoadedTrackingController(TrackingController):
     """Tracking controller for an arm with an undeclared payload of up to half the mass that the arm can carry.
 
-    The gains assume half of this payload, as otherwise the sag of a strong joint would swing the wrist. Limits of
-    deviation and correction are larger than in `TrackingController`.
+    The gains assume half of the largest undeclared payload, as otherwise the sag of a strong joint would swing the
+    wrist. Limits of deviation and correction are larger than in `TrackingController`.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):

@@ -17,7 +17,7 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import Task
 
-CYCLES = 200  # cycles at rest and cycles in motion: ten times the span of an estimator
+CYCLES = 200  # cycles at rest and cycles in motion: ten spans of the momentum residual
 SWING_RAD, SWING_HZ = 0.05, 1.0  # up to 0.3 rad/s: every joint slides
 RAMP_NM = 0.02  # Nm, largest torque of the ramps; it is so low that each ramp ends at once
 

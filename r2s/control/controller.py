@@ -11,7 +11,7 @@ from r2s.physics.robot import Robot
 
 
 class ControlledTask(Protocol):
-    """The interface of a task to its controller.
+    """Interface through which a controller uses a task.
 
     Attributes:
         ctrl_hz: policy rate, Hz. cutoff_hz: cutoff of the low-pass on the torque, Hz.

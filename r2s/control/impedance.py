@@ -1,8 +1,8 @@
 """`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs to a target; actions set target or stiffness.
 
 r2s/physics/impedance_laws.py contains the control laws; this module computes their parameters from arm, task and
-model. Default values scale with the arm: a spring's force is a share of the torque limit divided by the lever arm at
-home, and a spring's stiffness is this force divided by a distance, or less if the loop's latency requires it.
+model. Default values scale with the arm: a spring's largest force is a share of the torque limit over the lever arm
+at home. A spring's stiffness is the largest force over a distance, or less if the loop's latency requires it.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from r2s.physics.newton_euler import COM, LINK, MASS, links_of
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 
 ACTIONS = ("target", "stiffness", "both")
-# springs' share of the force that the torque limit allows in all directions at home; rest: damping, feedforward
+# springs' share of the force that the torque limit allows in all directions at home; damping and feedforward use more
 CLIP = 0.7
 CLIP_M = 0.05  # m, error at which the default spring saturates
 
@@ -46,7 +46,7 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Number of values: target; if `hybrid`, normal (3), force, measured force, flag; if `slides`, pull (3)."""
+        """Size of a setpoint: target; if `hybrid`, normal (3), force, measured force, flag; if `slides`, pull (3)."""
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
@@ -166,16 +166,16 @@ def cartesian_impedance(
     Args:
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
         displacement, rotation: m and rad, shift and rotation of the target by an action of 1.
-        stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less so as not to exceed `fastest_spring`.
-        rotational_stiffness: Nm/rad, largest; 0: the orientation is free, and only the null-space springs act on it.
+        stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less if `fastest_spring` requires less.
+        rotational_stiffness: Nm/rad, largest stiffness; 0: only the null-space springs act on the orientation.
         force_clip: N, largest spring force at the largest stiffness, at most the force F that the torque limit allows
-            in all directions in the home posture; None: CLIP F. moment_clip: Nm, largest spring moment, likewise.
+            in all directions in the home posture; None: CLIP F. moment_clip: Nm, the analogous moment limit.
         null_stiffness: 1/rad, each joint's null-space stiffness towards home as a multiple of its torque limit.
-        hybrid: whether a force acts along a surface normal, and the impedance in tangential directions. An action
+        hybrid: whether a force acts along a surface normal; the impedance acts along the surface. An action
             that displaces the target against the normal adds a force stiffness * displacement. If `task.approaches`,
             the target moves into the surface; the spring limits the force, so the tip is no faster than the target.
-        normal: (3,) in the base frame, out of the surface. force: N, against the normal. None: the task's contact.
-        integral_rate: 1/s, integral gain on a measured force error. integral_max: largest integral over force_clip.
+        normal: (3,) out of the surface, base frame. force: N, desired push against `normal`. None: the task's values.
+        integral_rate: 1/s, integral gain on a measured force error. integral_max: integral limit / force_clip.
 
     Raises:
         UserError: the task has no target or contact, or a setting is out of its range.
@@ -263,7 +263,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Check and return a force or moment; None: CLIP times the one that `limit` allows in all directions at home."""
+    """Check and return a force or moment; None: CLIP times the largest that `limit` allows in all directions."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most

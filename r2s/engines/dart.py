@@ -1,7 +1,7 @@
 """Simulate an arm in DART with the settings of Gazebo's physics plugin, for Sim2Sim transfer and the rigid twin.
 
 DART has semi-implicit Euler steps, implicit joint damping, hard position limits and exact Coulomb friction. With
-these settings DART agrees with Gazebo's plugin to round-off, and with MuJoCo to 1e-15 rad over 0.1 s.
+the plugin's settings, DART agrees with the plugin to round-off, and with MuJoCo to 1e-15 rad over 0.1 s.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class DartEngine:
         armature: (n,) kg m^2, armature of the joints; None: the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
-    This engine sets no velocity limits, like MuJoCo, because such limits would hide a policy's violations.
+    Like MuJoCo, this engine has no velocity limits, because velocity limits would hide a policy's violations.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class GazeboClassicEngine:
     """An arm in a `gzserver` process, which ends when this object is deleted.
 
     Each command acts for one step. ODE solves the joint constraints iteratively, so the motion with ODE differs from
-    MuJoCo's by about 1e-4 m after 1 s. The motion with DART does not differ from MuJoCo's.
+    MuJoCo's by about 1e-4 m after 1 s. The motion with DART agrees with MuJoCo's to round-off.
 
     Args:
         robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.

@@ -2,8 +2,8 @@
 
 The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
 T-RA 13(5), 1997. A prior prevents unidentifiable quantities from dominating the determinant. Only motion at several
-speeds determines friction curves and delay. So the motion consists of rungs: sections of the series at 10 % to 100 %
-of full speed, with rests between them. Slow rungs also run backwards, so that joints reverse at low speed.
+speeds determines friction curves and delay, so the motion consists of rungs: sections of the series at 10 % to 100 %
+of full speed, separated by rests. Slow rungs also run backwards, so that joints reverse at low speed.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from r2s.excitation.motion_checks import (
 )
 from r2s.physics.robot import SIM_DT, Robot
 
-# Speed ladder: paces relative to full speed.
+# Ladders, sequences of rungs from slow to fast; a pace is a speed relative to full speed.
 SLOWEST = 0.1
 REVERSES_BELOW = 0.4  # pace below which a rung also runs backwards for a part of its length
 RUNG_S = 4.0  # s, approximate duration of a rung with its rest
@@ -40,7 +40,7 @@ LEAST_S = 5 * BLEND_S
 TOP_HZ = 1.0  # frequency of the highest harmonic at full speed
 DECAY = 1.5  # harmonic k has an amplitude proportional to k^-DECAY: the acceleration limit bounds high harmonics
 SHORTEST_S = 4.0  # s, minimum fundamental period
-RANGE = 0.8  # share of the distance from the center to the nearer position limit, or of pi rad if that is less
+RANGE = 0.8  # share of the distance from the center to the nearer position limit, or of pi rad if pi is less
 SPEED = 0.65  # share of dq_max
 ACCELERATION = 0.7  # share of ddq_max
 STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then the joint catches up at a higher speed
@@ -51,7 +51,7 @@ TRIES = 5  # candidates per step of the local search
 MIN_AMPLITUDE = 0.3  # share of a joint's largest amplitude; a series that is safe only below this share is dropped
 MARGIN = 0.3  # least `_safety`: 0.3 of a clearance and 0.03 of tau_max, a reserve for motion between two samples
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
-FINE = 10  # ratio of two sample rates: that of limits over that of information and safety
+FINE = 10  # ratio of the sample rate for limits to the sample rate for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
 Samples = tuple[np.ndarray, ...]  # offset from the center, velocity, acceleration
 # Scores (B,) of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)
@@ -73,13 +73,13 @@ def fourier(
 
     A random series uses up to 80 % of the position range, 65 % of the velocity limit and 70 % of the acceleration
     limit, and less near obstacles. A local search changes the series to increase the motion's `information`. The
-    motion ends within the series' period, so it does not repeat itself. Equal arguments produce equal motions.
+    motion ends within the series' period, so no part of the motion repeats. Equal arguments produce equal motions.
 
     Args:
         robot: limits, links and nominal model.
         duration: s, including the rests at both ends.
         seed: random seed.
-        gravity: see `information`.
+        gravity: whether the recorded torque is link-side torque, with gravity; see `information`.
         effort: number of motions that the local search tries; 0: return the first safe random series.
         q_center: (n,) rad, center posture; default: the middle of the position range.
         table: m, height of the table in the base frame; -inf: no table.
@@ -113,7 +113,7 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions (x, a): coefficients x (2 H, n) of a series, amplitudes a (n,) as shares of the largest.
+    """Candidate motions (x, a): coefficients x (2 H, n) of a series, a (n,) as shares of the largest amplitudes.
 
     A joint's limits determine the joint's largest amplitude; the coefficients x determine only the motion's shape.
 
@@ -194,7 +194,7 @@ class Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the motion at 1 kHz, with amplitudes that are safe at GEOMETRY_HZ; None if one becomes too small."""
+        """Return the motion at 1 kHz, with amplitudes reduced until safe at GEOMETRY_HZ; None if one is too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))

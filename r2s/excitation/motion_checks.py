@@ -23,7 +23,7 @@ DEVIATION = 0.05  # rad; if all joints deviate by this angle, the links must sti
 FAR_M = 0.1  # m, at larger distances the distance of bounding spheres is accurate enough
 GEOMETRY_HZ = 100
 TORQUE_SHARE = 0.8  # share of tau_max for |gravity| + |dynamics| + friction
-FRICTION_SHARE = 0.15  # share of tau_max for friction; a Panda's joint 5 has 0.14
+FRICTION_SHARE = 0.15  # largest friction as a share of tau_max; 0.14 on joint 5 of a Panda
 FRICTION_ROOT = 0.5  # sqrt(Nm); the friction of strong joints is at most FRICTION_ROOT * sqrt(tau_max)
 
 
@@ -50,7 +50,7 @@ def check_motion(
         motion: the motion, sampled at 1 kHz.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
-        space: a `Space`, for example with obstacles, that replaces table and z_min; None: a `Space` with these two.
+        space: a `Space`, such as one with obstacles, that replaces table and z_min; None: `Space(table, z_min)`.
     """
     check_shape(robot, motion)
     check_limits(robot, motion)
@@ -124,7 +124,7 @@ def check_derivatives(robot: Robot, motion: Motion) -> None:
 
 
 def check_torque(robot: Robot, motion: Motion) -> None:
-    """Raise UserError if a motion's torque, with nominal model and `friction_margin`, exceeds 80 % of its limit."""
+    """Raise UserError if a motion's torque, with nominal model and `friction_margin`, exceeds 80 % of tau_max."""
     rows = geometry_rows(motion)
     share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
     bad = np.argwhere(~(share <= TORQUE_SHARE))
@@ -177,8 +177,8 @@ class Space:
     an arm stops beyond its `DeviationLimits`, which depend on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, smallest required distances: end effector above z_min (only a scale for fourier.py, since
-            `gaps` requires 0 m), then links above the table, then between the geoms of each pair.
+        clearance: (K,) m, smallest required distances: end effector above z_min (only fourier.py uses it, as a scale;
+            `gaps` requires 0 m), then geoms above the table, then the two geoms of each pair.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -218,7 +218,7 @@ class Space:
             )
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # so that an arm can return to a low home posture
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
-        # the largest required distance is half of that at home, or `clearance`, so that an arm may return home
+        # required distances are at most `clearance` or half of those at home, so that an arm may return home
         self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:

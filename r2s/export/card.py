@@ -75,7 +75,7 @@ def card(
 
 
 def contacts(contract: Mapping[str, Any]) -> str:
-    """Return the model card's words for contacts that did not occur in the training."""
+    """Return a phrase on contacts that did not occur in the training, for the model card."""
     return "no contact but of the tip" if contract["goal"]["kind"] == "surface" else "no contact"
 
 

@@ -45,7 +45,7 @@ class InverseDynamics:
     def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
         """Return the setpoints (rows, 3 n + n n) for the first `rows` rows of a joint motion (T, n) sampled at `hz`.
 
-        A setpoint contains feedforward, Nm, q_d, dq_d and the flattened mass matrix; its computation takes over 1 ms.
+        A setpoint contains feedforward, Nm, q_d, dq_d and the flattened mass matrix. Computing one takes over 1 ms.
         """
         n = q.shape[1]
         out = np.empty((rows, 3 * n + n * n))

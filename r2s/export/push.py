@@ -21,7 +21,7 @@ BEGINS, PRESSES, CLEAR = range(3)  # phases of a stop, before OVER
 
 
 class PushLimit:
-    """Limit one arm's contact force; in every cycle call `see`, then during a stop `stop`, and at last `limit`.
+    """Limit one arm's contact force; in every cycle call `see`, then `stop` if the arm stops, then `limit`.
 
     Args:
         law: a contract's entry `law`. model: the arm's `Model`; in every cycle, call `model.place(q)` before `see`.
@@ -83,7 +83,7 @@ class PushLimit:
         return most - own
 
     def limit(self, effort: np.ndarray, last: np.ndarray, bounded: Callable[..., Any]) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within all bounds nearest to `effort` (n,) Nm, and whether this torque differs.
+        """Return the torque (n,) Nm within all bounds nearest to `effort` (n,) Nm, and whether the two differ.
 
         bounded: function of torque and bias torque in contact, (n,) Nm each; limits the torque to the joint bounds.
         """

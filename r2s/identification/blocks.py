@@ -9,7 +9,7 @@ import numpy as np
 
 BLOCK_S = 0.5  # s, shortest block
 BLOCKS = 20, 400  # fewest and most blocks; few blocks make the scatter uncertain, many blocks cost time
-LENGTH = 5.0  # correlation times per block; a block sum's variance, over length, is then 90 % of a long block's
+LENGTH = 5.0  # correlation times per block; var(sum) / length of a block is then 90 % of the limit for long blocks
 WINDOW = 5.0  # correlation times; beyond this lag, autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
 LONGEST_S = 60.0  # s, longest lag of the autocorrelation
 REPEATED = 0.3  # relative growth of variance due to repetition above which blocks join repetitions
@@ -27,7 +27,7 @@ def blocks_of(
 
     Args:
         t: (T,) s, rising within a trajectory. q: (T, n) rad, joint angles. period: s, period of the motion, or None.
-        residual: (T, n), residual of a fit; None: each block lasts `shortest_s`, and no block joins repetitions.
+        residual: (T, n), residual of a fit; None: blocks last at least `shortest_s` and join no repetitions.
     """
     run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of the trajectory; the clock restarts in each
     steps = np.diff(t)[np.diff(run) == 0]
@@ -59,7 +59,7 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
     """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,) s.
 
-    This time is the integral of the squared autocorrelation, an upper bound even if residual times slope oscillates.
+    This time is the integral of the squared autocorrelation, an upper bound also for residual times Jacobian.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))

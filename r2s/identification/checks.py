@@ -39,7 +39,7 @@ def check_rate(cutoff_hz: float, recording: Recording) -> None:
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if the recording is from a different arm, exceeds `robot`'s limits or has little motion."""
+    """Raise UserError if the recording has a wrong number of joints, exceeds position limits or has little motion."""
     _check_joints(robot, recording, "the recording")
     moved = np.ptp(recording.q, axis=0)
     if moved.max() < MOVED or recording.duration < LEAST_S:
@@ -73,7 +73,7 @@ def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
 
 
 def check_ramps(robot: Robot, ramps: Ramps) -> None:
-    """Raise UserError if the ramps come from a different arm, exceed `robot`'s limits or are not in SI units."""
+    """Raise UserError if ramps have a wrong number of joints, exceed position limits or are not in SI units."""
     _check_joints(robot, ramps.recording, "the ramps")
     most = np.abs(ramps.recording.tau).max(0)
     j = int((most / robot.tau_max).argmax())

@@ -1,8 +1,8 @@
 """Assess what each of several recordings adds to an identification, and whether one contradicts the others.
 
-Two further fits assess each recording: a fit without this recording, and a fit to this recording alone. These fits
+Two further fits assess each recording: a fit without the recording, and a fit to the recording alone. Both fits
 start from the fit to all recordings, so that few least-squares steps on torque suffice. The residual of a fit to one
-recording alone sets this recording's weights, because contradicting recordings increase the residual of a common fit.
+recording alone sets the recording's weights, because contradicting recordings increase the residual of a common fit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,7 +36,7 @@ class Contribution:
         label, torque, seconds: name, kind of torque and length of the recording. use: "training" or "validation".
         rmse: (n,) Nm, error of the fit to all recordings.
         left_out: (n,) Nm, error of a fit without this recording; None for a validation recording.
-        narrower: (P,), 95 % interval widths without this recording over those with it; None for validation.
+        narrower: (P,), ratio of 95 % interval widths without and with this recording; None for validation.
         alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio of sums of squares, see
             CONTRADICTS; 1 for one recording. body_kg: mass on the last link that explains the contradiction, or nan.
     """
@@ -91,7 +91,7 @@ def contributions(
 def validated(
     found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
 ) -> list[Contribution]:
-    """Return the contributions of validation recordings {label: recording}, which contain only the error `rmse`."""
+    """Return contributions of the validation recordings {label: recording}, with `rmse` as the only error."""
     out = []
     for label, r in recordings.items():
         data = _torque(found.space, r, cutoff_hz)
@@ -132,7 +132,7 @@ def _rmse(error: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
-    """Return the additional mass on the last link, kg, that explains a torque error (T, n) Nm; nan: no mass does."""
+    """Return the additional mass on the last link, kg, that explains a torque error (T, n) Nm, or nan."""
     some = data.seen.ravel()
     y = data.rigid_body_of_last_link()
     rows, tau = y.reshape(-1, y.shape[-1])[some], -error.ravel()[some]
@@ -142,7 +142,7 @@ def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
 
 
 def contradictions(parts: Sequence[Contribution]) -> list[str]:
-    """Return 0 or 1 messages: a recording contradicts the others, or the model fits it far worse."""
+    """Return [message] if a recording contradicts the others or has a far larger torque error, else []."""
     trained = [p for p in parts if p.left_out is not None and p.alone is not None]
     if len(trained) < 2:
         return []

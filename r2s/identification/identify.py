@@ -1,6 +1,6 @@
 """Real2Sim: estimate the parameters with which the simulated arm reproduces a recording.
 
-`identify` runs STEPS in order. Each step computes a new `State` from the previous one. The paper's algorithm
+`identify` runs STEPS in order. Each step computes a new `State` from the previous `State`. The paper's algorithm
 corresponds to search=ga on the replay residual, eq. (8) of the paper.
 """
 
@@ -91,9 +91,9 @@ class State:
     Attributes:
         robot, nominal, recording, searches, settings, ramps: see `identify`. `select_family` sets nominal.family.
         prior: {parameter: prior standard deviation in SI units}. terms: model terms to estimate besides friction.
-        unpruned: the terms before `prune_terms` removed some; () if it removed none.
-        families: {friction family: prediction error of held-out torque}; empty if the user chose the family.
-        space: the parameter space; `fit_breakaway` and `fit_stiction` add their breakaway and stiction values.
+        unpruned: terms before the removal by `prune_terms`; () if `prune_terms` removed no term.
+        families: {friction family: relative error of held-out torque}; empty if the user chose the family.
+        space: the parameter space; `fit_breakaway` adds breakaway commands, `fit_stiction` the stiction model.
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
         edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
             sliding, only for friction families with a Stribeck effect.
@@ -157,19 +157,19 @@ def identify(
     report: Report = lambda row: None,
     memo: Memo = lambda name, make: make(),
 ) -> IdentificationResult:
-    """Estimate the parameters of an arm, with intervals.
+    """Estimate the parameters of an arm and their 95 % intervals.
 
     Args:
-        robot: the arm. nominal: start of the searches, and values of all parameters that are not estimated.
+        robot: the arm. nominal: dynamics at which searches start; parameters that are not estimated stay nominal.
         recording: the training motion; only commanded torque allows replay residuals.
         searches: one or more searches; each starts at the solution of the previous one.
         settings: options of the identification, see settings.py.
-        ramps: recordings of the breakaway protocol; without ramps, replays of `recording` find breakaway torques.
+        ramps: recorded ramps; without ramps, replays of `recording` determine the breakaway torques.
         report: function that is called with a row of progress after every step or generation.
         memo: function memo(name, make) that returns the arrays stored under `name`, else the result of make().
 
     Raises:
-        UserError: the recording does not fit the arm or hardly moves.
+        UserError: the recording does not fit the arm or contains too little motion, or a stated value is wrong.
     """
     check_motion(robot, recording)
     check_stated(settings.stated, robot.n)
@@ -196,7 +196,7 @@ def select_family(s: State) -> State:
 
 
 def settle_lateness(s: State) -> State:
-    """Decide whether to correct the lateness of link-side torque and of dq; without a delay, `signal_delay` is 0."""
+    """Decide whether to correct late link-side torque and dq; if torque stays as logged, set `signal_delay` to 0."""
     nominal = replace(s.nominal, late_alike=False)
     if s.recording.torque != "measured" or DELAY in s.settings.stated:
         return replace(s, nominal=nominal)
@@ -233,9 +233,9 @@ def draw_full_model(s: State) -> dict[str, np.ndarray]:
     """Return posterior draws (S, P) of the kept values on the unit cube, from a fit with all terms and wide priors.
 
     Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
-    compensates for a removed one, for example a payload for the error of a link's mass. Priors of the main fit serve
-    prediction and can be narrower than the scatter among arms, which narrows the intervals further. The result's
-    intervals count draws of both models equally (Hoeting et al., Statistical Science 14(4), 1999).
+    compensates for a removed one, for example a payload for the error of a link's mass. The main fit's priors, chosen
+    for prediction, narrow intervals further if the scatter among arms is wider. For the result's intervals, draws of
+    the full and the selected model have equal weight (Hoeting et al., Statistical Science 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
     u, problem = fit_torque(full.problem.with_usual_prior())
@@ -246,13 +246,13 @@ def draw_full_model(s: State) -> dict[str, np.ndarray]:
 def formulate(s: State) -> State:
     """Set up the parameter space, the residuals and the problem."""
     how, memory = s.settings, s.nominal.family.has_memory
-    settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # stays at 0, see `settle_lateness`
+    settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # DELAY stays 0, see `settle_lateness`
     space = search_space(s.robot, s.nominal, how.bounds, [*s.terms, *settled], s.recording, how.stated)
     s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # so that blocks join repetitions
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
     edges = estimate_breakaway(s.ramps) if s.commanded and s.ramps is not None else None
-    # for a family with memory, replays start from unknown bristle deflections and would spoil a good torque fit
+    # for a family with memory, replays start from unknown bristle deflections and would worsen a good torque fit
     if s.commanded and not all(map(fits_torque, s.searches)) and not (memory and fits_torque(s.searches[0])):
         slowest = 0.0 if memory else CLEAR * s.nominal.dq_min  # bristles have no dead zone
         released = None
@@ -274,7 +274,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the user's prior, completed for all other values by that of an earlier identification, or None."""
+    """Return the user's prior and, for all other values, an earlier identification's prior; None without either."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated
@@ -283,7 +283,7 @@ def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, Array
 
 
 def fit(s: State) -> State:
-    """Run the searches in order; discard a replay fit that explains the torque of moving joints clearly worse."""
+    """Run the searches in order; discard a replay fit that explains torque clearly worse than the torque fit."""
     problem, u = s.problem, s.u
     for k, search in enumerate(s.searches):
         v, problem = _run(s, f"search {k + 1}", search, problem, u)
@@ -293,13 +293,13 @@ def fit(s: State) -> State:
         if k and fits_torque(s.searches[0]) and problem.uses_replays and worse_on_torque(problem, u, v):
             return replace(s, problem=replace(problem, data=problem.torque_data), u=u, refused=True)
         u = v
-        # `fitted` only after a torque search or the last search: earlier replay residuals contain model error
+        # fitted=True only after a torque search or the last search: earlier replay residuals contain model error
         problem = problem.reweighted(u, fitted=k == len(s.searches) - 1 or fits_torque(search))
     return replace(s, problem=problem, u=u)
 
 
 def reread_ramps(s: State) -> State:
-    """Estimate the breakaway commands again, now with the fitted delay, lag and motion after release."""
+    """Estimate the breakaway commands again, now with the fitted delay, lag and motion after breakaway."""
     arm = s.fitted()
     if s.ramps is None or (slide := s.slide(arm)) is None:
         return s
@@ -353,18 +353,18 @@ def reweight(s: State) -> State:
 
 
 def fit_breakaway(s: State) -> State:
-    """Compute breakaway torques: commands at release plus offset, drag and gravity error of the fitted arm."""
+    """Compute breakaway torques: breakaway commands plus offset, drag and gravity error of the fitted arm."""
     arm, space = s.fitted(), s.space
     if not s.commanded or s.ramps is None:
         return replace(s, dynamics=arm)
     edges = estimate_breakaway(s.ramps, delay=float(arm.delay), lag=float(arm.lag), slide=s.slide(arm))
-    # without a release, the breakaway torque is at least the largest command at which the joint stayed at rest
+    # if no ramp moved a joint, its breakaway torque is at least the largest command of its ramps plus the offset
     beyond = np.abs(edges.held + arm.offset[:, None]) > np.abs(arm.breakaway)
     command = np.where(np.isnan(edges.command) & beyond & (edges.held != 0), edges.held, edges.command)
     arm = replace(space, breakaway_command=command).dynamics(space.from_unit(s.u))
     breakaway = StaticFriction(s.robot, s.ramps, edges).breakaway(arm)
     # a direction may lack a usable ramp, for example if the joint slid before its command rose. Stiction is similar
-    # in both directions, so r2s uses the value of the opposite direction
+    # in both directions, so r2s uses the opposite direction's value
     blind = (edges.count == 0) & (edges.held == 0) & (edges.count[:, ::-1] > 0)
     breakaway = np.where(blind, -breakaway[:, ::-1], breakaway)
     command = np.where((edges.count > 0) | blind, breakaway - arm.offset[:, None], command)

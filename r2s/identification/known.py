@@ -28,7 +28,7 @@ class Known:
 
     Attributes:
         names: K names such as coulomb[2]. mean: (K,) in SI units; for logarithmic parameters, mean of the logarithm.
-        covariance: (K, K), with drift. drift: (K,) standard deviation of the drift between the dates, or 0.
+        covariance: (K, K), including drift. drift: (K,) standard deviation of a value's drift; 0: no drift.
     """
 
     names: tuple[str, ...]
@@ -60,7 +60,7 @@ class Known:
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return the joint distribution with the independent prior `other`, which replaces common values."""
+        """Return the joint distribution with the independent prior `other`; for common values, use only `other`."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)

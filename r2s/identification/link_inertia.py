@@ -67,7 +67,7 @@ def add_point_mass(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mass (..., n) kg, com (..., n, 3) m, tensor (..., n, 3, 3) with a point mass added to the last link.
 
-    A point mass suffices, because the tensor of a gripper about the gripper's center is small compared with m r^2.
+    A point mass suffices: a gripper's tensor about its own center is small compared with m r^2 about the joints.
 
     Args:
         mass, com, inertia: mass, center of mass and inertia tensor of each link without the point mass.

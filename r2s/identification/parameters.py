@@ -1,4 +1,4 @@
-"""The parameter vector of an identification: blocks, bounds, map to the unit cube, and the dynamics it describes.
+"""The parameter vector of an identification: blocks, bounds, map to the unit cube, and conversion to dynamics.
 
 A block contains one parameter: a value per joint or link (a friction coefficient, offset, inertia), or one value for
 the whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are mapped
@@ -237,7 +237,7 @@ class ParameterEstimate:
     """Estimated parameter vector with arrays (P,) in SI units.
 
     Attributes:
-        x: estimated values. identifiable: whether the data determine a value.
+        x: estimated values. identifiable: whether the data determine each value.
         low, high: ends of 95 % intervals of the values; for measured and motor torque, the intervals also use draws
             from a second model (`draw_full_model`), which `samples` does not contain.
         samples: (S, P) random draws from the posterior.

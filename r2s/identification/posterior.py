@@ -65,7 +65,7 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
 def _root(matrix: np.ndarray) -> np.ndarray:
     """Return a square root (P, P) of a positive matrix, also if rounding made it indefinite.
 
-    A recording without noise and a wide prior differ in information by more than floats resolve.
+    The information of a noise-free recording exceeds that of a wide prior by more than floats resolve.
     """
     try:
         return np.linalg.cholesky(matrix)

@@ -18,15 +18,15 @@ from r2s.physics.robot import SIM_DT
 UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
 # Least ratio of a joint's RMS errors that counts as a wrong minimum. In trials with the 2- and 3-joint arms of
-# benchmarks/scaling.py, with values drawn from the priors, wrong minima had 1.9 to 36; on a physical Panda, where the
-# fit from narrow priors predicts better, the ratio is 1.0 to 1.2.
+# benchmarks/scaling.py, with values drawn from the priors, wrong minima had ratios of 1.9 to 36; on a
+# physical Panda, where the fit from narrow priors predicts better, the ratio is 1.0 to 1.2.
 CLEARLY = 2.0
 TAIL = 25.0  # degrees of freedom plus 1 of Student's t, which is the prior for link-side torque
 # implicit friction: least significance of its effect in standard deviations; range of actual over expected size
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
-ALIKE = 0.2  # relative uncertainty of the number of independent rows, and so of a sum of squares
+ALIKE = 0.2  # relative uncertainty of the number of independent rows, and therefore of a sum of squares
 ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more: nominal friction may be off by tens of Nm
-FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by less (relative)
+FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by a smaller share
 Report = Callable[[dict], None]
 
 
@@ -93,14 +93,14 @@ class Problem:
 
     @property
     def at_link(self) -> bool:
-        """Whether the recorded torque is that of a sensor behind the gear."""
+        """Whether link-side sensors measured the recorded torque."""
         return not (self.torque_data.commanded or self.torque_data.at_motor)
 
     @property
     def prior_width(self) -> np.ndarray:
-        """(P,) the prior's standard deviation on the unit cube, for comparison with the posterior's.
+        """(P,) the prior's standard deviation on the unit cube, for comparison with the posterior standard deviation.
 
-        The standard deviation among arms in general (`ParameterSpace.usual`) replaces a flat prior. No value exceeds
+        For flat priors, the value is the standard deviation among arms (`ParameterSpace.usual`). No value exceeds
         UNIFORM, the standard deviation of a uniform distribution over the bounds.
         """
         stated = np.where(np.isinf(self.sigma), self.space.usual, self.sigma)
@@ -113,7 +113,7 @@ class Problem:
 
     @property
     def is_fixed(self) -> np.ndarray:
-        """(P,) whether `fixed` fixed each value; a test of equality, because stated priors may be even narrower."""
+        """(P,) whether `fixed` set a value's prior; tested by equality, as stated priors may be even narrower."""
         return self.sigma == FIXED * self.space.width
 
     def fixed(self, at: np.ndarray) -> "Problem":
@@ -129,7 +129,7 @@ class Problem:
         return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with flat priors of the values in `names`, whose prior is an extra residual."""
+        """Return the problem with flat priors of the values in `names`, whose priors are extra residuals."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
@@ -230,8 +230,8 @@ def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solv
     A fit to link-side torque has several minima if values are far outside of narrow priors: with the first weights,
     which come from the nominal arm, a fit may keep cable torque near zero and distort friction instead. If `start` is
     nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
-    problem's priors. It replaces the first fit if it is likelier and clearly lowers the error of a joint. Unmodeled
-    effects may also make it likelier, but they hardly lower the error.
+    problem's priors. The second fit replaces the first if it is more likely and clearly lowers the error of a joint.
+    Unmodeled effects may also make the second fit more likely, but they hardly lower its error.
     """
     u, last = _rounds(problem, start, rounds, solve)
     wide = problem.with_usual_prior() if problem.at_link and np.array_equal(start, problem.start) else problem
@@ -244,7 +244,7 @@ def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solv
 
 
 def _rounds(problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
-    """Solve the problem from u (P,), and reweight it between rounds; return the last u and its problem."""
+    """Solve a problem in rounds from u (P,), reweighting between rounds; return the last solution and problem."""
     for k in range(rounds):
         u = solve(problem, u)
         if k < rounds - 1:
@@ -256,7 +256,7 @@ def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray
     """Return whether u (P,) has a larger posterior density than v (P,), and a clearly smaller error in some joint.
 
     Each solution has its own torque noise sigma. A joint's log likelihood is -N log sigma, with N independent rows. A
-    wrong model lengthens the correlation of errors, so N follows from the shorter of both correlation times.
+    wrong model lengthens the correlation of errors, so N uses the shorter of the two solutions' correlation times.
     """
     (length, sigma), (longer, larger) = (
         p.torque_data.noise_at(p.space.from_unit(x)) for p, x in ((one, u), (other, v))
@@ -314,6 +314,6 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
         row, products, hessian = row + len(own), products + j.T @ both, hessian + j.T @ j
     gradient, slope = np.asarray(products).T
     best = np.linalg.lstsq(hessian, slope, rcond=None)[0]
-    size = moved @ moved - best @ slope  # square of the effect's part that no parameter explains
+    size = moved @ moved - best @ slope  # square of the part of the effect that no parameter explains
     share = -(moved @ r - best @ gradient) / size
     return bool(EXPECTED[0] < share < EXPECTED[1] and share * np.sqrt(size) > significant)

@@ -18,7 +18,7 @@ EDGE = 5e-4  # a value closer to a bound than this share of its range is at the 
 RIDGE = 1e-6  # information added to every value on the unit cube, as some values have a flat prior and no data
 UNSEEN = 0.9  # ratio of posterior to prior sigma, above which the data hardly determine a value
 SHARPER = 4.0  # a value is identifiable if half its 95 % interval is less than its prior's sigma divided by this
-NULL_SHARE = 0.5  # ratio of posterior to prior sigma, above which the prior decides a direction
+NULL_SHARE = 0.5  # ratio of posterior to prior sigma, above which the prior determines a direction
 LISTED_PARTS, LEAST_PART = 6, 0.2  # most values listed per null direction; least component of a listed value
 
 
@@ -29,13 +29,13 @@ class IdentificationResult:
     Attributes:
         space: the parameter space. found: estimated values and intervals of the parameters.
         history: one row for each step or generation of a search.
-        families: {friction family: error of held-out torque relative to the best family's}; {} if the user chose one.
+        families: {friction family: error of held-out torque relative to the best family's}; {} if the user chose it.
         null_directions: parameter combinations with a ratio of posterior to prior sigma above NULL_SHARE, each as a
             pair (this ratio, {name: component}), largest ratio first.
         unseen: names of the parameters that r2s left at nominal values, because the data hardly determine them.
         edges: breakaway commands estimated from ramps; None if no ramps were recorded.
-        refused: whether r2s discarded the replay fit, because this fit explained torque clearly worse.
-        prior_rows: residuals (B,) of prior, ramps and earlier knowledge, and their Jacobian (B, P) on the unit cube.
+        refused: whether r2s discarded the replay fit, which explained torque clearly worse than the torque fit.
+        prior_rows: residual (B,) and Jacobian (B, P) on the unit cube, see `Problem.prior_rows`.
     """
 
     space: ParameterSpace
@@ -138,7 +138,7 @@ def conclude(
         problem: the solved problem.
         space: the parameter space, with the breakaway torques and the stiction model estimated after the fit.
         sure: the posterior, as a dict with the fields of `Posterior`.
-        full: {"draws": (S, P)}, draws on the unit cube from a second model, which count as much as those of `sure`.
+        full: {"draws": (S, P)}, draws on the unit cube from a second model, with the same weight as draws of `sure`.
         story: further fields of `IdentificationResult`: history, families, edges, refused.
     """
     u = np.array(sure["u"], dtype=float)

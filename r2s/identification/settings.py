@@ -34,7 +34,7 @@ class Settings:
         stated: the user's mean, width or fixed value per parameter (stated.py).
         known: prior knowledge from an earlier identification, of any kind of torque (known.py).
         seed: seed of the random draws from the posterior.
-        nthread: threads of the physics; 0 uses all cores.
+        nthread: threads of the simulator; 0 uses all cores.
 
     Raises:
         UserError: a friction family, term or parameter is unknown, or a number is outside its range.

@@ -21,7 +21,7 @@ TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to
 def check_stated(stated: Stated, n: int | None = None) -> None:
     """Raise UserError for an unknown parameter or key, a wrong value, or a fixed value with a mean or width.
 
-    A value is a number, null or a list of n of these. n: number of joints; None: do not check lengths of lists.
+    A value is a number, null or a list of n numbers or nulls. n: number of joints; None: do not check list lengths.
     """
     check_parameters("identify.prior", stated)
     for name, entry in stated.items():
@@ -91,14 +91,14 @@ def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
 def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, ArrayLike]) -> Known | None:
     """Return the user's prior (mean and width) for values in `space`; None if the user states no mean and no width.
 
-    If the user states only a mean, the width is from `prior`; if only a width, the mean is the nominal value. Widths
-    are standard deviations in SI units; the width of a logarithmic parameter is divided by its mean.
+    If the user states only a mean, the width is from `prior`; if the user states only a width, the mean is nominal.
+    Widths are standard deviations in SI units; the width of a logarithmic parameter is divided by the mean.
 
     Args:
         space: the searched parameters. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.
 
     Raises:
-        UserError: a stated parameter is not in `space`, a mean is outside the bounds, or a mean lacks a width.
+        UserError: a stated parameter is not in `space`, a mean is outside the bounds, or a mean has no width.
     """
     names, means, widths = [], [], []
     for block, entry in stated.items():

@@ -58,7 +58,7 @@ def blocks_of(term: str) -> tuple[str, ...]:
 
 
 def add_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:
-    """Return `terms` plus `more`; `link` replaces `inertia_scale`, because it already includes the inertia tensor."""
+    """Return `terms` plus `more`; `link` replaces `inertia_scale`, because `link` includes the inertia tensor."""
     return [name for name in terms if not (name == "inertia_scale" and "link" in more)] + list(more)
 
 

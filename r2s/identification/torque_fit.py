@@ -68,7 +68,7 @@ class Unexplained:
         return np.array(factors), left / whole
 
     def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return, for each judged joint, K torques over tau_max (T, K), without fitted friction and offset."""
+        """Return, for each judged joint, K torques / tau_max (T, K) minus their fitted friction and offset."""
         out = []
         for j in self.seen.tolist():
             own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
@@ -141,7 +141,7 @@ def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
 
 
 def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for each link that needs a different mass, with moments scaled by the same factor."""
+    """Return (misfit, message) for each link that needs a different mass; its moments scale with the mass."""
     robot, m, out = left.robot, left.m, []
     y = regressor(robot, m.q, m.dq, m.ddq, robot.gravity if gravity else None)
     standard, names = LinkInertia(robot.mass, robot.com, robot.inertia).standard(), robot.model(gravity=False)

@@ -1,7 +1,7 @@
 """Check a recording's units, signs, joint order, gravity and clock against the arm's model.
 
 r2s compares dq with the slope of q, the integral of dq with q (r2s/recordings/clock.py), and tau with nominal torque.
-The checks accept a nominal arm that is wrong by a factor of 3, an undeclared payload, any friction, and sensor
+The checks accept nominal torque that is wrong by a factor of 3, an undeclared payload, any friction, and sensor
 offsets. The checks refuse a signal that is wrong by a factor of 1000, 57.3 or -1, and a wrong joint order or
 mounting. Most checks refuse only if correcting one error removes at least three quarters of the misfit.
 """
@@ -29,7 +29,7 @@ REFUSED, CORRECTED = 0.5, 0.25  # largest accepted unexplained share; largest fr
 SUSPECT = 0.3  # misfit above which other joint orders are tested; correct recordings had 0.006 to 0.21
 TURNED = 0.05  # misfit above which other mountings are tested; a valid mounting leaves at most MASS_LEFT of it
 HELD = 0.05  # a joint whose RMS nominal torque exceeds this share of tau_max is judged even at rest
-HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity: range in torque with gravity; most without
+HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity in tau: range with gravity; most without
 CURRENT = 0.005  # A/Nm, least ratio of a current to torque: no arm's joint has 200 Nm/A
 OVER_LIMIT = 3.0  # largest allowed torque over tau_max
 RATIO = 4.0  # dq is refused if its ratio to the slope of q is above RATIO or below 1 / RATIO
@@ -51,7 +51,7 @@ class Judged:
 
     Attributes:
         clock: (n,) ratio of the change of q to the integral of dq. scale: (n,) ratio of dq to the slope of q.
-        misfit: unexplained share of the squared torque. shares: share of nominal gravity torque in tau, by joint.
+        misfit: unexplained share of the squared torque. shares: (K,) share of nominal gravity in tau of K joints.
     """
 
     clock: np.ndarray
@@ -146,7 +146,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints that other columns fit far better, and these columns, or None; pairs: as `Unexplained.pairs`."""
+    """Return joints that other joints' columns fit far better, and these columns, or None; pairs: misfits [j, k]."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():

@@ -18,12 +18,12 @@ RANGES = "mass", "table", "friction", "damping", "bristle"
 class BoxRandomization(UniformRandomization):
     """Draw random arms from `UniformRandomization` and a random box for each arm.
 
-    Mass and stiffness are log-uniform; all remaining ranges are uniform. The initial pose of the box deviates from
+    Mass and stiffness are log-uniform, all other draws uniform. The initial pose of the box deviates from
     the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's normal.
 
     Attributes:
         table, friction: friction coefficients at the work table and at the tip. mass (kg), stiffness (N/m), damping
-            (s/m), bristle (m): see `Surface`. All six are ranges [least, most]. size: (3,) m, edges of the box.
+            (s/m), bristle (m): see `Surface`. table to bristle: ranges [least, most]. size: (3,) m, edges of the box.
         spread, yaw: m, degrees, range of the box's pose. point (3,) m, normal (3,): table plane, see `table_frame`.
 
     Raises:

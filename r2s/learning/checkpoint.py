@@ -2,7 +2,7 @@
 
 Each checkpoint writes only the new transitions, as one chunk. The state file lists the chunks of the checkpoint, so
 an interrupted write does not damage the previous checkpoint. A chunk is deleted after the replay buffer has
-overwritten all transitions of the chunk. The oldest chunk can therefore contain some overwritten transitions. All
+overwritten all transitions of the chunk. The oldest chunk can contain transitions already overwritten. All
 files contain only tensors, numbers and names, so torch.load(weights_only=True) can read the files.
 """
 
@@ -24,7 +24,7 @@ class Checkpoint:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._chunks = list[int]()  # per chunk, `Replay.seen` at its end, where the next chunk begins
+        self._chunks = list[int]()  # `Replay.seen` at the end of each chunk
 
     @property
     def env_steps(self) -> int:
@@ -45,9 +45,9 @@ class Checkpoint:
             path.unlink()
 
     def load(self, replay: Replay) -> dict[str, Any] | None:
-        """Fill `replay`, an empty buffer, with the saved transitions and return the state; None without a checkpoint.
+        """Fill the empty buffer `replay` with the saved transitions; return the state, or None without a checkpoint.
 
-        Every transition returns to its row in the buffer, so a restored random generator draws the same batches.
+        Each transition gets its former row, so a resumed training draws the batches of an uninterrupted training.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.
@@ -90,7 +90,7 @@ def save_tensors(path: Path, content: dict[str, Any]) -> None:
 
 
 def load_tensors(path: Path, option: str) -> dict[str, Any]:
-    """Load a file of `save_tensors`: tensors, numbers and names, never a pickled object.
+    """Load a file that `save_tensors` wrote: tensors, numbers and names, never a pickled object.
 
     Raises:
         UserError: the file is missing or damaged; the message begins with `option`.

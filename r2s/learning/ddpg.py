@@ -15,7 +15,7 @@ from r2s.learning.learner import DeterministicLearner, polyak
 
 
 class DDPG(DeterministicLearner):
-    """Learner of a deterministic policy with one critic; for its arguments see `DeterministicLearner`."""
+    """Learn a deterministic policy with one critic; for the arguments, see `DeterministicLearner`."""
 
     def __init__(self, scale: tuple[Tensor, Tensor], action_scale: Tensor, **shared: Any):
         super().__init__(scale, action_scale, (1, 1), **shared)

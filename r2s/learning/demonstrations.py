@@ -43,7 +43,7 @@ class Demonstrator:
 
 
 def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstrator | None:
-    """Return the demonstrator for the task; None if no baseline of reaching, pushing or hybrid control supports it.
+    """Return the demonstrator for reaching, pushing or hybrid control; None if no baseline supports the task.
 
     Args:
         robot, task: the arm and its task. dynamics: model of one arm, the center of the training's randomization.

@@ -32,7 +32,7 @@ class TaskEnv(EnvBase):
 
     Args:
         robot, task: the arm and its task.
-        draw: domain randomization, called at every reset; a `Pushes` also applies joint torques at every step.
+        draw: domain randomization, called at every reset; type `Pushes` also applies joint torques at every step.
         nsim: number of arms. nthread: number of threads; 0: all cores.
         seed: seed of goals, starts and dynamics.
         stagger: whether the first episodes of the GROUPS groups of arms end at different times.
@@ -84,7 +84,7 @@ class TaskEnv(EnvBase):
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights for training progress from 0 to 1, if an external library runs the training loop.
+        """Set the reward weights, for an external training loop; progress: used share of its budget, 0 to 1.
 
         As in `train`, `Reward.adapt` computes the factor of the weights from the steps since the last call.
         """
@@ -132,7 +132,7 @@ class TaskEnv(EnvBase):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Run one step, reset truncated episodes, and return the step and the initial state of the next step.
 
-        The method of EnvBase also checks and copies tensors, which takes a fifth of a step's time with 32 arms.
+        `EnvBase.step_and_maybe_reset` also checks and copies tensors: a fifth of a step's time with 32 arms.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)
@@ -175,7 +175,7 @@ class TaskEnv(EnvBase):
         return own | {"arms": self.arms.state(), "rng": self.rng.bit_generator.state, "_stagger": self._stagger}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a saved `state`, from which equal actions produce equal steps, bit for bit."""
+        """Restore a saved `state`; equal actions then produce equal steps, bit for bit."""
         for name in ("goal", "_dq", "_count", "_scale"):
             getattr(self, name)[:] = state[name]
         self.arms.set_state(state["arms"])

@@ -1,6 +1,6 @@
 """A task as Gymnasium environments: `ArmVectorEnv` for a batch of simulated arms, `ArmEnv` for a single arm.
 
-Each arm of a batch has its own random generator, so arm i runs the same episodes as a single arm with the same seed.
+Each arm of a batch has its own random generator, so arm i runs the episodes of a single arm with arm i's seed.
 Observations are normalized with the scales of the task, as in r2s's policies.
 """
 
@@ -104,7 +104,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.observation_space, self.action_space = (gym.vector.utils.batch_space(s, num_envs) for s in spaces)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights for training progress from 0 to 1; see `TaskEnv.set_progress`."""
+        """Set the reward weights; progress: used share of the budget, 0 to 1; see `TaskEnv.set_progress`."""
         self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
@@ -116,7 +116,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes of all arms, or of the arms of `options["reset_mask"]` (num_envs,) bool.
 
-        seed: number, to which r2s adds i for arm i, or list of one seed per arm; None: no generator is restarted.
+        seed: number (arm i gets seed + i), or list of one seed per arm; None: the random generators continue.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
@@ -177,7 +177,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
 
 
 class ArmEnv(gym.Env):
-    """A single simulated arm: an `ArmVectorEnv` of one arm without automatic resets; see there for the arguments."""
+    """A single simulated arm: an `ArmVectorEnv` of one arm without automatic resets; see `ArmVectorEnv`."""
 
     def __init__(self, robot: Robot, task: Task, draw: Draw, *, reward: Reward | None = None):
         self.batch = ArmVectorEnv(robot, task, draw, nthread=1, reward=reward, autoreset_mode=AutoresetMode.DISABLED)
@@ -189,7 +189,7 @@ class ArmEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; `seed` sets the random numbers of this and all later episodes."""
+        """Start a new episode; `seed` determines the random numbers of this episode and of all later episodes."""
         super().reset(seed=seed)
         self.batch.env.rngs = [self.np_random]
         observation, info = self.batch.reset()

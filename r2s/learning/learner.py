@@ -32,8 +32,8 @@ class Learner(nn.Module, ABC):
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). In states in
             which critics hardly distinguish actions, this weight favors small actions over alternating full torque.
         explore_correlation: correlation of an arm's exploration noise between two steps; 0 means white noise. The
-            noise is a first-order process of constant variance. Correlated noise moves an arm as far with smaller
-            accelerations (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
+            noise is a first-order process of constant variance. Correlated noise moves an arm as far as white
+            noise with less acceleration (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
 
     Raises:
         UserError: a setting has the wrong type or is out of range.
@@ -209,7 +209,7 @@ class Learner(nn.Module, ABC):
         """Restore a state that `get_extra_state` returned."""
         # torch stores references to the loaded moments: without a copy, two learners would share and overwrite them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
-        noise = state.get("noise")  # older checkpoints have none
+        noise = state.get("noise")  # older checkpoints contain no noise
         self.updates, self._noise = state["updates"], None if noise is None else noise.to(self.action_scale.device)
 
 
@@ -274,7 +274,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Shift the target entropy like the entropy of a Gaussian whose standard deviations are scaled by `share`."""
+        """Shift the target entropy by the entropy change of a Gaussian whose standard deviations `share` scales."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -333,7 +333,7 @@ def differentiate(
 
 @torch.no_grad()
 def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
-    """Move every parameter of `target` by the fraction tau towards the parameter of `source`."""
+    """Move every parameter of `target` by the fraction tau towards the corresponding parameter of `source`."""
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
 
 

@@ -17,7 +17,7 @@ from r2s.physics.safety_filter import ALLOWED
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-STIFF = 12.0  # rad/s, bandwidth of the critically damped feedback; the highest for 50 Hz and the latency of an arm
+STIFF = 12.0  # rad/s, bandwidth of the critically damped feedback; the highest for 50 Hz and an arm's latency
 POSTURE = 1e-3  # m^2, weight of the start posture in the inverse kinematics
 FAST = 0.9 * ALLOWED  # largest planned share of a joint's speed limit; the safety filter allows the share ALLOWED
 PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (15 / 8)

@@ -23,7 +23,7 @@ class Normalizer(nn.Module):
         self.register_buffer("std", std.float())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return normalized x, clipped to CLIP."""
+        """Return normalized x, clipped to [-CLIP, CLIP]."""
         return ((x - self.mean) / self.std).clamp(-CLIP, CLIP)
 
 

@@ -33,7 +33,7 @@ class UniformRandomization:
     are independent, so some tensors, mainly of slender links, belong to no body (see `physical`); r2s draws these
     again. With inertia_relative = 0.05, the share of valid draws is 100 % for the Panda's links 4 and 7, 47 to 63 %
     for links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate I_xx and I_yy of
-    link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Each tensor element still spans its full +-5 %.
+    link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Even with redraws, each element spans its full +-5 %.
 
     Attributes:
         robot: the arm.
@@ -109,8 +109,8 @@ class Pushes(Protocol):
 class ForceRandomization:
     """Apply random joint torques instead of random dynamics (Valassakis et al. 2020, arXiv 2008.06686).
 
-    At every control step, each joint receives a torque U(-1, 1) * share * friction level of the joint. Like friction,
-    this torque acts on the joint itself, so the safety filter does not change this torque.
+    At every control step, each joint receives a torque U(-1, 1) * share * friction level of the joint. The random
+    torque acts on the joint itself, as friction does, so the safety filter does not change this torque.
 
     Attributes:
         robot: the arm. center: dynamics of the arm, without a batch dimension.
@@ -151,7 +151,7 @@ class ContactRandomization(UniformRandomization):
     """Draw arms as `UniformRandomization` does, and for each arm a random surface near a nominal plane.
 
     The exponent is the lower or the upper end of its range. Stiffness is log-uniform; damping, friction and bristle
-    are uniform. U(-place, place) displaces the plane along its normal, and U(0, tilt) tilts it about a random axis.
+    are uniform. U(-place, place) shifts the plane along its normal, U(0, tilt) tilts the plane about a random axis.
 
     Attributes:
         point, normal: (3,) m and (3,), of the nominal plane; None: a work table below the home posture's tip.

@@ -5,9 +5,9 @@ only env_steps is limited, runs with equal seeds and equal numbers of threads ag
 resumption. If minutes are limited, the curriculum depends on the clock.
 
 The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
-one core, steps and updates alternate, with the same result. Physics and updates do not share OpenMP threads. Shared
-threads would slow both: after an update they spin for milliseconds on cores that the physics needs, and on a busy
-machine, each OpenMP barrier waits for a suspended thread.
+one core, steps and updates alternate; the result equals that of parallel steps. Physics and updates do not share
+OpenMP threads, because shared threads would slow down physics and updates: after an update, the threads spin for
+milliseconds on cores that the physics needs, and on a busy machine, each barrier waits for a suspended thread.
 """
 
 import copy
@@ -73,7 +73,7 @@ class Loop:
             initial value.
         explore_end: ratio of final to initial exploration noise, which falls geometrically over the budget.
         eval_env_steps: env steps between two evaluations; a training ends with one more evaluation.
-        compile: compile the losses first, which uses budget.minutes. concurrent: step the arms in a separate thread.
+        compile: whether to compile losses first, within budget.minutes. concurrent: whether arms step during updates.
         matmul: precision of float32 matrix products in updates, for torch.set_float32_matmul_precision: "medium"
             allows bfloat16 factors; "auto" selects the result of `fastest_matmul`.
 
@@ -181,8 +181,8 @@ class Training:
     """State of a training: arms, learner, replay buffer and counters; the arguments are those of `train`.
 
     Attributes:
-        env_steps, updates: numbers so far. next_eval: value of env_steps from which the next evaluation is due.
-        factor: `Reward.factor`, then the last result of `Reward.adapt`. evaluation: last row of evaluations.csv.
+        env_steps, updates: counts so far. next_eval: env_steps from which the next evaluation is due.
+        factor: last result of `Reward.adapt`, initially `Reward.factor`. evaluation: last row of evaluations.csv.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ class Training:
         checkpoint.save(state, self._replay)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Restore the state of a checkpoint; without a saved checkpoint, do nothing."""
+        """Restore the state in `checkpoint`; do nothing if no checkpoint was saved."""
         saved = checkpoint.load(self._replay)
         if saved is None:
             return
@@ -301,7 +301,7 @@ class Training:
 
 
 def run_now(function: Callable[..., Any], *given: Any) -> Future:
-    """Call `function` at once and return a future with the result; this replaces `submit` of an executor."""
+    """Call `function` at once and return a future with the result, in place of `Executor.submit`."""
     done: Future = Future()
     done.set_result(function(*given))
     return done
@@ -314,7 +314,7 @@ def generators(device: torch.device) -> dict[str, torch.Tensor]:
 
 
 def set_generators(states: Mapping[str, Any], device: torch.device) -> None:
-    """Restore the generator states that `generators` returned, as far as this device uses the generators."""
+    """Restore the states that `generators` returned, for the generators that this device uses."""
     torch.set_rng_state(states["torch"])
     if device.type == "cuda" and "cuda" in states:
         torch.cuda.set_rng_state(states["cuda"], device)
@@ -334,7 +334,7 @@ def fastest_matmul(device: torch.device) -> str:
     """Return the fastest matrix precision: "medium" (bfloat16) if the device has bfloat16 units, else "highest".
 
     On a CPU with AVX-512 but without bfloat16 units, "medium" saves no time with networks of 128 to 256 units:
-    rounding the factors takes as long as the faster products save (benchmarks/results/speed.md).
+    rounding the factors takes as much time as the faster products save (benchmarks/results/speed.md).
     """
     units = device.type == "cuda" or torch.cpu.get_capabilities().get("amx_bf16", False)
     return "medium" if units else "highest"

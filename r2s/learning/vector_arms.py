@@ -19,7 +19,7 @@ class VectorArms:
     """Simulate `width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
     Each ms of a control period has these stages: control law, soft start, low-pass, clip, rate limit, safety filter,
-    delay and lag, physics. Kinematics are computed once per period. A `State` has true speeds and, separately, noise.
+    delay and lag, physics. Kinematics are computed once per period. `State` separates true speeds and sensor noise.
 
     Attributes:
         speeds: None, because simulated speeds are exact and need no smoothing.
@@ -53,7 +53,7 @@ class VectorArms:
         self.sim.drive(filter_limits(robot, torque), torque, task.cutoff_hz, soft_start_s, task.push_limit)
         self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
         self.speeds = None
-        self._limited = np.zeros(width)  # number of limited cycles before the last step
+        self._limited = np.zeros(width)  # cycles changed by the safety filter before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
         self.seed(seed)
         self._sigma, self._noise = np.zeros((2, width, robot.n))
@@ -70,7 +70,7 @@ class VectorArms:
         self._sigma[ids] = dynamics.speed_noise
 
     def push(self, tau: np.ndarray) -> None:
-        """Apply external joint torques tau (width, n) Nm until the next call."""
+        """Apply external joint torques tau (width, n) Nm until the next call of `push`."""
         self.sim.push(tau)
 
     def place(self, starts: np.ndarray, first: int = 0, ids: np.ndarray | None = None) -> State:
@@ -130,7 +130,7 @@ class VectorArms:
         return {"sim": self.sim.state()} | own | {"_rng": self._rng.bit_generator.state}
 
     def set_state(self, state: Mapping) -> None:
-        """Restore a state from `state`; the same commands then lead to the same arm states, bit for bit."""
+        """Restore a result of `state`; equal commands then lead to equal arm states, bit for bit."""
         self.sim.set_state(state["sim"])
         self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
         for name in NOISES:

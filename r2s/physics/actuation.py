@@ -91,7 +91,7 @@ class Actuation:
 
 MAX_DELAY = 0.02  # s, longest pure delay of the model
 # Number of steps by which a semi-implicit simulation responds too early. In a simulation, q(k+1) - 2 q(k) + q(k-1) =
-# h^2 a(k). On an arm, the torques of steps k - 1 and k contribute half each.
+# h^2 a(k). On an arm, the torques of steps k - 1 and k each contribute half of this difference.
 EARLY = 0.5
 SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 
@@ -100,8 +100,8 @@ SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    If a command arrives within a step, the previous command acts until then. The motor torque m lags the command u:
-    dm/dt = (u - m) / lag. From an initial m0, its mean over a time s is u + (m0 - u) (1 - exp(-s / lag)) lag / s.
+    If a command arrives within a step, the previous command acts first. The motor torque m lags the command u: dm/dt
+    = (u - m) / lag. From an initial m0, the mean of m over a time s is u + (m0 - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
         line: (SLOTS, n) Nm, recent commands; row k % SLOTS is the command of cycle k. motor: (n,) Nm, motor torques.

@@ -10,10 +10,10 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import default_plane, nominal_plane
 
-SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; the tip pushes below the hand
+SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; low enough for the hand to stay above the box
 PUSHED_AT = 0.4  # height at which the tip pushes, as a share of the box's height
 SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal pose, to either side
-FORWARD = 0.25  # nominal box's distance ahead of the tip at home, over distance from base to table below the tip
+FORWARD = 0.25  # (distance from the tip at home ahead to the nominal box) / (distance from base to table below tip)
 # Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
 # from a carton on a smooth table to a block of wood on a dry table
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)

@@ -1,19 +1,19 @@
 """Solve a 1 ms step of a tip's contact with a surface, by a method implicit in stiffness, damping and friction.
 
-The normal force is the mean of the law of Hunt and Crossley (surface.py) over the step. The mean of K d^e from the
-depth d0 to the depth d1 is (V(d1) - V(d0)) / (d1 - d0), where V is the potential of K d^e. This discrete gradient
-(Gonzalez, J. Nonlinear Science 6, 1996) conserves the energy of a bounce at any stiffness, even if contact begins or
-ends within the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions, so d0
-= d - h rate / 2 and d1 = d0 + h (rate + rate1) / 2 for penetration rates rate and rate1 before and after the step.
+The normal force is the mean of Hunt and Crossley's force (surface.py) over the step. The mean of K d^e from depth d0
+to depth d1 is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of its potential V (Gonzalez, J. Nonlinear Science 6,
+1996). A discrete gradient conserves the energy of a bounce at any stiffness, even if contact begins or ends within
+the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions, so d0 = d - h rate
+/ 2 and d1 = d0 + h (rate + rate1) / 2 for penetration rates rate and rate1 before and after the step.
 
 The stiffness of tangential bristles is proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
 1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with z_s = `bristle`. The friction
--mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; in sliding it is mu F.
+-mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; sliding friction: mu F.
 
-The unknowns are the final joint velocities of the step. Normal force and friction are linearized about a guess of the
-unknowns; the constant part adds to the driving torque, the linear part to the mass matrix. The stick-slip law solves
-these equations, so contact forces can move resting joints. `start_guess` writes the first guess. `add_contact`,
-`coming_velocity` and `next_guess` repeat until the guess is accurate, usually once. `finish_contact` ends the step.
+The unknowns are the joint velocities at the end of the step. Normal force and friction are linearized about a guess
+of the unknowns; the constant part adds to the driving torque, the linear part to the mass matrix. stick_slip.py
+solves these equations, so contact can move resting joints. `start_guess` writes the first guess. `add_contact`,
+`coming_velocity` and `next_guess` run until the guess is accurate, usually once. `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -60,14 +60,14 @@ from r2s.physics.surface import normal_force
 
 RIGID = 1e-6  # m, smallest `bristle`, for a rigid surface: a fiftieth of the tip's motion per encoder step
 SLIP = 0.02  # m/s, speed above which bristle damping fades out; without fading, each reversal causes a force pulse
-MARGIN = 1e-3  # m, a tip farther away cannot touch within a step: it would need an acceleration of 2000 m/s^2
+MARGIN = 1e-3  # m, reserve in the prediction of a touch: a tip would need 2000 m/s^2 to cross it within a step
 FAR = 0.02  # m, a tip farther away would need 20 m/s to touch within a step
 ROUNDS = 12  # largest number of guesses in a step
 TOLERANCE = 1e-4  # allowed relative error of the normal force after the last guess
 LATE = 1e-2  # allowed error of the tangential force, due to the guess, as a share of the normal force
 BOX_LATE = 1e-3  # allowed relative error of table friction, due to the guessed speed of the box
 NEGLIGIBLE = 1e-6  # N, force that is treated as 0
-SHORT = 1e-6  # ratio |d1 - d0| / depth below which V(d1) - V(d0) is round-off; then the force at mid-path is used
+SHORT = 1e-6  # ratio |d1 - d0| / depth below which V(d1) - V(d0) is round-off; mean_force then uses the mean depth
 
 
 @njit(cache=True, error_model="numpy")
@@ -135,7 +135,7 @@ def near(contact, place, anchor, axis, dq, h, jacobian):
     Call `near` only once per step: if the tip cannot touch the box, `near` also moves a sliding box by one step.
 
     Args:
-        contact: (COLUMNS,), updated in place; force and deflection become 0 if the tip cannot touch the surface.
+        contact: (COLUMNS,), see contact_layout.py; force and deflection become 0 if the tip cannot touch the surface.
         place: position (3,) m and rotation (9,), in the base frame, of the link that carries the tool.
         anchor, axis: (n, 3) m and (n, 3), position and direction of each joint axis. dq: (n,) rad/s, joint speeds.
     """
@@ -286,7 +286,7 @@ def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def next_guess(contact, jacobian, h, coming, guess):
-    """Return whether the guess was accurate, and update it from the solved joint velocities `coming` (n,) rad/s."""
+    """Return whether the guess was accurate; update the guess from the joint velocities `coming` (n,) rad/s."""
     force, fast = guess[NORMAL_FORCE], guess[SPEED]
     rate, speed = _velocity(jacobian, coming, guess[SLID : SLID + 3])
     box_late = 0.0

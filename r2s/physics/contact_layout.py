@@ -20,7 +20,7 @@ VELOCITY, SPIN, STRAIN, ARM, LOAD = UP + 3, UP + 6, UP + 7, UP + 11, UP + 14
 COLUMNS = LOAD + 1
 ROWS = 4  # rows of the Jacobian: normal direction, then the tangential parts of x, y and z
 # Columns of `guess`. RATE, SLIDE (3): penetration rate and tangential velocity before the step. NEXT, SPEED: guessed
-# rate and sliding speed after it. BEGIN: m, depth d0. LINEAR, SLID (3): solved normal force, tangential velocity
+# rate and speed after the step. BEGIN: m, depth d0. LINEAR, SLID (3): solved normal force, tangential velocity
 RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE = 0, 1, 4, 5, 6, 7, 8
 SPRING, DAMPER, LINEAR, SLID = 9, 10, 11, 12
 # With a box: tip velocity before the step (3), contact force at unchanged tip velocity (3) N, decrease of this force

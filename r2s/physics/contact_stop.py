@@ -3,7 +3,7 @@
 If a stop only removed the command, the surface's elastic energy F^2 / 2k would push the tip off by up to F / k, or
 joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver has three kinds of stop:
 
-- hold: the target torque is J^T R with the push limit's estimate R of the force at the stop's start. Nothing moves.
+- hold: the target torque is J^T R with the push limit's estimate R of the force at the stop's start. The arm rests.
 - release: the tip moves outward at the speed LEAVE until the contact force F is gone. A velocity loop tracks the
   joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains the present R and the modeled
   friction force h; for an arm with more friction, an integral adds at most h. Joint friction pushes an outward moving
@@ -24,8 +24,8 @@ from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
 RELEASED = 0.5  # N, contact force below which a tip counts as released
 SLIDES = 0.25  # ratio of friction in slow sliding to breakaway friction; 0.35 with conf/friction/paper
-RETREAT_M = 0.01  # m; this space is free, as the tip came from `task.clearance` = 15 mm above the plane
-LEAVES_S = 0.4  # s; then 0.1 s is left to brake. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml
+RETREAT_M = 0.01  # m; free of obstacles, as the tip came from `task.clearance` = 15 mm above the plane
+LEAVES_S = 0.4  # s; 0.1 s remains for braking. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml
 MOST = 0.25  # largest share of a joint's allowed speed that the outward motion uses
 GAIN = 0.5 * RATE  # 1/s, gain of the velocity loop: half of the latency budget remains for the estimate R
 BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE

@@ -100,7 +100,7 @@ def _segments(a, p, b, r):
 def _nearest(s, count, t):
     """Return the simplex point x, y, z nearest to the origin, and the number of corners that span this point.
 
-    The number is 4 if the origin is inside. s: (4, 3), `count` corners; the spanning ones come first. t: scratch.
+    The number is 4 if the origin is inside. s: (4, 3), `count` corners; spanning corners come first. t: scratch.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1

@@ -19,7 +19,7 @@ from r2s.physics.urdf import GEAR, ROTOR
 from r2s.physics.welds import Bodies, about, make_pose, rotation
 
 ENDLESS = 1e16  # rad, SDF's value for no limit
-HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` in URDF: without them, DART assumes 1 kg and 1 kg m^2
+HAND = 1e-12, 1e-13  # kg, kg m^2 of the URDF link `ee`: without an inertia, DART assumes 1 kg and 1 kg m^2
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf; return a message for each format that cannot represent the arm.
 
-    For an arm with armature, like most arms, skip arm.sdf without a message, because SDF has no rotors.
+    If the arm has armature, as most arms have, write no arm.sdf and return no message, because SDF has no rotors.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)

@@ -145,8 +145,8 @@ def nominal_dynamics(
 
     phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). With phi1=None, frictionloss and damping in
     the robot's file are Coulomb and viscous friction; for a joint with neither, phi1 is PHI1 tau_max. family="auto"
-    keeps this law; any other family has parameters with the same friction at 1 rad/s. If a breakaway torque is
-    None, the file's frictionloss replaces this torque.
+    keeps the sigmoid or Coulomb law; any other family has parameters with the same friction at 1 rad/s. A breakaway
+    torque that is None equals the file's frictionloss.
 
     Raises:
         UserError: a list has the wrong length, or a value is out of its physical range.

@@ -4,10 +4,10 @@ The fence predicts the posture in which the arm would rest if it braked now. In 
 each pair of `CollisionCheck` must be FENCE_M apart. At full speed, the bodies must be FENCE_M (1 + SPREAD) apart,
 because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and joints lag
 the ramp by LAG_S. A joint that uses a smaller share of its allowed speed than the fastest joint brakes only when the
-ramp has fallen to this share. The predicted posture moves continuously with the arm, so it cannot skip an obstacle.
+ramp has fallen to this share. As the predicted posture moves continuously, it skips no obstacle.
 
-If two bodies start closer, the arm may move them apart: the required distance is half of their largest distance in
-the motion so far, at most FENCE_M. The fence ignores bodies that overlap at the start until they separate.
+If two bodies start closer than FENCE_M, the required distance is half of their largest distance in the motion so far,
+at most FENCE_M, so the arm may move them apart. The fence ignores bodies that overlap at first until they separate.
 """
 
 from typing import NamedTuple

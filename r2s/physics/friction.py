@@ -77,7 +77,7 @@ class Family:
         return self.held is not None
 
     def at_rest(self, phi: np.ndarray) -> np.ndarray:
-        """Return the negative and positive limit (..., n, 2) Nm of friction at zero speed; 0 for a continuous law.
+        """Return friction (..., n, 2) Nm just below and just above zero velocity; 0 for a continuous law.
 
         phi: (..., n, K), parameters of the law.
         """
@@ -257,7 +257,7 @@ STRIBECK = Family(
 
 @njit(cache=True)
 def _bristle_native(p, v, h, memory):
-    """Return Dahl's friction (1968) with LuGre damping; z with dz/dt = (v - |v| z) / presliding replaces sign(v)."""
+    """Return Stribeck friction, LuGre damping; z with dz/dt = (v - |v| z) / presliding (Dahl) replaces sign(v)."""
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
@@ -265,7 +265,7 @@ def _bristle_native(p, v, h, memory):
     level = p[0] * (1.0 + side * p[1]) * (1.0 + p[3] * (1.0 + side * p[6]) * np.exp(-((v / p[4]) ** 2)))
     stiff = level / p[5]
     rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
-    # the second term contains the deflection during the coming step, at the present velocity
+    # the second term: change of the deflection in the coming step at the present velocity, and bristle damping
     viscous = p[2] * (1.0 + s * p[7])
     return level * z + stiff * rate * (v - abs(v) * z) + viscous * v, stiff * rate * (1.0 - s * z) + viscous
 
@@ -354,7 +354,7 @@ def family_path(one: Family) -> str:
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
     """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s in steps of dt s.
 
-    z replaces sign(v) and solves dz/dt = (v - |v| z) / distance (Dahl 1968) from z = 0. distance: rad, one or (n,).
+    z replaces sign(v) and solves dz/dt = (v - |v| z) / distance (Dahl 1968) from z = 0. distance: rad, () or (n,).
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 

@@ -4,13 +4,13 @@
 
 With the damping D = 2 zeta (M # K_q), every mode has the damping ratio zeta. Here M is the mass matrix, K_q = J^T K J
 + N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. D equals the damping of the
-double diagonalization of Albu-Schaeffer et al. (ICRA 2003), but needs no eigenvectors. The null-space projector N is
-dynamically consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force has a potential, even if
-clipped. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs;
-damping refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al.,
-RA-L 2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured angle,
-other friction at the reference speed dq_r. A feedforward above the true friction would drive the arm. Canceling a
-bristle stiffness k with a delay d adds the damping k sin(w d) / w, which is positive for frequencies w < pi / d.
+double diagonalization of Albu-Schaeffer et al. (ICRA 2003), without eigenvectors. The null-space projector N is
+dynamically consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a
+potential. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the
+springs; damping refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich
+et al., RA-L 2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured
+angle, other friction at the reference speed dq_r. A feedforward above the true friction would drive the arm.
+Canceling a bristle stiffness k with a delay d adds damping k sin(w d) / w, positive for frequencies w < pi / d.
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ SPRINGS = 4  # stiffnesses in the task's axes
 ROUNDS = 14  # iterations of the geometric mean: enough for squared frequencies with a ratio of 1e4
 FREE = 1.0  # rad/s, frequency that sets the damping of modes without a spring
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice REST_DQ
-# SETTLE_S: s, low-pass of the angles for friction; reduces a Panda's encoder noise, 1.4e-5 rad, to a third. STEP:
+# SETTLE_S: s, lag of the low-passed angles for friction; cuts a Panda's encoder noise, 1.4e-5 rad, to a third. STEP:
 # bristles deflect in steps of this share of the presliding distance, at least ENCODER rad, 10 times the reduced noise
 SETTLE_S, STEP, ENCODER = 5e-3, 0.1, 5e-5
 # rad/s. REST_DQ: speed below which a joint may rest, 3.5 times the noise of (q - MEAN) / SETTLE_S. DIRECTION_DQ:
@@ -225,8 +225,8 @@ def friction_ahead(v, q, j, load, parameters, memory, at):
 
     With bristles, the feedforward is the deflection z times the smaller of the frictions at reference and at measured
     speed; the measured dq drives dz/dt = (dq - |dq| z) / presliding (Dahl 1968). Without bristles, the feedforward is
-    the friction at v while the tip approaches a surface (APPROACH = 1). Otherwise, the feedforward has the sign of v,
-    and equals the breakaway torque at rest. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
+    the friction at v if APPROACH is 1. Otherwise, the feedforward has the sign of v; for |v| >> DIRECTION_DQ, a joint
+    at rest receives at least the breakaway torque. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j

@@ -81,7 +81,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
             asked[j] = min(max(command[stiff + j], row[K_JOINT + 1]), row[K_JOINT + 2])
         K[j] = asked[j] if begins else K[j]
     share, pays = 1.0, False
-    while not pays:  # halve a rise until the tank can supply the energy; a fall needs no energy
+    while not pays:  # halve a rise of stiffness until the tank can supply the energy; a fall needs none
         raised = 0.0
         for j in range(n):
             out[j] = asked[j] if asked[j] <= K[j] else K[j] + share * (asked[j] - K[j])
@@ -122,7 +122,7 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
             asked[k] = min(max(command[at + k], parameters[K_LOW + k]), parameters[K_HIGH + k])
         K[k] = asked[k] if begins else K[k]
     before, share, pays = task_energy(K, error, tilt, parameters), 1.0, False
-    while not pays:  # halve a rise until the tank can supply the energy; a fall needs no energy
+    while not pays:  # halve a rise of stiffness until the tank can supply the energy; a fall needs none
         for k in range(SPRINGS):
             new[k] = asked[k] if asked[k] <= K[k] else K[k] + share * (asked[k] - K[k])
         raised = task_energy(new, error, tilt, parameters) - before
@@ -213,8 +213,8 @@ def update(velocity, parameters, frames, jacobian, memory):
 def normal_force(command, shift, parameters, memory):
     """Return the desired tip force, N, against the normal: the reference plus an integral of the force error.
 
-    The command contains the normal (3,), reference and measured force, N, and a flag for a measured force. Stiffness
-    times the action's displacement against the normal adds to the reference. Saturation stops the integral.
+    The command contains the normal (3,), reference and measured force, N, and a flag, above 0 if force is measured.
+    Stiffness times the action's displacement against the normal adds to the reference. Saturation stops the integral.
     """
     at = int(parameters[TARGET_AT]) + int(parameters[TARGET_SIZE])
     asked = command[at + 3]
@@ -237,8 +237,8 @@ def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
     """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's motion.
 
     The gradient method (Widrow and Hoff, 1960) fits the slope g in: tip speed along the normal = g . target velocity.
-    The surface's rate of rise adds to `velocity` (3,) m/s. The correcting force is the sum of two clamped
-    integrals of the position error, one along the motion, where friction acts, and one across the motion.
+    The normal velocity g . target velocity adds to `velocity` (3,) m/s. The correcting force is the sum of two
+    clamped integrals of the position error, one along the motion, where friction acts, and one across the motion.
     """
     up, rises, fast = 0.0, 0.0, SLIDING * SLIDING
     for k in range(3):

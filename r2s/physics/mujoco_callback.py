@@ -1,14 +1,14 @@
 """Add friction, control law, safety filter and motors to MuJoCo's physics step, by a compiled callback.
 
 `install()` registers a native control callback. The callback reads each arm's parameters from `jnt_user`, so a batch
-of different arms runs at full speed. It computes friction (friction.py) and, after `Simulator.drive`, control law
-(control_laws.py), safety filter (safety_filter.py) and motor delay (actuation.py), which need feedback every
-millisecond. Stiction (stick_slip.py) and contact (contact.py) need the sum of all other forces. Therefore, r2s uses
-the control callback, which MuJoCo calls last before it computes accelerations.
+of different arms runs at full speed. The callback computes friction (friction.py) and, after `Simulator.drive`,
+control law (control_laws.py), safety filter (safety_filter.py) and motor delay (actuation.py), which act every
+millisecond. Stiction (stick_slip.py) and contact (contact.py) need the sum of all other forces, so r2s uses the
+control callback: MuJoCo calls this callback last before MuJoCo computes accelerations.
 
 A linearly implicit method integrates the friction torque tau_f. With D = d tau_f / dv >= 0 at the current velocity v,
 the callback adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. A step
-is accurate to first order, and stable even for friction slopes of real wrists, 3-10 Nm s/rad on 0.004-0.012 kg m^2.
+is accurate to first order, and stable even for real wrist joints: slopes of 3-10 Nm s/rad, 0.004-0.012 kg m^2.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ from r2s.physics.user_laws import as_doubles, call_friction, friction_address, s
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether masses are summed up
-MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
+MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # widths: 1, 3, 1, 3
 NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: use stick_slip.py. REST: friction when sliding begins
 GRAVITY = REST_POS + 1  # 3 wide
 DELAY, LAG, LEVEL = range(GRAVITY + 3, GRAVITY + 6)  # LEVEL: friction level for the safety filter

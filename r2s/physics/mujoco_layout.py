@@ -16,7 +16,7 @@ DATA_FIELDS = (  # in the order of mujoco_callback.py
 def struct_offsets(width: int, kept: int) -> dict[str, int]:
     """Return the byte offsets of MODEL_FIELDS in mjModel and DATA_FIELDS in mjData, found in a live model.
 
-    An array's pointer equals the address of its NumPy view; a size has an index in MuJoCo's introspection.
+    An array's pointer equals the address of its NumPy view; MuJoCo's introspection lists the sizes in order.
 
     Args:
         width: number of columns of `jnt_user` in the live model. kept: number of rows of `userdata` (kept, n).

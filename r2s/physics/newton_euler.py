@@ -1,8 +1,8 @@
 """Equations of motion of a serial arm, compiled: mass matrix and bias torque in about a microsecond.
 
-The recursive Newton-Euler algorithm with zero joint accelerations computes the bias torque, and the
-composite-rigid-body algorithm the mass matrix (Featherstone 2008, ch. 5 and 6), both with moments about the base's
-origin. This module is independent of MuJoCo and DART; tests compare the results of all three.
+The recursive Newton-Euler algorithm with zero joint accelerations computes the bias torque; the composite-rigid-body
+algorithm computes the mass matrix (Featherstone 2008, ch. 5 and 6). All moments are about the base's origin.
+`equations` uses neither MuJoCo nor DART; tests compare the results of r2s, MuJoCo and DART.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A payload changes mass, center of mass and inertia tensor of the last link. This model is exact in every simulator. An
+A payload changes mass, center and inertia tensor of the last link, an exact model in every simulator. An
 external force could not represent a payload, because the force would depend on the acceleration that it causes. The
 payload's frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
 """
@@ -22,7 +22,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
 
 Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centers (..., n, 3) m, tensors (..., n, 3, 3)
-USUAL = 0.5  # usual payload mass and distance, as a share of the largest ones
+USUAL = 0.5  # usual payload mass and distance, as a share of the largest allowed ones
 WATER = 1000.0  # kg/m^3
 
 
@@ -129,7 +129,7 @@ def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] <= 0:
         raise UserError(f"{name}: expected positive moments, got {moments[0]:.3g} kg m^2")
-    if moments[0] + moments[1] < moments[2] * (1 - 1e-9):  # round-off of a flat body
+    if moments[0] + moments[1] < moments[2] * (1 - 1e-9):  # the tolerance is for the round-off of a flat body
         listed = ", ".join(f"{m:.3g}" for m in moments)
         raise UserError(f"{name}: expected no moment above the sum of the others, got {listed} kg m^2")
     if moments[2] > (largest := 4.0 * most[0] * most[1] ** 2):

@@ -9,12 +9,12 @@ Here P is the push of the command, F >= 0 the contact force, and P_f the push of
 `hidden` = m |J M^-1| friction. Every millisecond, the push limit enforces two rules:
 
 - Force: P + hidden <= force_max.
-- Speed: dv/dt <= RATE (v_max - v). With an estimate R of the force against the push, this rule is P <= R + m RATE
-  (v_max - v). The allowed speed v_max is `speed_near` / OVERSHOOT at the surface and grows with the distance from it.
+- Speed: dv/dt <= RATE (v_max - v). With an estimate R of the force against the push, the rule reads P <= R + m RATE
+  (v_max - v). The allowed speed v_max is `speed_near` / OVERSHOOT at the surface and grows with the tip's height.
 
 The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. In
 free motion, R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, R is P, so the speed rule
-allows P to rise. If the tip is faster than v_max or leaves the surface, the push limit resets R to 0.
+allows P to rise. If the tip is faster than v_max or leaves the surface, the push limit caps R at 0.
 
 On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m): when F
 exceeds force_max, the tip's speed is at most speed_near, and from then on P + P_f - F < 0 brakes the tip. Surface
@@ -22,8 +22,8 @@ friction mu F pushes a sliding tip inward with up to mu c F, where c = m |T J M^
 the projection T across the normal n. Therefore, (1 - mu c) F replaces F in the bound for a surface with friction.
 
 The force rule and the speed rule restrict the torque to two half-spaces with the same normal J M^-1. Of all torques
-in both, the nearest to the target by Gauss' principle is the target minus J^T f with a force f. As the torque must
-also satisfy acceleration bounds (safety_filter.py), regula falsi finds the f whose bounded torque meets the limit.
+in both half-spaces, Gauss' principle selects the one nearest to the target: the target minus J^T f with a force f.
+Regula falsi finds the f whose torque also satisfies the acceleration bounds (safety_filter.py).
 """
 
 from dataclasses import dataclass
@@ -52,10 +52,10 @@ STOPS = {"hold": HOLD, "release": RELEASE, "retreat": RETREAT}
 LEAVE = 0.05  # m/s, outward tip speed in a stop: 20 N on 2e3 N/m are released in half of LEAVES_S
 WORK = 3  # rows of `work` in addition to n
 ROUNDS = 16  # largest number of trial values of f
-CLOSE = 1e-2  # m/s^2, tolerance: inward acceleration may stay below its bound by up to this
+CLOSE = 1e-2  # m/s^2, tolerance: the inward acceleration may be below its bound by up to CLOSE
 OVERSHOOT = 1.5  # largest ratio of closing speed to v_max: latency limits how fast the tip brakes
 STIFF = 1e5  # N/m, stiffest surface of conf/dr/contact.yaml
-NEAR_M = 0.3  # m, distance from the surface beyond which the limit does nothing
+NEAR_M = 0.3  # m, distance from the surface beyond which the push limit has no effect
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max, speed_near: N and m/s, see `PushLimit`; None: the force on 1e5 N/m is at most 2 force_max.
-        plane: point and normal; None: a work table below the home posture's tip. asked: N, largest force of a task.
+        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None: at most 2 force_max on 1e5 N/m.
+        plane: point and normal; None: a work table below the home posture's tip. asked: N, a task's largest force.
         stop: a key of STOPS (contact_stop.py); None: "release".
 
     Raises:

@@ -30,7 +30,7 @@ class LinkInertia:
     inertia: np.ndarray
 
     def standard(self) -> np.ndarray:
-        """Return each link's standard parameters (..., n, 10): mass, first moments, tensor about its origin."""
+        """Return each link's standard parameters (..., n, 10): mass, first moments, tensor about the origin."""
         m, c = self.mass[..., None], self.com
         square = (c**2).sum(-1)[..., None, None] * np.eye(3) - c[..., :, None] * c[..., None, :]
         tensor = tensor_elements(self.inertia + m[..., None] * square)

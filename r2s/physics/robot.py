@@ -28,8 +28,8 @@ PANDA = "r2s:models/panda.xml"
 RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of the Panda's size
-# Default payload limits, from a Panda's ratios (3 kg, 0.15 m, 87 Nm): payload weight times reach over the largest
-# torque limit, and distance of the payload's center over reach.
+# Default payload limits, the ratios of a Panda (3 kg, 0.15 m, 87 Nm): weight of the payload * reach / largest torque
+# limit, and distance from the end effector to the payload's center / reach.
 PAYLOAD_SHARE, PAYLOAD_FAR = 0.33, 0.15
 OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot that tasks use, not `load_robot`
 
@@ -122,7 +122,7 @@ class Robot:
             joint.limited = int(np.isfinite(limits).all())
             joint.range = unit * limits if joint.limited else np.zeros(2)
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-            joint.parent.simple = False  # MuJoCo simplifies `simple` bodies, but this inertia may change
+            joint.parent.simple = False  # MuJoCo simplifies `simple` bodies, but a body's inertia may change
         for number, box in enumerate(obstacles, 1):
             box.add_to(spec, number)
         spec.nuser_jnt = user

@@ -13,7 +13,7 @@ DEGREES_FROM = 30.0  # limits between 30 rad and 360 rad are taken for degrees
 VIRTUAL = 0.01  # m: a link with joints closer than this is part of a universal joint and needs no mass
 WEIGHT = 2.0  # largest plausible gravity torque in the worst posture, as a multiple of tau_max
 POSTURES = 200  # number of random postures in which gravity torque is computed
-WIDEST = 2.0  # arm lengths: no part of a link lies farther from its center of mass
+WIDEST = 2.0  # arm lengths: no part of a link lies farther from the link's center of mass
 DENSEST = 2e4  # kg/m^3, tungsten: no link has smaller moments than a tungsten ball of its mass
 
 

@@ -33,7 +33,7 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
         return read_urdf(path, lock)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        for joint in ET.parse(path).iter("joint"):  # MuJoCo reads 0 to 0 as no range
+        for joint in ET.parse(path).iter("joint"):  # MuJoCo reads a range of 0 to 0 as no range
             if joint.get("range") and not any(float(x) for x in joint.get("range", "").split()) and joint.get("name"):
                 spec.joint(joint.get("name")).info = NO_RANGE
         if loose := [body for body in spec.worldbody.bodies if _is_loose(body)]:
@@ -153,7 +153,7 @@ def _lump(spec: mujoco.MjSpec, welded: set[str | int]) -> None:
             body = of[k]
             body.explicitinertial, body.mass, body.inertia = True, 0.0, np.zeros(3)
             body.fullinertia = np.full(6, np.nan)
-            body.ipos, body.iquat = np.zeros(3), np.array([1.0, 0, 0, 0])  # else MuJoCo infers them from geoms
+            body.ipos, body.iquat = np.zeros(3), np.array([1.0, 0, 0, 0])  # else MuJoCo infers both from geoms
             for geom in body.geoms:
                 geom.mass = 0.0
         moments, axes = np.linalg.eigh(inertia)

@@ -6,11 +6,11 @@ the low-pass (r2s/physics/actuation.py). The safety filter consists of three lim
 - Fading: the policy's torque fades out as a joint approaches its velocity limit or a position limit.
 - Acceleration limit: each joint's acceleration a = M^-1 (tau - Coriolis torque) satisfies -RATE (v + dq) <= a <= RATE
   (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within this limit, the filter selects
-  the one nearest to the effort by Gauss' principle of least constraint: it adds the torques of fictitious mechanical
-  stops. Joint friction only widens the limit, so an overestimated friction never accelerates a joint.
+  the torque nearest to the effort by Gauss' principle of least constraint: the filter adds torques of fictitious
+  joint stops. Joint friction only widens the limit, so an overestimated friction never accelerates a joint.
 - Rate limit: the filter clips the torque, and limits the torque rate by one factor for all joints. The command
   therefore moves straight from the last command to the new torque, within the convex set of the acceleration limit.
-  With a separate factor for each joint, the command could leave this set if two joint axes are almost parallel.
+  With a separate factor for each joint, the command could leave the convex set if two joint axes are almost parallel.
 
 The acceleration limit is a control barrier function (Ames et al., European Control Conference 2019). The command is
 continuous in state and effort, so the filter causes no chattering. RATE is low enough for the latency of an arm.
@@ -35,8 +35,8 @@ RATE = round(1 / (math.e * LATENCY_S))
 APPROACH = 0.25 * RATE  # 1/s, allowed speed per distance from a position limit: critical damping of the loop
 ALLOWED = 0.66  # share of dq_max that the filter allows; unmodeled friction adds to it (docs/explanation/safety.md)
 FADED = 0.82  # share of dq_max at which the policy's torque has faded out; it fades from ALLOWED on
-# Distance from a position limit at which the allowed speed towards it is 0: rad, but at most a tenth of the range.
-# From there on the policy's torque fades out over the share Q_FADE_SHARE of that distance.
+# Q_MARGIN: rad, distance from a position limit at which the allowed speed towards the limit is 0; at most a tenth of
+# the range. Closer to the limit, the policy's torque fades out over the share Q_FADE_SHARE of the distance.
 Q_MARGIN, Q_FADE_SHARE = 0.1, 0.6
 ENVELOPE_SHARE = 0.55  # share of the position-dependent velocity limit of an FR3 that the filter uses
 # s, time in which the allowed speed ramps down while braking. With 0.1 s the torque of the base joint reached 60 Nm,
@@ -69,7 +69,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
     The filter adds to light joints just enough inertia (column ADDED) that the largest target torque of any joint is
-    within the acceleration limit at rest. DELAY_PHASE bounds this inertia, which makes the loop faster than RATE.
+    within the acceleration limit at rest. DELAY_PHASE bounds the added inertia, because it speeds up the loop.
 
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
@@ -84,7 +84,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     mobility = InverseInertia(robot)(robot.q_home[None])[0]
     inertia = 1 / np.diag(mobility)
     most = (DELAY_PHASE / (RATE * LATENCY_S) - 1) * inertia
-    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm, with the strongest target torque's effect
+    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm, as effective as any joint's target torque
     out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.step_max
     return out

@@ -143,7 +143,7 @@ class Simulator:
             self._push[:] = self._push_limit = push_limit.columns(self.robot)
 
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
-        """Set the c commands (nsim, c) of each arm's control law until the next call of `command`.
+        """Set the commands (nsim, c) of the arms' control laws until the next call of `command`.
 
         speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: no noise.
         """

@@ -26,7 +26,7 @@ class JointForces(NamedTuple):
 
     dq: (n,) rad/s, joint velocities. drive: (n,) Nm, sum of torques without friction. friction: (n,) Nm, friction at
     dq. rest: (2, n) Nm, kinetic friction at zero speed in negative and positive direction. edges: (2, n) Nm,
-    breakaway torques in these directions, with at least the magnitude of `rest`; 0: no stiction.
+    negative and positive breakaway torques, with at least the magnitude of `rest`; 0: no stiction.
     """
 
     dq: np.ndarray
@@ -81,7 +81,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
             factor(root, root, side)
             solve(root, acceleration, side)
             j, direction = _farthest_beyond(mass, acceleration, forces, side)
-            if j < 0 or events > 4 * n:  # after so many stops no joint breaks away in this step
+            if j < 0 or events > 4 * n:  # after 4 n stops, no joint breaks away in this step
                 break
             side[j] = direction if coming[j] == 0.0 else np.sign(coming[j])
             on = side[j] * forces.dq[j] > 0.0  # the joint keeps its direction
@@ -113,7 +113,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
 
 @njit(cache=True, error_model="numpy")
 def _initial_sides(forces, dq_min, side, friction, coming):
-    """Write each joint's side, friction and velocity; return whether a HELD joint moves and whether all rest."""
+    """Write each joint's side, friction and velocity; return whether HELD joints move and whether all joints rest."""
     dq, drive, edges, n = forces.dq, forces.drive, forces.edges, len(forces.dq)
     slow, held, inside = False, 0, True
     for j in range(n):

@@ -38,7 +38,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
     The spec has the file's body and joint names, joint damping and friction. Joints in `lock` ({name: rad or m})
-    become fixed at these positions, and joints that mimic them at the resulting positions.
+    become fixed at these positions, and a joint that mimics one of them at the resulting position.
 
     Raises:
         UserError: the file is not XML, not URDF, or not an arm of revolute (or continuous) joints.
@@ -108,7 +108,7 @@ class _Reader:
         return out
 
     def _lock(self, at: dict[str, float]) -> None:
-        """Fix joints at positions `at` ({name: rad or m}), and joints that mimic them at the resulting ones."""
+        """Fix joints at positions `at` ({name: rad or m}), and each joint that mimics one accordingly."""
         for name in at:
             if name not in self.joints:
                 joints = choices(self.joints)
@@ -272,7 +272,7 @@ class _Reader:
         return mass, com, axes @ x @ axes.T
 
     def _shapes(self, body: mujoco.MjsBody, link: str) -> None:
-        """Add the boxes, cylinders and spheres of a link to its body, with contact flags for <collision>."""
+        """Add boxes, cylinders and spheres of a link to its body; only those in <collision> have contact flags."""
         kinds = mujoco.mjtGeom
         for tag in ("visual", "collision"):
             for element in self.links[link].findall(tag):

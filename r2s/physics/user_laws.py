@@ -1,7 +1,7 @@
 """Call a user's control or friction law from the cached compiled code of r2s.
 
-Compiling the code of r2s for a new law would take half a minute in every process. So only the law is compiled, and
-the code of r2s calls it by address. A law of r2s has a small number instead of an address. Addresses are below 2^53,
+Compiling the code of r2s for a new law would take half a minute in every process. So r2s compiles only the law, and
+calls the law by address. A law of r2s has a small number instead of an address. Addresses are below 2^53,
 so that a float64 represents them exactly.
 """
 

@@ -22,7 +22,7 @@ def speed_factors(recording: Recording) -> np.ndarray:
         if len(t) < 3:
             continue
         trend = np.linalg.qr(np.column_stack([np.ones(len(t)), t - t.mean()]))[0]
-        for j in range(recording.n_joints):  # one joint at a time saves memory: an hour of a log is large
+        for j in range(recording.n_joints):  # one joint at a time saves memory in a long log
             q, dq = recording.q[s, j], recording.dq[s, j]
             area = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(t) * (dq[1:] + dq[:-1]))])
             x, y = (v - trend @ (trend.T @ v) for v in (area, q - q[0]))

@@ -21,7 +21,7 @@ TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # kin
 NAMES = ("joint_names", "joints", "names", "name")  # names that an array of joint names may have in .npz or HDF5
 CURRENT = ("current", "i")  # columns of motor current, read instead of torque if the user sets a torque constant
 OPTIONAL = ("dq", "trajectory")
-WORDS = {  # field -> words for it in a column name that also contains the name of a joint
+WORDS = {  # field -> words that denote the field in a column name with a joint name
     "q": ("q", "position", "positions", "pos", "angle"),
     "dq": ("dq", "qd", "velocity", "velocities", "vel", "speed"),
     "tau": ("tau", "effort", "efforts", "torque"),
@@ -115,7 +115,7 @@ def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
 
 
 def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -> list[str]:
-    """Return one column per joint, named by the joint and a common one of `words`; [] if a joint has no column."""
+    """Return each joint's column, whose name has the joint and one of `words`; [] if a joint has no column."""
     found: dict[str, dict[int, str]] = {}
     for column in table:
         joint, rest = _joint_of(column, robot_joints)
@@ -141,7 +141,7 @@ def _check_order(names: list[str], field: str, robot_joints: Sequence[str]) -> N
 
 
 def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[str] | None, n: int | None) -> Table:
-    """Return the table with each (T, m) array reduced to the robot's joints, in the robot's order, found by name.
+    """Select and order the columns of (T, m) arrays by the robot's joint names; return the changed table.
 
     Args:
         table: {column name: array}. The first text array with a name in NAMES contains the file's joint names (m,).

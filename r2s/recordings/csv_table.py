@@ -1,4 +1,4 @@
-"""Read CSV files of spreadsheets, NumPy, ROS and vendors, with any separators, comments, units, decimal commas."""
+"""Read CSV files of spreadsheets, NumPy, ROS and vendors, with their separators, comments, units, decimal commas."""
 
 import csv
 import re
@@ -23,7 +23,7 @@ EXAMPLE = "t,q1,q2,...,dq1,dq2,...,tau1,tau2,..."
 def read_csv(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a CSV file by name, (T,) each.
 
-    The header is the line above the first numeric line; it may begin with `#` or `%`. Earlier lines are skipped.
+    The header is the line above the first numeric line and may begin with `#` or `%`; earlier lines are skipped.
 
     Raises:
         UserError: the file has no header, or header and rows differ in length.
@@ -37,7 +37,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
         raise UserError("cannot be read as csv: No columns to parse from file")
     plain = [k for k in filled if lines[k].lstrip()[0] not in MARKS]
     first: int | None = next((k for k in plain if _is_numeric(lines[k])), None)
-    if first is None:  # no line is numeric, as a column is text: the header is the first line
+    if first is None:  # no line is numeric, because a column is text: the header is the first line
         title = plain[0] if plain and plain[0] == filled[0] else filled[0]
         first = next((k for k in filled if k > title), title + 1)
     above = [k for k in filled if k < first]
@@ -65,7 +65,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbers(column: pd.Series) -> pd.Series:
-    """Convert a text column to numbers if only its last cell is cut off, such as "-" or "1.2e"."""
+    """Convert a column to numbers if its only text is a last cell that was cut off, such as "-" or "1.2e"."""
     text = column.dtype.kind not in "iufb" and len(column) > 1
     if not text or not re.fullmatch(r"[+-]?[\d.]*(e[+-]?)?", str(column.iloc[-1])):
         return column
@@ -98,7 +98,7 @@ def _encoding(head: bytes) -> str:
     try:
         head[: head.rfind(b"\n") + 1].decode("utf-8-sig")
     except UnicodeDecodeError:
-        return "latin-1"  # such as the degree sign in a German spreadsheet
+        return "latin-1"  # for example, a German spreadsheet with a degree sign
     return "utf-8-sig"
 
 

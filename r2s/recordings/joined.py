@@ -1,4 +1,4 @@
-"""Join recordings of one arm, with the same kind of torque, into one; each keeps its clock and trajectories."""
+"""Join recordings of one arm and one kind of torque; each recording keeps its clock and trajectories."""
 
 from collections.abc import Sequence
 from dataclasses import replace

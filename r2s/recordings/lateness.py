@@ -11,7 +11,7 @@ from r2s.recordings.recording import Recording
 COMPARED_S = 60.0  # s, total length of the parts of a recording in which dq is compared with q
 EDGE = 100  # ms that are ignored at both ends of a trajectory, where the filter has transients
 BLOCK = 500  # ms, length of blocks whose errors are treated as independent
-LATE_S, SURE = 5e-4, 3.0  # s (half a step) and standard deviations; lateness below either is not corrected
+LATE_S, SURE = 5e-4, 3.0  # s (half a step) and standard deviations; a lateness below either limit is not corrected
 OFF = 0.05  # share of the RMS speed; if the error of corrected dq is larger, dq is not the derivative of q
 
 

@@ -51,7 +51,7 @@ def dataset_files(folder: Path) -> list[Path]:
 def lerobot_table(folder: Path) -> Table:
     """Return t (T,) s, trajectory (T,), joint_names (m,) and, if stored, q, dq, tau, tau_J_d, current (T, m).
 
-    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. A torque in
+    t is frame_index / fps or, if these differ, the timestamp; `trajectory` is the episode index. A torque in
     `action` is returned as tau_J_d. Features of a gripper, hand or pose are ignored. The entry `reader_note` names
     the clock and features that were used.
 
@@ -94,7 +94,7 @@ def lerobot_table(folder: Path) -> Table:
 
 
 def _info(folder: Path) -> dict[str, Any]:
-    """Return the content of meta/info.json after checking it."""
+    """Check meta/info.json, and return the content of this file."""
     try:
         info = json.loads((folder / INFO).read_text())
         version, fps = str(info["codebase_version"]), info["fps"]
@@ -112,7 +112,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, int, float]]]:
-    """Return (field, joint, (feature, element index, factor to SI units)) for each element of an arm joint."""
+    """Return (field, joint, (feature, element index, factor to SI units)) of each element of an arm joint."""
     out = []
     for feature, spec in features.items():
         shape = spec["shape"]
@@ -121,7 +121,7 @@ def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, in
         of = re.findall(r"[a-z]+", feature.lower())
         for k, element in enumerate(_elements(spec.get("names"), shape[0])):
             words = re.findall(r"[a-z]+", element.lower())
-            # words of the feature have priority: a feature of effort may have elements such as `elbow.pos`
+            # words in the feature's name have priority: a feature of effort may have elements such as `elbow.pos`
             field = next((WORDS[w] for w in [*reversed(of), *reversed(words)] if w in WORDS), None)
             field, action = field or ("q" if "state" in of else None), "action" in of
             if field is None or set(OTHERS) & {*words, *of} or (action and field != "tau"):

@@ -12,17 +12,17 @@ from r2s.recordings.recording import Recording
 
 M_MMAP_THRESHOLD, MAPPED = -3, 4 << 20  # option of glibc's mallopt(3); bytes
 LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of MB
-MANY = 10  # parts; only a recording longer than LONG_S has more
+MANY = 10  # number of parts; only a recording longer than LONG_S has more parts
 
 
 def give_back(recording: Recording) -> None:
-    """Release freed memory to the operating system after a long recording: glibc retains blocks of up to 32 MB."""
+    """Return freed memory to the operating system after a long recording: glibc retains blocks of up to 32 MB."""
     if recording.duration > LONG_S:
         _trim()
 
 
 def _trim() -> None:
-    """Release freed memory to the operating system; later, release blocks above MAPPED bytes when they are freed."""
+    """Return freed memory to the operating system, now and whenever a block above MAPPED bytes is freed later."""
     libc: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
     if hasattr(libc, "malloc_trim"):  # musl has no malloc_trim
         libc.mallopt(M_MMAP_THRESHOLD, MAPPED)
@@ -35,14 +35,14 @@ def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np
     for name in names:
         out[name] = np.concatenate([vars(part).pop(name) for part in parts])
         if len(parts) > MANY and out[name].nbytes > MAPPED:
-            _trim()  # only here: mapping large blocks one by one slows a short identification
+            _trim()  # only for many parts: mapping large blocks one by one slows a short identification
     return out
 
 
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:
     """Yield pieces of about `seconds` s in the order of the log; in a trajectory, pieces overlap by `overlap_s` s.
 
-    The last piece includes the rest of the log, because this rest alone may be too short to filter.
+    The last piece includes the remaining rows, which alone may be too few to filter.
     """
     if recording.duration <= 1.5 * seconds:
         yield recording

@@ -10,13 +10,13 @@ from itertools import pairwise
 import numpy as np
 
 STEP = 0.02  # s, grid of the comparison
-MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances; peak to peak about 10
+MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances; its range is then about 10
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
 MAX_COMPARED = 60  # limit on the tracks compared with one track and on the pieces in `overlap`, for speed
 PIECE_S, PIECE_MOTION = 1.0, 2.0  # least duration (s) and range (standard deviations of the motion) of a piece
 TRACKING = 0.03  # rad RMS, difference between two repetitions, each with 15 to 20 mrad of tracking error
-# smallest and largest tolerance, in standard deviations; at 0.2 single joints of unrelated motion match
+# smallest and largest tolerance, in standard deviations of an angle; at 0.2, unrelated motions of a joint match
 SIMILAR = 0.04, 0.12
 STILL = 0.25  # lower bound on a joint's standard deviation, relative to the largest of all joints
 
@@ -41,7 +41,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return tracks of at least OVERLAP_S: one per stretch (`each`) or per part without restart or long pause."""
+    """Return tracks of at least OVERLAP_S: one per stretch (`each`) or per part without restart and long pause."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -98,9 +98,9 @@ def _deviation(tracks: Sequence[Track]) -> np.ndarray:
 
 
 def _tolerance(tracks: Sequence[Track]) -> np.ndarray:
-    """Return the RMS distance (n,) rad, per joint, below which two pieces of motion in `tracks` count as the same.
+    """Return the RMS distance (n,) rad, per joint, below which two pieces of motion in `tracks` are treated as equal.
 
-    It is TRACKING, clipped to the range SIMILAR times the joint's standard deviation.
+    The distance is TRACKING, clipped to the range SIMILAR times the joint's standard deviation (lower bound: STILL).
     """
     deviation = _deviation(tracks)
     return np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -149,7 +149,7 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest ratio (L,) of a joint's RMS distance between a and b to its tolerance (n,) rad, at L lags.
+    """Return the largest ratio (L,), over joints, of RMS distance between a and b to tolerance (n,) rad, at L lags.
 
     Also return the number of common rows (L,). The ratio is inf at a lag if the common rows last less than OVERLAP_S,
     or if no joint moves by MIN_MOTION.
@@ -172,7 +172,7 @@ def _own_lag(track: Track, tolerance: np.ndarray) -> int | None:
 
 
 def _lag(a: Track, b: Track, tolerance: np.ndarray) -> int | None:
-    """Return the lag, in rows, at which b repeats a, or None; of several lags, that with the most rows in common."""
+    """Return the lag, in rows, at which b repeats a (None: no lag); of several, that with the most common rows."""
     error, count = _errors(a.q, b.q, tolerance)
     runs = _runs(error < 1.0)
     if not runs:

@@ -17,7 +17,7 @@ from r2s.recordings.robot_logs import Table
 
 OWN = {*FIELDS, "torque", "name", "joint", "sign", "pose"}  # arrays that `Ramps.save` writes
 MIN_RISE = 1e-3  # Nm; a command that changes by less is treated as constant
-BREAKAWAY = 2e-3  # rad; a joint that has moved this far has broken away or is about to
+BREAKAWAY = 2e-3  # rad; a joint that has moved this far has broken away or soon will
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Ramps:
 
     Attributes:
         recording: motion with commanded torque; identification uses t, and the ramped joint's q and tau.
-        joint, sign, pose: ramped joint (from 0), direction (1 or -1), posture (from 0), each (K,) or a single value.
+        joint, sign, pose: ramped joint (from 0), direction (1, -1), posture index (from 0); each (K,) or one value.
 
     Raises:
         UserError: the torque is not commanded, or `joint`, `sign` or `pose` has a wrong shape or value.
@@ -67,15 +67,15 @@ def read_ramps(
     n_joints: int | None = None,
     max_gap_s: float | None = None,
 ) -> Ramps:
-    """Read ramps from a file of `Ramps.save`, or from a log in any format of `readers.read`.
+    """Read ramps from a file that `Ramps.save` wrote, or from a log in any format of `readers.read`.
 
     A log needs columns t (s), q (rad), tau_J_d or tau (commanded torque, Nm), optionally dq (rad/s), and columns
     `joint` (from 1) and `sign` (1 or -1) with a value per row or per ramp. A new ramp begins where the value of
     `joint`, `sign`, `trajectory` or `segment` changes, where t restarts, and after a gap in t.
 
     Args:
-        path: the file.
-        columns: column names in the file, see `readers.read`.
+        path: file of ramps.
+        columns: {field: column name} of a log, see `readers.read`.
         n_joints: expected number of joints.
         max_gap_s: s; a longer time step separates ramps; None: see `longest_step`.
 

@@ -67,25 +67,25 @@ def read(
         columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. Default names
             are in DEFAULT_COLUMNS; for tau, the name in TAU has priority. For q, dq and tau, a name stands for one
             array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... In a name,
-            `{j}` (from 1) or `{i}` (from 0) stands for the joint number. Instead of a name, a list may contain one
-            column name per joint. In HDF5 a column name is the path of a dataset, such as robot/q.
+            `{j}` (from 1) or `{i}` (from 0) stands for the joint number. A list of names has one column name per
+            joint. In HDF5 a column name is the path of a dataset, such as robot/q.
         n_joints: expected number of joints.
         max_gap_s: s, longest time step within a trajectory; None: see `longest_step`; inf: gaps end no trajectory.
-        period: period of the motion, s, see `Recording`.
+        period: s, period of the motion, see `Recording`.
         name: name of the recording; None: the file name without its suffix.
         topic: ROS topic to read from a bag, see `bag_table`.
         joints, model_joints: the robot's joint names in the file, and in the robot description. `by_names` and
             `choose_joints` select and sort the file's joints by these names.
         torque_constant: (n,) or one value, Nm/A at the joint, with gear ratio; if set, `tau` is a motor current.
-        limits: (lowest, highest) q of the robot, (n,) rad each; angles outside are shifted inside by revolutions.
+        limits: (lowest, highest) q of the robot, (n,) rad each; angles beyond them are shifted inside by revolutions.
 
     Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. Clock
-    restarts also separate trajectories, except in bags and in files with a column `trajectory`. Faults with only one
-    remedy are repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file that
+    restarts also separate trajectories, except in bags and in files with a column `trajectory`. Log faults with only
+    one remedy are repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file that
     `Recording.save` wrote is restored unchanged.
 
     Raises:
-        UserError: the file or a column is missing or damaged, or its values are no valid recording.
+        UserError: the file or a column is missing or damaged, or the values are no valid recording.
     """
     constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
@@ -235,7 +235,7 @@ def _numbers(table: Table, name: str) -> np.ndarray:
 
 
 def files_of(path: str | os.PathLike) -> list[Path]:
-    """Return the files of a recording: `path` itself, or the files in it if it is a ROS 2 bag or LeRobotDataset."""
+    """Return the files of a recording: `path` itself, or the files in the folder of a ROS 2 bag or LeRobotDataset."""
     path = Path(path).expanduser()
     if is_dataset(path):
         return dataset_files(path)

@@ -168,7 +168,7 @@ class Recording:
 
         A command acts until the next command, so commanded torque is averaged over each step of `dt`. There is no
         anti-aliasing filter: to lower the rate, resample at the logged rate, call `smooth`, then resample again. A
-        new row contains the last logged `signals`, because flags and poses cannot be interpolated. Trajectories
+        resampled row has the last logged `signals`, because flags and poses cannot be interpolated. Trajectories
         shorter than `dt` are dropped.
         """
         _positive("dt", dt, "s")
@@ -215,7 +215,7 @@ class Recording:
     def smooth(self, cutoff_hz: float) -> "Recording":
         """Low-pass q, dq and tau without delay, by a Butterworth filter of order 4 forwards and then backwards.
 
-        Both passes together have a gain of -6 dB at the cutoff. Time steps must be uniform (see `resample`).
+        The two passes together have a gain of -6 dB at the cutoff. Time steps must be uniform (see `resample`).
         """
         _positive("cutoff_hz", cutoff_hz, "Hz")
         steps, rate = self._steps(), self.rate_hz
@@ -247,8 +247,8 @@ class Recording:
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        In a repetition of at least 0.5 s, the RMS difference of each joint is below its tolerance (about 0.03 rad),
-        and a joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a clock restart.
+        A repetition lasts at least 0.5 s; the RMS difference of each joint is below a tolerance (about 0.03 rad), and
+        a joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a clock restart.
         """
         return self._period_and_clock()[0]
 
@@ -267,7 +267,7 @@ class Recording:
             period, shift = find_period(tracks)
             if period is None:
                 continue
-            # trajectories that were started by hand may not match a period found on the log's clock
+            # trajectories that were started by hand may not be in phase with a period found on the log's clock
             if best is None or np.abs((shift + 0.5 * best) % best - 0.5 * best).max() > SPLIT_GUARD_S / 2:
                 best, clock = period, self.t.copy()
                 for track, late in zip(tracks, shift, strict=True):
@@ -278,7 +278,7 @@ class Recording:
     def overlap(self, training: "Recording") -> float:
         """Return the share (0 to 1) of this recording's motion that occurs in `training` (see `periodicity.overlap`).
 
-        Pieces with too little motion are ignored. A motion may occur at different times in the two recordings.
+        Pieces of this recording with too little motion are ignored. The time at which a motion occurs has no effect.
         """
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
@@ -291,8 +291,8 @@ class Recording:
         2. Without a period, but with several trajectories, validation consists of the last trajectories.
         3. Without a period and with one trajectory, validation is the end of the recording.
 
-        In cases 1 and 3, training has no rows within 0.1 s of a validation row. Trajectories of a single row are
-        dropped from training and validation.
+        Unless whole trajectories are separated (case 2), training has no rows within 0.1 s of a validation row.
+        Trajectories of a single row are dropped from training and validation.
         """
         if not 0 < validation_fraction < 1:
             raise UserError(f"validation_fraction: expected a number in (0, 1), got {validation_fraction}")
@@ -334,7 +334,7 @@ class Recording:
     def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
         """Return the rows with indices `rows` (K,) as a recording with the trajectory indices `trajectory` (K,).
 
-        drop_lone: whether to drop trajectories of a single row. Arrays of consecutive rows are views, not copies.
+        drop_lone: whether to drop trajectories of a single row. If `rows` are consecutive, the new arrays are views.
         """
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1

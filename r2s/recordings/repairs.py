@@ -1,4 +1,4 @@
-"""Repair log faults with only one remedy: swapped, repeated or held rows, zero stamps, wrapped or misread angles.
+"""Repair log faults with only one remedy: swapped rows, repeats, zero stamps, wrapped or misread angles.
 
 Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired, but
 reported by `Recording` or by the checks of an identification.
@@ -11,13 +11,13 @@ import numpy as np
 Arrays = dict[str, np.ndarray]  # t (T,), trajectory (T,), q, dq, tau (T, n)
 
 MOST_SWAPPED = 10  # rows; a row that is farther out of place indicates two interleaved logs
-JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: misread q jumps by more than all three, and back
+JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: misread q jumps by more than each, and back
 AWAY, MOST_FAILED = 10, 0.01  # largest number of successive rows, and share of all rows, with misread q
 FIRST_STEP = 100  # median steps; zero stamps are dropped only if the first valid stamp is larger than this
 REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad; at a wrap, q jumps by a revolution, plus or minus a motion below NEAR
 SLACK = 0.05  # rad by which a logged angle may exceed a joint limit
 LEAST_HELD = 2.0  # rows, least median length of a hold: a run of rows with equal values
-REGULAR = 0.8  # least share of holds near the median length; the length varies for a coarse encoder
+REGULAR = 0.8  # least share of holds whose length is near the median; with a coarse encoder, lengths vary
 MOVES = 0.2  # rad, least motion of a log in which holds are removed
 
 
@@ -54,7 +54,7 @@ def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
 def _failed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of the rows with misread q: a joint's angle jumps, and jumps back within AWAY rows."""
     out, fast = np.zeros(len(q), dtype=bool), FASTEST * np.maximum(np.diff(t), 0.0)
-    for x in q.T:  # one joint at a time: an hour of a log is large
+    for x in q.T:  # one joint at a time saves memory in a long log
         step = np.abs(np.diff(x))
         least = max(JUMP, JUMPS * float(np.median(step)))
         for first, back in pairwise((np.flatnonzero(step > np.maximum(least, fast)) + 1).tolist()):

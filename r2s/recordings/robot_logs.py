@@ -69,7 +69,7 @@ def _last_number(name: str) -> int:
 
 
 def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-    """Shift the logged tau_J_d (T, n) Nm by one cycle, so that each state is paired with the command that followed.
+    """Shift the logged tau_J_d (T, n) Nm by one cycle, so that each state is paired with the next command.
 
     A Franka state at t (T,) s contains the command of the previous cycle, but a `Recording` (`r2s.arm.recorder`)
     pairs a state with the next command. If the log is slower than the control cycle, shifted commands are
@@ -99,7 +99,7 @@ def bag_table(
 
     t starts at 0 and comes from the header stamps, or from bag time if all stamps are 0. Messages that lack joints of
     the robot, such as a gripper's, are ignored. Messages are sorted by time, and repeated messages are dropped. The
-    entry `reader_note` counts omitted messages: those with stamp 0, and those before the first with values.
+    entry `reader_note` counts omitted messages: those with stamp 0, and those before the first complete message.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap file, or the folder of a ROS 2 bag.
@@ -129,7 +129,7 @@ def bag_table(
     stamp, table = _in_order(stamp[use], {field: x[use] for field, x in table.items()})
     if notes:
         table["reader_note"] = np.array("; ".join(notes))
-    table["t"] = (stamp - stamp[0]) * 1e-9  # subtracts integers: as floats, seconds since 1970 resolve only 0.2 us
+    table["t"] = (stamp - stamp[0]) * 1e-9  # integer difference: a float of seconds since 1970 resolves only 0.2 us
     if "tau_J_d" in table:
         table["tau_J_d"] = shift_command(table["t"], table["tau_J_d"])
     return table
@@ -140,9 +140,9 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    A log's order may differ, because some ROS 2 drivers sort joints by name. The first applicable rule is used: (1)
+    Logs may order joints differently: some ROS 2 drivers sort them by name. The first applicable rule is used: (1)
     `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix as in panda_joint1; (3) n names that
-    differ only in a number, sorted by this number; (4) the first n names, if n is 1 or `model_joints` empty.
+    differ only in a number, sorted by this number; (4) the first n names, if n is 1 or `model_joints` is empty.
 
     Args:
         logged: joint names in the log.
@@ -188,7 +188,7 @@ def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
     """Read a topic (None: the only readable topic); return the topic's name and messages."""
     rosbag1, rosbag2 = (optional_import(f"rosbags.rosbag{k}", "reading this file", "recordings") for k in (1, 2))
     try:
-        # only this topic is decoded: others may have unknown message types
+        # only this topic is decoded: other topics may have unknown message types
         ros1 = path.is_file() and path.suffix.lower() == ".bag"
         with (rosbag1 if ros1 else rosbag2).Reader(path) as reader:
             topic, connections = _pick_topic(reader.connections, topic)
@@ -272,7 +272,7 @@ def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _pick_joints(topic: str, samples: list[Sample], joints, model_joints, n_joints) -> tuple[list[Sample], Layouts]:
-    """Return the messages with all joints of the robot, and {joint names in a message: indices of these joints}."""
+    """Return the messages with all joints of the robot, and {names in a message: indices of the robot's joints}."""
     layouts = dict.fromkeys(s.names for s in samples)
     logged = list(dict.fromkeys(name for names in layouts for name in names))
     if not logged:

@@ -23,8 +23,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
     """Return the standard deviation (n,) rad/s of the velocity noise; 0 if no recording has a rate of at least 80 Hz.
 
     The noise is dq minus a reference velocity, the slope of a cubic fit to q (Savitzky and Golay, Analytical
-    Chemistry 36(8), 1964). At low acceleration, this slope is accurate, and a delay of dq has no effect. Therefore,
-    the result is the median over the 10 % of all 50 ms pieces that have the least acceleration, computed from q.
+    Chemistry 36(8), 1964). At low acceleration, the fitted slope is accurate, and a delay of dq has no effect. The
+    result is the median over the 10 % of all 50 ms pieces in which the acceleration, computed from q, is smallest.
 
     Raises:
         UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.

@@ -13,12 +13,12 @@ Item = str | list[str] | pd.DataFrame | Path  # paragraph, bullets, table, pictu
 
 
 def doubtful(cell: str) -> bool:
-    """Return whether a cell shows a poorly identifiable value."""
+    """Return whether a table cell marks its value as poorly identifiable ("?") or as kept nominal."""
     return any(line.endswith(("?", "kept", KEPT)) for line in cell.split("\n"))
 
 
 def report_markdown(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
-    """Write report.md from {heading: items}; the first heading is the title; links to figures are relative."""
+    """Write report.md from {heading: items}; the first heading is the title; links to figures are relative paths."""
     lines: list[str] = []
     for i, (heading, items) in enumerate(sections.items()):
         lines += [f"{'#' if i == 0 else '##'} {heading}", ""]

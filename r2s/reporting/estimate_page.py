@@ -1,4 +1,4 @@
-"""Draw figures and write the rerun recording of stage=estimate: each value over time, with its 95 % interval."""
+"""Draw figures and write the rerun recording of stage=estimate: each estimate over time, with its 95 % interval."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and limits 
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
-    """Draw payload and friction over time from `rows` (`offline_estimation.table`), with lines at `changes`, s."""
+    """Draw payload and friction in `rows` (`offline_estimation.table`) over time; mark the times `changes`, s."""
     t, colour = rows["t"].to_numpy(), colours(["estimate"])["estimate"]
 
     def band(axis, name: str, title: str, label: str, scale: float = 1.0) -> None:
@@ -67,7 +67,7 @@ def write_estimate_recording(
 
 
 def _log_columns(stream: rr.RecordingStream, table: pd.DataFrame, names: Sequence[str]) -> None:
-    """Log each column in `names` over time, column `t`, with the limits of its 95 % interval."""
+    """Log the columns `names` of a table over the column `t`, and the limits of the 95 % intervals of the columns."""
     index = [rr.TimeColumn("time", duration=table["t"].to_numpy())]
     colour = colours(["estimate"])["estimate"]
     for name in names:

@@ -42,7 +42,7 @@ def excitation_page(
 
 
 def motion_figure(path: Any, robot: Robot, motion: Excitation) -> Any:
-    """Draw joint angles with their limits, and velocities, over time."""
+    """Draw joint angles, limits of the angles, and joint velocities over time."""
     some = thin(len(motion.t))
     low, high = robot.q_range
     with joint_panels(path, robot.n, "planned motion") as axes:

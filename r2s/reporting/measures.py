@@ -6,7 +6,7 @@ from r2s.tasks.measures import MeasureTable, read_measures
 
 
 def measures_of(folder: Path) -> MeasureTable:
-    """Return the table in measures.json; for an older run without this file, infer the task's table from its rows.
+    """Return the table in measures.json; for an older run without this file, infer the table from the run's results.
 
     Raises:
         UserError: measures.json is damaged.

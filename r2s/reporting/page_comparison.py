@@ -1,4 +1,4 @@
-"""Compare the table cells of two versions of a page of benchmarks/results, including the intervals in the cells.
+"""Compare the table cells, including their intervals, in two versions of a page from benchmarks/results.
 
 Cells are matched by section, row and column, so added rows and changed paragraphs do not affect the comparison.
 """
@@ -17,7 +17,7 @@ Cell = tuple[str, str, str]  # section, row, column
 
 
 def table_cells(page: str) -> dict[Cell, str]:
-    """Return {(section, row, column): cell} for all tables in a markdown page; repeated names are numbered."""
+    """Return {(section, row, column): cell} of all tables in a page; repeated row and column names get a number."""
     cells: dict[Cell, str] = {}
     for section, head, rows in _tables(page):
         columns, names = _numbered(head), _numbered([row[0] for row in rows])
@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Remove the rows of all tables from a page, so that tables that are not computed again have only a head."""
+    """Return a page without table rows, so that a table that is not computed again has only a head."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -41,8 +41,8 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
     """Compare all cells of two pages; return a row per cell: section, row, column, committed, now, verdict, change.
 
     `verdict` is one of VERDICTS: with "last digit", numbers differ by at most one unit of their last digits; with
-    "beyond intervals", an interval in the cell does not overlap with the interval that replaces it. `change` is the
-    largest relative change of a number in the cell; NaN if old and new cell differ in how many numbers they contain.
+    "beyond intervals", an interval of the old cell does not overlap with its counterpart in the new cell. `change` is
+    the largest relative change of a number in the cell; NaN without numbers or if the count of numbers changes.
     """
     old, new = table_cells(before), table_cells(now)
     rows = []
@@ -54,7 +54,7 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
 
 
 def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
-    """Compare each page in {page: text}; return one table. With several pages, section names begin with the page."""
+    """Compare each page in {page: text}; return one table. With several pages, sections begin with the page name."""
     parts = []
     for page, text in before.items():
         cells = compare_pages(text, now[page])

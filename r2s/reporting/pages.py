@@ -1,4 +1,4 @@
-"""Write figures, report.md and recording.rrd of a training, a transfer and a pipeline."""
+"""Write figures and recording.rrd of a training, a transfer or a pipeline, and report.md of the last two."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -49,7 +49,7 @@ def transfer(
     Args:
         run, robot: the run and its arm. episodes: {simulator or arm: episodes}. rows: {simulator or arm: measures}.
         torque: (n,) Nm, the policy's torque limits. timing: latencies of the arm's control cycles; None: no arm.
-        stops: stops of the arm, with their reasons. halted: reason why episodes were not run; None: all were run.
+        stops: stops of the arm, with their reasons. halted: reason why episodes were not run; None: all episodes ran.
     """
     measures = measures_of(run.folder)
     shown = {label: first(e) for label, e in episodes.items()}

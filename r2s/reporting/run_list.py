@@ -16,7 +16,7 @@ from r2s.runs import status_of
 
 LOST = ("failed", "killed")
 COLUMNS = ["status", "age", "result"]
-LONGEST = 46  # letters to which a terminal cuts run names; the time at their beginning still identifies the runs
+LONGEST = 46  # letters to which r2s cuts run names in a terminal; the time at the start of a name identifies the run
 LEAST = 20  # letters of a result that are always shown
 
 
@@ -43,7 +43,7 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
 
 
 def print_runs(console: Console, runs: pd.DataFrame, title: str) -> None:
-    """Print `run_rows` with a line per run; lines are cut to the width of a terminal, but not in a file or pipe."""
+    """Print `runs`, a table of `run_rows`, with a line per run; in a terminal, cut lines to the terminal's width."""
     rows = [("run", *runs.columns), *((str(name), *map(str, row)) for name, row in runs.iterrows())]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     if console.is_terminal:

@@ -19,7 +19,7 @@ def number(value: float | None, form: str = "{:.3g}") -> str:
 
 
 def measure_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return `rows`, {simulator or arm: row of evaluations.csv}, as a table of strings with a line per label."""
+    """Return a table of strings with a line per key of `rows`, {simulator or arm: row of evaluations.csv}."""
     return _table([measures[key] for key in measures.rows], rows, measures.corner, decimals=1)
 
 
@@ -56,7 +56,7 @@ def scores_rows(measures: MeasureTable, scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, Mapping], title: str) -> None:
-    """Print `measure_rows`."""
+    """Print the table of `measure_rows`."""
     print_table(console, measure_rows(measures, rows), title)
 
 

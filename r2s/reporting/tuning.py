@@ -14,7 +14,7 @@ from r2s.reporting.document import Item, report_markdown
 from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
-ORDERS = 2000  # random orders of a grid: the standard error of their mean is then 1 / 45 of their spread
+ORDERS = 2000  # random orders of a grid's jobs: a mean over them has a standard error of 1 / 45 of the spread
 SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of the search's training time, summed over its trials
 
 
@@ -32,7 +32,7 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) of the trials that end within `at` (K,) s, if trials run one after another.
+    """Return the best value (K,) of the trials that end within `at` (K,) s, if trials of `spent` s run in sequence.
 
     Pruned and failed trials use compute, but their value is nan. sign: 1 if a larger value is better, else -1.
     """

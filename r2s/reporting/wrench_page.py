@@ -18,7 +18,7 @@ from r2s.reporting.viewer.layout import log_series, rgb
 DRAWN_HZ = 100.0
 FORCES = [f"force_{c}_N" for c in "xyz"]
 FRANKA = "Franka's O_F_ext_hat_K"
-METRES = 0.01  # m, length of the arrow per N
+METRES = 0.01  # m per N, scale of the force arrow
 CONE = 24  # number of points on the cone's edge
 TOUCH, NONE = "#cc0018", "#7f8790"
 
@@ -86,7 +86,7 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
     """Return the 95 % cone of the force's direction as lines: the cone's edge, and four lines from tip to edge.
 
-    In each direction normal to the force, the edge lies half a 95 % interval of the force from the arrow's end.
+    In each direction normal to the force, half the force's 95 % interval separates the edge from the arrow's end.
     """
     size = max(float(np.linalg.norm(force)), 1e-9)
     across = np.linalg.svd(force[None] / size)[2][1:]

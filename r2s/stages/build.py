@@ -58,7 +58,7 @@ def make_dynamics(cfg, robot, announce=False):
     """Return the dynamics of `base_dynamics`, prepared for contact if the task of conf/task touches a surface.
 
     During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. If
-    `announce`, print a line when this changes the stiction model.
+    `announce`, print a line if contact changes the stiction model.
     """
     dynamics = base_dynamics(cfg, robot)
     if not getattr(target(cfg.task, "task"), "touches", False):

@@ -12,7 +12,7 @@ def reads(cfg):
 
 
 def compare(cfg, overrides):
-    """Compare the trainings that `runs=` matches; if it matches only transfers, compare their adapters."""
+    """Compare the trainings that `runs=` matches; if only transfers match, compare their adapters."""
     from glob import glob
 
     from r2s.errors import UserError

@@ -25,8 +25,8 @@ class ArmData:
         excitation_seed: seed of the training motion; the validation motion has the next seed.
         excitation: file of the training motion; None: r2s optimizes this motion.
         ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
-        presses: how often the tool presses on a surface and slides, in place of the motions above; 0: never.
-        press_point, press_normal: (3,) m and (3,), rough plane; None: a work table below the tip in the home posture.
+        presses: number of contact motions (press and slide), which replace all motions without contact; 0: none.
+        press_point, press_normal: (3,) m and (3,), nominal plane; None: work table below the tip in the home posture.
 
     Raises:
         UserError: a value is outside its range.
@@ -114,7 +114,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with the hold of data.command_hz; if unset, print the assumed hold if it is long."""
+        """Return the recording with the hold from data.command_hz; if unset, print an assumed hold above SLOW_MS."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -240,7 +240,7 @@ def check_cutoff(cutoff_hz, recordings):
 
 
 def read_user_ramps(robot, file):
-    """Return the ramps in `file.ramps`, or None if unset; their columns have the same names as in the recording."""
+    """Return the ramps in `file.ramps`, or None if unset; the columns of ramps and recording have equal names."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
 
@@ -282,7 +282,7 @@ def record_motion(cfg, robot, motion, k, label, timing):
     if motion is None:
         seed, gravity = cfg.data.excitation_seed + k, cfg.data.torque == "measured"
         motion = fourier(within_speed_share(cfg, robot), duration=cfg.data.seconds, seed=seed, gravity=gravity)
-    with opened_source(cfg, robot, k) as arm:  # one client at a time
+    with opened_source(cfg, robot, k) as arm:  # an arm accepts one client at a time
         how = {"torque": cfg.data.torque, "timing": timing}
         out = record(arm, motion, **how, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")

@@ -133,7 +133,7 @@ def format_contacts(touched):
 
 
 def given_recording(cfg, robot):
-    """Return the recording of data=recording with one row per millisecond, or None if an arm will be recorded.
+    """Return the recording of data=recording with one row per millisecond, or None if r2s will record an arm.
 
     Raises:
         UserError: the file is missing or lacks commanded torque, or a setting of the arm is wrong.

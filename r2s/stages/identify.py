@@ -40,7 +40,7 @@ def reads(cfg):
 class Parts:
     """Inputs of an identification, checked before a run folder is made.
 
-    Without data=recording, `groups` and `ramps` are recorded later. motion: data.excitation. earlier: identify.from.
+    groups, ramps: recorded later unless data=recording. motion: from data.excitation. earlier: from identify.from.
     """
 
     robot: Any

@@ -70,7 +70,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
 def arguments(make: Callable[..., Any]) -> dict[str, Any]:
     """Return {argument: type hint} of a function or class.
 
-    For **kwargs of an __init__, add the arguments of the next class in the MRO; for those of a function, add "**".
+    For **kwargs of an __init__, add the arguments of the next class in the MRO; for **kwargs of a function, add "**".
     """
     found: dict[str, Any] = {}
     for owner in make.__mro__[:-1] if inspect.isclass(make) else (make,):

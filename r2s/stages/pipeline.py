@@ -58,7 +58,7 @@ def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
 
 
 def run_step(words: dict[str, list[str]]) -> None:
-    """Run the commands {label: words} in parallel; print the progress of each and, when it ends, its tables.
+    """Run the commands {label: words} in parallel; print each command's progress and, at its end, its tables.
 
     Raises:
         UserError: a command failed; the remaining commands are terminated.
@@ -107,12 +107,12 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Group the commands of a step that run in parallel: all in one group, or if an arm `moves`, each in its own."""
+    """Group the commands of a step that run in parallel: all in one group; if an arm `moves`, one per group."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
 def command_prefix() -> list[str]:
-    """Return the command that starts r2s again, from the same checkout or package with the same --config-dir."""
+    """Return the command that starts r2s again, from this job's checkout or package, with this job's --config-dir."""
     from hydra.core.hydra_config import HydraConfig
 
     program = [str(PACKAGE.parent / "run.py")] if CONF.parent != PACKAGE else ["-m", "r2s"]
@@ -244,7 +244,7 @@ def tool_words(cfg: Any) -> list[str]:
 
 
 def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrides: Sequence[str]) -> None:
-    """In trainings on the identified model, set task.friction, if the task has this key, to the identified value."""
+    """Set task.friction to the identified value in trainings on the identified model, if the task has this key."""
     from r2s.identification.contact.contact_file import load_contact
 
     if "friction" not in cfg.task or any(o.startswith("task.friction=") for o in overrides):
@@ -254,7 +254,7 @@ def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrid
 
 
 def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
-    """Raise UserError if identification or training would refuse an override, before the arm moves."""
+    """Before the arm moves, raise UserError if identification or training would refuse an override."""
     first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
     identify.make_parts(compose_step(first["identify"], "stage=identify"))
     train.make_parts(compose_step(trained["nominal"], "stage=train"))  # other trainings need the identified model

@@ -1,4 +1,4 @@
-"""Make the prior of stage=identify from stated values (identify.prior.PARAMETER.mean=) and a run (identify.from=)."""
+"""Make the prior of stage=identify from stated values (identify.prior.PARAMETER.mean=) and identify.from=."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -63,7 +63,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
 
     Args:
         earlier: list of `Earlier`, whose links and payload enter the prior. An `Earlier` with the same kind of torque
-            also provides all other values, friction family and terms, so that both identifications share a model.
+            also provides all other values, friction family and terms, so that old and new model have equal form.
         last: whether r2s fits this kind of torque last; earlier fits use only the stated values of links and payload.
     """
     from r2s.identification.known import BODY, Known, block_of

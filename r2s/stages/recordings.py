@@ -1,4 +1,4 @@
-"""Find and read the recordings for stage=identify and `r2s check`; each of the files has one kind of torque.
+"""Find and read the recordings for stage=identify and `r2s check`; each file has one kind of torque.
 
 `data.path` and `data.validation` each name a file, a pattern such as "logs/*.csv", a dict such as
 {path: FILE, torque: motor}, or a list of these. The keys of such a dict override the settings in `data`.
@@ -62,7 +62,7 @@ def recording_files(cfg, key="path"):
 
 
 def _matching(where: str, path: str) -> Iterator[str]:
-    """Yield the files that match a pattern, in alphabetical order; if the path exists or is no pattern, yield it."""
+    """Yield the files that match `path` in alphabetical order, or `path` itself if it exists or is no pattern."""
     if not glob.has_magic(path) or located(path).exists():
         yield path
         return

@@ -1,4 +1,4 @@
-"""stage=results: reproduce a page of benchmarks/results in a clean clone of this commit; compare both pages.
+"""stage=results: reproduce a page of benchmarks/results in a clean clone of this commit; compare new and old page.
 
 `python run.py -m +experiment=results` reproduces all pages that docs/results.md cites.
 """
@@ -78,7 +78,7 @@ def results(cfg, overrides):
 def cloned(clone, paths):
     """Clone this commit unless the clone exists; return {page: committed text, or ""} and the hash of the commit.
 
-    In the pages of the clone, all tables lose their rows; a table that no command fills then stays empty. The clone
+    r2s removes the rows of all tables in the clone's pages, so a table that no command fills stays empty. The clone
     has a temporary name until the clone is complete.
     """
     from r2s.reporting.page_comparison import without_rows
@@ -100,7 +100,7 @@ def cloned(clone, paths):
 
 
 def execute(words, clone, log):
-    """Run `python WORDS`, or WORDS if they begin with make, in the clone with its r2s; append the output to `log`.
+    """Run `python WORDS`, or WORDS that begin with make, in the clone with its own r2s; append the output to `log`.
 
     Raises:
         UserError: the command fails; the message quotes the last line of output.

@@ -53,7 +53,7 @@ def run_config(folder, trust=None):
     """Read config.yaml of a run folder, check it with `checked`, and return it.
 
     Raises:
-        UserError: the file cannot be read, or names a part that is neither in r2s nor in a module of `trust`.
+        UserError: the file cannot be read, or names code that is neither in r2s nor in a module of `trust`.
     """
     return checked(loaded(Path(folder) / "config.yaml"), Path(folder) / "config.yaml", trust)
 

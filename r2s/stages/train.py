@@ -52,7 +52,7 @@ def reads(cfg):
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a training, made before the run folder, so that a config error creates no folder.
+    """Objects for a training, made before the run folder, so that a config error creates no folder.
 
     For a controller without learning, `algo` is the controller, and `env` and all later attributes are None.
     """

@@ -3,8 +3,8 @@
 A training maximizes the mean reward r subject to mean costs c_k <= d_k (constrained Markov decision process, Altman
 1999). The policy maximizes r - sum_k lambda_k c_k / d_k, where the rate of the multiplier lambda_k is proportional to
 c_k / d_k - 1, and lambda_k is never negative (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization,
-ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies by the current -lambda_k / d_k. So
-stored transitions stay valid, and costs need no separate critic. Means are over all training steps, with exploration.
+ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies by the current -lambda_k / d_k. A
+stored cost thus stays valid, and costs need no separate critic. Means are over all training steps, with exploration.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,7 +49,7 @@ COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {
 
 
 class ConstrainedReward(Reward):
-    """A reward with costs: its terms are those of `reward`, then the costs with the weights -lambda / limit.
+    """A reward whose terms are the terms of `reward`, then costs with the weights -lambda / limit.
 
     Args:
         reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost in the cost's unit}.

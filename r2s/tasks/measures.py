@@ -81,7 +81,7 @@ class MeasureTable:
 
     Attributes:
         measures: the task's own measures, to which r2s adds the measures COMMON.
-        selection: measures that compare trainings. Rows must contain the first measure; the last one ranks trainings.
+        selection: measures that compare trainings: every row must contain the first; the last ranks trainings.
         rows: columns of the table that has a row for each simulator and arm; by default all `measures`.
         comparison: columns of the table of trainings. curves: panels of the figure of learning curves.
         scores: panels of the figure that compares the scores of trainings.

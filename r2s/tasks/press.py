@@ -1,4 +1,4 @@
-"""Task press: touch a surface of roughly known position, hold a force against it, and follow a step of the force."""
+"""Task press: touch a surface of roughly known position, hold a requested force, and follow a step of this force."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from r2s.tasks.surface_task import FAR_N, FINE_N, HARD_N, NORMAL, SurfaceTask, n
 from r2s.tasks.task import Episodes, State
 
 LEAST_STEP = 0.2  # smallest force step, as a share of the range `force`
-REVERSAL_S = 0.2  # s, time in which the friction feedforward reverses after a downward force step
+REVERSAL_S = 0.2  # s, time in which the friction feedforward reverses after a decrease of the force
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class PressTask(SurfaceTask):
         return away * np.array([[np.cos(about), np.sin(about)]]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return two forces ~ U(force), N, that differ by at least LEAST_STEP times the width of this range."""
+        """Return two forces ~ U(force), N, whose difference is at least LEAST_STEP times the range of `force`."""
         low, high = self.force
         first = rng.uniform(low, high)
         second = first
@@ -82,8 +82,8 @@ class PressTask(SurfaceTask):
 
         The target position moves through the nominal plane, against the normal, until the spring would exert the
         larger of the two forces even on a surface at the lowest allowed position. The target velocity only gives the
-        friction feedforward the expected direction of motion, which is along the normal after a downward force step,
-        and against the normal otherwise.
+        friction feedforward the expected direction of motion, which is along the normal after a decrease of the
+        force, and against the normal otherwise.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = self.at(t, goals) - self.depth(t, goals)[:, None] * goals[:, NORMAL]

@@ -43,8 +43,8 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
 
     force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the force step, and in
     the last second. Means over episodes: overshoot_N, largest excess over the new force in the direction of the step;
-    overshoot_share, the same divided by the step; impact_N, largest force within IMPACT_S of the first touch;
-    contact, share of time in contact after the first touch. All these exclude stopped episodes. success: share of all
+    overshoot_share, overshoot_N divided by the step; impact_N, largest force within IMPACT_S of the first touch;
+    contact, share of time in contact after the first touch. The above exclude stopped episodes. success: share of all
     episodes that have no stop, both RMS errors <= GOOD_N, and an overshoot within OVER_N or OVER_SHARE.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])

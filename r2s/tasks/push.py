@@ -62,13 +62,13 @@ class PushTask(TipTask):
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         size: (3,) m, edges of the box. away: (low, high) m, distance of a goal from the box's nominal position.
         bearing: degrees, goals lie within +- this angle of straight ahead. goal_yaw: degrees, largest yaw of a goal.
-        spread, first_yaw: m and degrees, largest deviation of the box's start pose from nominal, for `dr=box`.
+        spread, first_yaw: m and degrees, largest deviation of the box's start pose from the nominal, for `dr=box`.
         pose_noise: m and degrees, standard deviation of the perceived pose in simulation.
         point, normal: nominal position of the box on the table, m, and the table's normal; None: see `table_frame`.
         displacement: m, distance by which an action of 1 shifts the tip's target in the default controller.
         tool, pool: see `SurfaceTask`. torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         tip_radius, frame: radius of the tip, m, and frame of the table. own, parameters: default controller and its
-            parameters. `with_model` sets these four attributes.
+            parameters. `with_model` sets tip_radius, frame, own and parameters.
     """
 
     ctrl_hz: int = 25
@@ -160,7 +160,7 @@ class PushTask(TipTask):
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) m, target of the tip at zero action: the mean distance `away` ahead of the nominal box."""
+        """(3,) m, target of the tip at zero action: the mean of `away` ahead of the box's nominal position."""
         return self.table.outside(np.array([0.5 * sum(self.away), 0.0, self.height]))
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:

@@ -69,8 +69,8 @@ class ReachTask(BaseTask):
             quantiles MIDDLE of the end effector's distance in random postures.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
         speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise learns not to react to noise, and so does not excite oscillations of
-            elastic gears, which rigid models do not have (benchmarks/results/transfer.md).
+            else 0. A policy trained with noise does not react to noise, and so does not excite oscillations of
+            elastic gears; rigid models have no such oscillations (benchmarks/results/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -239,7 +239,7 @@ def observe(
     effort: np.ndarray,
     torque: np.ndarray,
 ) -> np.ndarray:
-    """Return the observation (m, 6 n + 12) float32 in SI units, the same for arms and simulators.
+    """Return the observation (m, 6 n + 12) float32 in SI units; arms and simulators share this function.
 
     Terms: q; dq; ee; goal; error; effort / torque; tanh(error / 2 cm); J^T error; tanh(J^T error / 1.5 cm);
     tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector toward the goal; otherwise a network

@@ -2,7 +2,7 @@
 
 A reward is a weighted sum of named terms. The replay buffer stores the terms without weights, and each update applies
 the current weights, so that stored transitions stay valid when a curriculum changes the weights. r2s adds three terms
-to the paper's: a bonus for precision, and penalties for motion near the goal and for action of the safety filter.
+to the paper's: a bonus for precision, and penalties for motion near the goal and for a high filter rate.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 def terms(
     distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray, limited: np.ndarray
 ) -> np.ndarray:
-    """Return five reward terms (m, 5): the first two sum to eq. (2) of the paper, the others are not in the paper.
+    """Return five reward terms (m, 5): the sum of the first two is eq. (2) of the paper; r2s adds the last three.
 
     Terms, with d = distance / distance0: distance = -k1 d;
     smoothness = -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d);
@@ -101,7 +101,7 @@ class Reward:
 class Curriculum(Reward):
     """A reward whose weights change during a training.
 
-    Eq. (2) alone makes exploration difficult, because its acceleration terms reward early stopping. So trainings with
+    Eq. (2) alone makes exploration difficult, because its acceleration terms reward early stopping. Trainings with
     a curriculum start with a small smoothness weight and a bonus for precision, and the weights then change linearly
     toward eq. (2). With reward=paper, the weights are constant: 1 for distance and smoothness, 0 for other terms.
 
@@ -110,9 +110,9 @@ class Curriculum(Reward):
             change. anneal: fractions of the budget at which this change of weights starts and ends.
         max_filter_rate: largest filter rate in a training, exploration included; None: no limit. Once the weights
             change, a filter rate above `max_filter_rate` raises the weight of the filter penalty. A lower filter rate
-            reduces this weight, but not below the value of the curriculum. With a fixed weight, the filter rate is 1
+            reduces the penalty, but not below the curriculum weight. With a fixed penalty, the filter rate is 1
             to 6 %, depending on the seed (benchmarks/results/minutes.md). Integral control adapts the logarithm of
-            the weight, as for a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
+            the penalty weight, as for a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.

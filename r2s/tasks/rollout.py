@@ -159,8 +159,8 @@ def measures(episodes: Episodes) -> dict[str, float]:
     """Return the measures of task reach, one row of evaluations.csv.
 
     success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
-    of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth: the
-    same mean without speed noise, from which eq. (2) would compute false accelerations. time_to_reach_s: median time
+    of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth:
+    return_paper without speed noise, which causes false accelerations in eq. (2). time_to_reach_s: median time
     after which the end effector stays within 2 cm, over the episodes that achieve this. overshoot_m: mean over
     episodes of the largest distance beyond 2 cm after the first time within 2 cm. rest: share of episodes in which
     every joint is slower than REST throughout the last 0.5 s; an end effector at rest is not enough. q_left_rad: 5 %

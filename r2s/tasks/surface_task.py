@@ -47,16 +47,16 @@ class SurfaceTask(TipTask):
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        force: (low, high) N, range of the requested forces. force_rate: N/s, rate at which this force changes.
+        force: (low, high) N, range of the requested forces. force_rate: N/s, rate of change of a force.
         approach_speed: m/s, speed of the target against the nominal normal: the highest closing speed at contact.
         clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
-            from `point`. place, tilt: m and degrees, largest offset and tilt of the true plane from the nominal.
+            from `point`. place, tilt: m and degrees, largest shift and tilt of the true plane from the nominal plane.
         point, normal: the nominal plane in the base frame, m; None: a work table below the tip in home posture.
         tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of different goals in a training.
-        stop: kind of stop in contact, a key of `r2s.physics.push_limit.STOPS`; None: release.
-        model: model of the arm. own, parameters: default controller and its parameters. `with_model` sets all three.
+        stop: kind of stop in contact, a key of `r2s.physics.push_limit.STOPS`; None: "release".
+        model: model of the arm. own, parameters: default controller and its parameters. `with_model` sets these.
     """
 
     ctrl_hz: int = 100
@@ -213,7 +213,7 @@ class SurfaceTask(TipTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return the numbers of a goal after the start posture, computed from `path` (k, 3) m; by default none."""
+        """Return a goal's last numbers, after the start posture, computed from `path` (k, 3) m; by default none."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -223,7 +223,7 @@ class SurfaceTask(TipTask):
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, how far the target of the tip's center is below the nominal plane at the times t (m,) s.
 
-        It grows at `approach_speed` until the tip touches even the lowest surface, then by `force_rate` / stiffness.
+        The depth grows at `approach_speed` until the tip touches the lowest plane, then by `force_rate` / stiffness.
         """
         height, K = goals[:, HEIGHT], self.spring
         touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` refers to the tip's center

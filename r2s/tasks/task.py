@@ -21,7 +21,7 @@ from r2s.tasks.rewards import TERMS
 
 # the score penalizes only filter rates above this value; lower rates do not make policies better
 MAX_FILTER_RATE = 0.04
-TORQUE_STD = 0.3  # share of the torque limit, standard deviation that normalizes an observed controller torque
+TORQUE_STD = 0.3  # standard deviation, divided by the torque limit, that normalizes an observed torque
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +251,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, controller: the task and its controller. goals: (m, ...). state: `observe` adds its sensor noise.
+        task, controller: the task and its controller. goals: (m, ...). state: `observe` adds `State.noise`.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()

@@ -27,7 +27,7 @@ class TipTask(BaseTask):
     own: Impedance | None
 
     def as_reach(self) -> ReachTask:
-        """Return a reach task of this task's timing, torque limit and noise; raise UserError if one is invalid."""
+        """Return a reach task of this task's timing, torque limit and noise; raise UserError if any is wrong."""
         return ReachTask(
             self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
         )
@@ -59,5 +59,5 @@ class TipTask(BaseTask):
         return np.tile(robot.q_home, (count, 1))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones, because the rewards of these tasks need no initial distance as a scale."""
+        """Return (m,) ones, because the rewards of tip tasks need no initial distance as a scale."""
         return np.ones(len(goals))

@@ -66,7 +66,7 @@ class TrackTask(BaseTask):
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         preview: number of future path positions in an observation.
         speed: (low, high) m/s, range of random peak speeds; a path is slower if the arm's limits require it.
-        size: (low, high) m, range of random path radii. kinds: subset of KINDS, equally probable.
+        size: (low, high) m, range of random path radii. kinds: curves, a subset of KINDS, equally probable.
         reach, height, azimuth: region that contains the paths, see `ReachTask`.
         pool: number of different paths in a training.
         model: dynamics of the arm for the default controller, set by `with_model`.
@@ -128,11 +128,11 @@ class TrackTask(BaseTask):
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """Weights (5,) of the reward terms: 1 for distance and smoothness, 0 for the others."""
+        """Weights (5,) of the reward terms: 1 for distance and smoothness, 0 for other terms."""
         return PAPER
 
     def region(self, robot: Robot) -> tuple[float, float]:
-        """Return (low, high) m, distance of paths from the shoulder."""
+        """Return (low, high) m, range of the distance between paths and shoulder."""
         return self._region.region(robot)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:

@@ -26,7 +26,7 @@ LEADS = 60  # points from home to the start of a path, and repetitions of the st
 OFF_M = 1e-4  # m, largest position error of a posture
 INSIDE = 0.05  # rad, least distance of a path from the position limits of the safety filter
 # Shares of the largest target torque, and of the filter's speed limit and acceleration bound, that a path may use;
-# the rest remains for friction, feedback and errors of the nominal model.
+# the remaining share is for friction, feedback and errors of the nominal model.
 TORQUE, SPEED, ACCELERATION = 0.5, 0.9, 0.8
 SLOWEST = 0.02  # share of the requested pace; a path that must be slower is rejected
 CHECK_HZ = 50  # Hz, rate at which a path is checked against limits
@@ -95,7 +95,7 @@ def smooth(s: np.ndarray) -> np.ndarray:
 def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return u, du/dt and d2u/dt2 at t (T,) s for a path parameter u(t) that moves at pace 1 from 0 s to `seconds`.
 
-    The pace du/dt rises as `smooth` in the first `ramp` s and falls in the last `ramp` s. Before and after, it is 0.
+    The pace du/dt rises as `smooth` in the first `ramp` s, falls in the last `ramp` s, and is 0 outside the motion.
     """
 
     def integral(s: np.ndarray) -> np.ndarray:

@@ -31,12 +31,12 @@ STEADY = 0.25  # integral rate as a share of its stability limit: a gain margin 
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal begins as in `SurfaceTask`; random goals have equal forces at the start and the end of the path. The rest
-    of a goal is the path, as rows (9,) of position, velocity and acceleration, at the start and after each step.
+    A goal begins as in `SurfaceTask`; random goals have equal forces at the start and the end of the path. A goal
+    ends with the path, as rows (9,) of position, velocity and acceleration, at the start and after each step.
 
     Attributes:
         speed: (low, high) m/s, range of random peak speeds. size: (low, high) m, range of random path radii. kinds:
-            subset of KINDS, equally probable. ramp_s: s, duration of acceleration and of deceleration on a path.
+            curves from KINDS, equally probable. ramp_s: s, duration of acceleration and of deceleration on a path.
         friction: expected friction coefficient of the surface. Other attributes: see `SurfaceTask`.
         inertia: (3, 3) kg, effective mass of the tip at the nominal plane.
     """
@@ -89,8 +89,8 @@ class WipeTask(SurfaceTask):
     def own_settings(self) -> dict[str, Any]:
         """Stiffness K, N/m, and integral rate r, 1/s, of the default controller, from the tip's effective mass.
 
-        To follow a path, the spring is as stiff as the latency allows: K = m w^2, with the smallest effective mass m
-        and w of `fastest_spring`. With critical damping, the largest such mass M has the characteristic equation
+        To follow a path, the spring is as stiff as latency allows: K = m w^2, with the smallest effective mass m
+        and w of `fastest_spring`. With critical damping, the largest effective mass M has the characteristic equation
         M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0, stable for r < r0 = 2 (K/M)^(1/2) (Routh, Hurwitz). r = STEADY r0.
         """
         masses = np.linalg.eigvalsh(self.inertia)
@@ -139,7 +139,7 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and requested force, N, for hybrid control; linear in time between both forces."""
+        """Return (m, 4), normal and requested force, N, for hybrid control, linear between a goal's forces."""
         share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
         force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)

@@ -43,7 +43,7 @@ def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, flo
     within_2N, within_3mm: share of steps with a force error <= 2 N, and with a path error <= 3 mm. wiped: share of
     steps within both limits. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes never
     qualify. success: share of episodes with `wiped` >= SUCCESS. For episodes without a stop: force_rmse_N and
-    path_rmse_mm are RMS errors; impact_N is the mean peak force in IMPACT_S after first touch, also before `begin`.
+    path_rmse_mm are RMS errors; impact_N is the mean peak force in IMPACT_S after first touch, at any time.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = ~ended[:, None]

@@ -21,7 +21,7 @@ FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/cont
 class CollisionThresholds:
     """Thresholds of external torque and force above which the arm stops itself.
 
-    r2s sets libfranka's contact thresholds to the same values. The defaults are the lowest in libfranka's examples.
+    r2s also uses these values as libfranka's contact thresholds. The defaults are the lowest in libfranka's examples.
 
     Attributes:
         torque: (7,) Nm, per joint. force: (6,) N and Nm, wrench at the end effector.

@@ -9,7 +9,7 @@ import numpy as np
 from r2s.arm.clients.connection_check import Finding
 from r2s.physics.robot import SIM_DT
 
-LOST_SHARE = 0.01  # largest share of lost states; the limit for lost commands is the same, as both use one cable
+LOST_SHARE = 0.01  # largest share of lost states; equal to the limit for lost commands, which use the same cable
 GAP_S = 0.02  # 20 cycles without an answer stop the arm
 REALTIME = Path("/sys/kernel/realtime")  # where libfranka looks for a real-time kernel
 LIMITS = resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK
@@ -30,7 +30,7 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check for lost or late states, from their times (k,) s by the arm's clock and by this computer's (`here`)."""
+    """Check for lost or late states, from their times (k,) s by the clocks of arm and computer (`here`)."""
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)
@@ -44,7 +44,7 @@ def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
 
 
 def _may_use_fifo() -> bool:
-    """Return whether this process may use libfranka's priority: try it, then restore the previous one."""
+    """Return whether this process may use libfranka's priority; restore the previous priority after the attempt."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO)))

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from r2s.errors import UserError
 
-CONSENT = "go on"  # the operator types this to allow further motion
+CONSENT = "go on"  # the operator types this text to allow further motion
 
 
 class Operator(Protocol):

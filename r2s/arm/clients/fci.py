@@ -1,10 +1,10 @@
-"""The wire format of the Franka Control Interface (FCI), as far as torque control needs it.
+"""The wire format of the Franka Control Interface (FCI), limited to what torque control needs.
 
 A client connects to TCP port 1337 and sends its version and a UDP port. The robot then sends one RobotState per
 millisecond by UDP and, in a motion, expects a RobotCommand for each state. Two versions are implemented: 5 (libfranka
 0.9, the Panda, FER) and 10 (libfranka 0.18 and later, the FR3). All structs are packed and little-endian.
 
-Source: the public headers of libfranka-common (service_types.h, rbk_types.h), checked against both client packages.
+Source: the public headers of libfranka-common (service_types.h, rbk_types.h), checked against the clients' packages.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ VERSIONS = (5, 10)
 HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
 CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
 MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # allowed deviations follow, unused
-COLLISION = np.dtype(  # both our clients set the thresholds during acceleration to the same values
+COLLISION = np.dtype(  # our clients use equal thresholds with and without acceleration
     [
         ("torque_acceleration", "<f8", (2, 7)),
         ("lower_torque", "<f8", 7),

@@ -68,7 +68,7 @@ class _FR3Client(Client):
         self._control, self._last = self._robot.start_torque_control(), [0.0] * 7
         while True:
             state, _ = self._control.readOnce()
-            # the arm may ignore commands until its success rate exceeds 0; the caller's first one must not get lost
+            # the arm may ignore commands until its success rate is above 0; keep the caller's first command
             if state.control_command_success_rate > 0:
                 return state
             self._control.writeOnce(self._package.Torques(self._last))
@@ -95,8 +95,8 @@ class FR3(Panda):
     """A Franka Research 3, with the arguments of `Panda` and the limits of `within_fr3`.
 
     Raises:
-        UserError: pylibfranka is missing, no server of its FCI version answers at the address, or the arm there does
-            not match the model.
+        UserError: pylibfranka is missing, no server of FCI version 10 answers at the address, or the connected arm
+            does not match the model.
     """
 
     arm_type, client_type, within = connection_check.FR3, _FR3Client, staticmethod(within_fr3)

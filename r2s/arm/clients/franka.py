@@ -36,7 +36,7 @@ from r2s.recordings.recording import SIGNALS
 SPEED = 0.2  # share of dq_max
 ACCELERATION = 0.2  # share of ddq_max
 TORQUE_SHARE = 0.2  # share of tau_max that the driver allows
-MAX_DEVIATION = 0.1  # rad off the path, less where an obstacle is near; a larger deviation aborts `move_to`
+MAX_DEVIATION = 0.1  # rad, largest deviation from the path, smaller near obstacles; beyond it, `move_to` ends
 SETTLE_S = 3.0  # s, longest time to settle at the end of the path
 INTEGRAL_GAIN = 15.0  # share of tau_max per rad s; overcomes breakaway torque at the end of the path
 INTEGRAL_SHARE = 0.15  # share of tau_max, limit of the integral's torque
@@ -60,7 +60,7 @@ class Franka:
     Args:
         robot: limits and nominal model.
         client: the connection.
-        operator: asked after a stop, with the stop's reason, before the arm moves again. Without an operator (None),
+        operator: function that is called with a stop's reason before the arm moves again. Without an operator (None),
             `move_to` raises NotCleared after a stop until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
         connection: properties that the arm must have; None skips this check.
@@ -103,7 +103,7 @@ class Franka:
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Move to q (7,) rad at up to a fifth of the speed limits, unless the arm is within 2 mrad of q; hold there.
+        """Bring the arm to rest at q (7,) rad, at up to a fifth of the speed limits; stay if within 2 mrad of q.
 
         The arm follows the first path of r2s/excitation/paths.py that respects the limits and clearances.
 

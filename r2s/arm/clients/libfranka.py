@@ -1,4 +1,4 @@
-"""Use libfranka through its two Python packages: import, connection, messages, and the base of both clients."""
+"""Use libfranka through its two Python packages: import, connection, messages, and the clients' base class."""
 
 import socket
 import time

@@ -74,7 +74,7 @@ class _Motion:
         if isinstance(state, Exception):
             self._thread.join()
             raise ArmStopped(one_line(state)) from state
-        return state  # None only after the answer None
+        return state  # the state is None only after the answer None
 
     def answer(self, tau: np.ndarray | None) -> None:
         """Answer the last state from `next` with the command tau (7,) Nm; None ends the motion."""
@@ -122,7 +122,7 @@ class Panda(Franka):
     """A Franka Emika Panda.
 
     Attributes:
-        arm_type: type of the arm. client_type: class of the client. within: function that clips limits to the arm's.
+        arm_type: type of the arm. client_type: class of the client. within: clips a robot's limits to the arm's.
 
     Args:
         robot: limits and nominal model.
@@ -131,11 +131,11 @@ class Panda(Franka):
         realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
         collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
         declared_payload: payload that the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
-            `payload_of`; r2s refuses to move an arm that declares another mass. moves: see `Connection`.
+            `payload_of`; r2s refuses to move an arm whose declared mass differs. moves: see `Connection`.
 
     Raises:
-        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm there does
-            not match the model.
+        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the connected arm
+            does not match the model.
     """
 
     arm_type: ArmType = PANDA

@@ -43,7 +43,7 @@ class Fault:
             'press': the stop button is pressed for `cycles` ms. 'hold': an external force stops the first link; the
             arm needs the attribute `external`.
         cycle: control cycle in which the fault begins, from 0.
-        motion: number of the motion, from 0; a client's `move_to` makes one per straight segment of its joint path.
+        motion: number of the motion, from 0; a client's `move_to` makes one motion per straight path segment.
         cycles: number of consecutive cycles with the fault; 20 late or dropped cycles stop the arm.
 
     """
@@ -74,7 +74,7 @@ class Control:
     Args:
         arm: the arm. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
         version: version of the FCI. faults, max_missed: see `Emulator`.
-        desk: settings of `DESK` by name, such as {"m_ee": 0.73}; they may be wrong and do not change the arm.
+        desk: values of settings in `DESK`, such as {"m_ee": 0.73}; even wrong values do not change the arm.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Control:
         if (declared := getattr(arm, "declared_payload", None)) is not None:
             self.state["m_load"], self.state["F_x_Cload"] = declared.mass, declared.centre
             self.state["I_load"] = declared.inertia.ravel()
-        self._right = self.state.copy()  # the settings with which the arm's own gravity compensation works
+        self._right = self.state.copy()  # the settings that the arm's own gravity compensation uses
         for name, value in (desk or {}).items():
             if name not in DESK:
                 raise UserError(f"emulator: desk setting '{name}'; {instead_of(name, DESK)}")
@@ -201,7 +201,7 @@ class Control:
             for name in settings.dtype.names or ():
                 self.state[name] = settings[name]
             f = {name: self.state[name].reshape(4, 4) for name in FRAMES}
-            self.state["F_T_EE"] = (f["NE_T_EE"] @ f["F_T_NE"]).ravel()  # by columns, hence in this order
+            self.state["F_T_EE"] = (f["NE_T_EE"] @ f["F_T_NE"]).ravel()  # stored by columns, hence in this order
         self._feel(1.0)
         self._sense()
 
@@ -275,7 +275,7 @@ class Control:
         self._external = s["tau_ext_hat_filtered"] = self._external + gain * (raw - self._external)
         force = np.zeros(6)
         if self._external.any():
-            at_k = s["EE_T_K"].reshape(4, 4) @ s["F_T_EE"].reshape(4, 4)  # by columns, hence in this order
+            at_k = s["EE_T_K"].reshape(4, 4) @ s["F_T_EE"].reshape(4, 4)  # stored by columns, hence this order
             force = self._model.wrench(arm.q, at_k.T, self._external)
             rotation = self._model.pose(arm.q, at_k.T)[:3, :3]
             s["K_F_ext_hat_K"] = np.concatenate([rotation.T @ force[:3], rotation.T @ force[3:]])

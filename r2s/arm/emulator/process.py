@@ -24,7 +24,7 @@ from r2s.arm.emulator.server import Server, open_port
 from r2s.arm.interface import Arm
 from r2s.errors import UserError, choices
 
-START_S = 180.0  # longest time for the process to import, compile and create its arm
+START_S = 180.0  # longest time for the server's process to import, compile and create its arm
 
 
 class Emulator:
@@ -70,7 +70,7 @@ class Emulator:
         raise started if isinstance(started, UserError) else RuntimeError("the FCI emulator did not start")
 
     def __exit__(self, *_: object) -> None:
-        """End the process."""
+        """End the server's process."""
         self._process.terminate()
         self._process.join()
 

@@ -15,7 +15,7 @@ from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 
 LOOPBACK = "127.0.0"
-IDLE_MS = 20  # between states of an idle arm in lock-step; the clients do not need 1 kHz there
+IDLE_MS = 20  # ms between states of an idle arm in lock-step; clients do not need 1 kHz at rest
 ANSWER_S = 0.9 * SIM_DT  # s, least time between two states in real time; our choice, a real box allows 1 ms
 BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's first answer; clients time out at 1 s
 
@@ -62,7 +62,7 @@ class Server:
 
     def _accept(self) -> None:
         tcp, _ = self._socket.accept()
-        if self._tcp is not None and _is_closed(self._tcp):  # the client reconnected before this was noticed
+        if self._tcp is not None and _is_closed(self._tcp):  # the client has reconnected
             self._disconnect()
         if self._tcp is not None:
             tcp.close()
@@ -82,7 +82,7 @@ class Server:
         self._received = b""
         self._client: tuple[str, int] | None = None
         self._move: int | None = None  # id of the Move request whose motion is active
-        self._started = False  # whether that motion has had its first answer
+        self._started = False  # whether the active motion has received its first answer
         self._ahead = False  # in real time, whether the newest state was answered and its cycle has run
         self._due: float | None = None  # when the next state is sent; None: only after an answer
         self._message_id = 0
@@ -122,7 +122,7 @@ class Server:
         elif name in ("LoadModelLibrary", "GetCartesianLimit") or self._control.running:
             self._reply(name, number, fci.NOT_POSSIBLE)  # the model library is machine code
         else:
-            if name in fci.SETTINGS:  # impedances have no effect here
+            if name in fci.SETTINGS:  # the emulator ignores impedances
                 self._control.set(name, np.frombuffer(payload, fci.SETTINGS[name], 1)[0].copy())
             self._reply(name, number, fci.DONE)
 
@@ -183,7 +183,7 @@ class Server:
                     self._send()
                 elif not self._realtime:
                     self._cycle(command["tau_J_d"].copy())
-                elif not self._ahead:  # at once: a real box computes in parallel, not in the client's time
+                elif not self._ahead:  # at once, as a real box computes in parallel with the client
                     self._control.cycle(command["tau_J_d"].copy())
                     self._ahead = True
 
@@ -213,7 +213,7 @@ class Server:
         else:
             self._send()
         if self._realtime:
-            # this process may wake late, unlike a box; the client must still get its time to answer
+            # this process, unlike a box, may wake late; the client must still have time to answer
             self._due = max(self._due + SIM_DT, time.monotonic() + ANSWER_S)
         elif self._move is None:
             self._due = time.monotonic() + IDLE_MS * SIM_DT

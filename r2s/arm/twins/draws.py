@@ -1,4 +1,4 @@
-"""Draw the parameters that both twin variants have: links, torque offset, cable drag and sensor noise."""
+"""Draw parameters of rigid and elastic twins: links, torque offset, cable drag and sensor noise."""
 
 import numpy as np
 

@@ -78,7 +78,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
         after = w + h / p[ROTOR, i] * (push - side * f)
         if after * side >= 0.0:
             return after
-        h *= 1.0 - w / (w - after)  # the rest of the step, after the motor has come to rest
+        h *= 1.0 - w / (w - after)  # the remaining time of the step, after the motor has stopped
     side = np.sign(push)
     edge = factor * level(p, 0.0, load, side, i)
     if abs(push) <= edge:

@@ -4,7 +4,7 @@ The gears are elastic and oscillate. Friction holds a resting motor without cree
 than in the rigid variant, decreases with heat, and ripples with the gear angle (elastic_joints.py). The control box
 compensates part of the friction, has a clock that jitters, and occasionally loses a command. Delay and lag differ
 between joints. Links, offsets, cable drag, noise and quantization are as in the rigid variant. The seed determines
-the robot's parameters, which only this file reads. Seeds 0-9 are for development, seeds >= 200 for evaluation.
+the robot's parameters, which only the twin reads. Seeds 0-9 are for development, seeds >= 200 for evaluation.
 
 In each 1 ms cycle the control box adds its compensation to the command. elastic_joints.py then integrates rotors and
 links in steps of at most 0.05 ms. The sensors measure the motors up to 0.5 ms before the end of the cycle.
@@ -137,7 +137,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
     """
     n, model = robot.n, robot.model(gravity=False)
-    own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, with the other joints free
+    own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, without torque on the other joints
     p = np.zeros((ej.ROWS, n))
     size = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
     coulomb = 0.75 * size  # viscous friction adds to this value; the control box compensates about a quarter
@@ -167,7 +167,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
 
 def _critical_damping(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return the critical damping (n,) Nm s/rad of each gear, with the other joints free."""
+    """Return the critical damping (n,) Nm s/rad of each gear, without torque on the other joints."""
     reduced = 1 / (1 / p[ej.ROTOR] + np.diag(np.linalg.inv(inertia)))
     return 2 * np.sqrt(p[ej.STIFF] * reduced)
 

@@ -22,8 +22,8 @@ DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; LAG, DQ_FILTER: gains per
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED, TAU_MEASURED, BENT = range(12)
 Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, joint torque of the contact with a surface
 
-DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, otherwise each reversal would cause a torque pulse
-SWEEPS, CONVERGED = 50, 1e-9  # largest number of Gauss-Seidel sweeps; velocity change, rad/s, that ends them
+DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, else each reversal would cause a torque pulse
+SWEEPS, CONVERGED = 50, 1e-9  # largest number of Gauss-Seidel sweeps; velocity change, rad/s, that ends the sweeps
 
 
 @njit(cache=True)
@@ -62,8 +62,8 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
     """Apply a command; return passive torque (n,) Nm and implicit damping (n,) Nm s/rad for the engine's step.
 
     Gauss-Seidel iteration solves the coupled implicit equation mass (w - v) / h + bias + f(w) = drive for the next
-    velocity w. Each joint's equation has an exact solution: with the bristle's backward Euler step
-    z' = (z + h w) / (1 + k |w|), k = h s0 / g, it is quadratic in w and has one root of the right sign.
+    velocity w. Each joint's equation has an exact solution, because the bristle's backward Euler step
+    z' = (z + h w) / (1 + k |w|), k = h s0 / g, makes the equation quadratic in w, with one root of the right sign.
 
     Args:
         p: joint parameters. s: joint states. line: (slots, n) Nm, the last commands. cycle: index of this cycle.

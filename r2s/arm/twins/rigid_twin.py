@@ -3,7 +3,7 @@
 The twin runs in DART, not in the training engine, with LuGre friction (bristles, Stribeck effect, load and direction
 dependence, breakaway), torque offsets, delay and lag, cable drag, sensor noise and quantization. Masses,
 centers and tensors differ from the nominal values that gravity compensation uses. The seed determines the robot's
-parameters, which only this file reads. Seeds 0-9 are for development, seeds of 100 and above for final evaluation.
+parameters, which only the twin reads. Seeds 0-9 are for development, seeds of 100 and above for final evaluation.
 
 In each cycle, delay and lag act on the command first. lugre_joints.py then solves the next step implicitly for joint
 velocities, friction and contact force. DART integrates this step with the contact force and with friction linearized
@@ -21,7 +21,7 @@ from r2s.engines.dart import DartEngine
 from r2s.physics.payload import Payload, with_payload
 from r2s.physics.robot import SIM_DT, Robot
 
-MASS_EVERY = 4  # cycles between updates of the mass matrix in lugre_joints.py; DART updates its own in every step
+MASS_EVERY = 4  # cycles between updates of the mass matrix for lugre_joints.py; DART updates its matrix in every step
 STOP_MARGIN = 0.1  # rad by which the mechanical stops lie beyond the position limits, where the reflexes stop the arm
 
 
@@ -32,7 +32,7 @@ class RigidTwin(TwinBase):
 
     Args:
         stiffness: as in `TwinBase`; None: rigid gears. Elastic gears deflect without oscillation. Encoders on the
-            motors' side do not measure this deflection.
+            motors' side do not measure the gear deflection.
     """
 
     def __init__(self, robot: Robot, seed: int, **settings: Any):
@@ -109,14 +109,14 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
     Args:
         robot: the arm. rng: random number generator.
-        inertia: (n,) kg m^2, inertia of each joint in the home posture with the other joints free.
+        inertia: (n,) kg m^2, inertia of each joint in the home posture without torque on the other joints.
         unbalanced: (n,) Nm, gravity compensation minus gravity torque in the home posture.
 
     """
     n = robot.n
     p = np.empty((lj.ROWS, n))
     level = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
-    coulomb = 0.6 * level  # viscous friction adds the rest of the level
+    coulomb = 0.6 * level  # viscous friction supplies the remainder of the level
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[lj.C_NEG], p[lj.C_POS] = coulomb - asymmetry, coulomb + asymmetry
     p[lj.BREAK] = rng.uniform(1.1, 1.5, n)  # times the Coulomb level

@@ -95,7 +95,7 @@ class TwinBase:
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
             raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
         self._reflexes.state(q, np.zeros(self.robot.n))
-        stays = np.abs(q - self._q).max() < STAYS  # the tip may press, as under the arm's own position control
+        stays = np.abs(q - self._q).max() < STAYS  # the tip may press, as under a real arm's position control
         if (depth := self._touch.start(q, [self._seed, 5, self._episode, self._stream])) > 0 and not stays:
             raise ArmStopped(f"move_to: the tool's tip would be {1e3 * depth:.1f} mm inside the surface")
         self._cycle = 0
@@ -147,7 +147,7 @@ class TwinBase:
 
     @property
     def _link_q(self) -> np.ndarray:
-        """(n,) rad, angles of the links; with elastic gears they differ from the motors' angles."""
+        """(n,) rad, angles of the links, which differ from the motors' angles if the gears are elastic."""
         return self._q
 
     @property

@@ -33,7 +33,7 @@ class IdentifiedSurface:
             (N/m at 10 N), height (m along the normal) and tilt_deg (angle from the normal).
         identifiable: {name: whether the recording determines this value}; names include plane and slope.
         draws: surfaces drawn from the posterior.
-        rigid_gears: the surface for simulations with rigid gears, such as r2s's; see `ContactEstimate`.
+        rigid_gears: the surface for simulations with rigid gears, such as those of r2s; see `ContactEstimate`.
     """
 
     surface: Surface

@@ -1,7 +1,7 @@
 """Identify a surface that an arm has pressed: stiffness, exponent, damping, friction and plane, with intervals.
 
 If an arm's encoders are on the motors, the gears' deflection adds to the penetration of the surface. A first estimate
-assumes rigid gears. A second one also estimates their compliance, with a prior about the stated stiffness, if any.
+assumes rigid gears. A second estimate includes the gears' compliance; its prior uses a stated stiffness, if any.
 """
 
 from collections.abc import Callable
@@ -49,13 +49,13 @@ class ContactEstimate:
             force curve at LOAD, N/m; `gears`: (S, n) rad/Nm, compliance of the gears.
         identifiable: {name: whether the data determine this value}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
-        training: predicted and measured forces of fitted presses. validation: the same for unfitted presses, or None.
+        training: predicted and measured forces of fitted presses. validation: forces of unfitted presses, or None.
         gears: (n,) rad/Nm, compliance of the gears behind encoders on motors; 0: rigid gears or encoders on links.
-            A joint that is hardly loaded keeps its prior ratio to the mean deflection.
-        stated: whether the stiffness of the gears was stated.
+            For a hardly loaded joint, deflection / mean deflection keeps its prior value.
+        stated: whether the user stated the stiffness of the gears.
         tau_max: (n,) Nm, largest torques of the joints.
-        rigid_gears: the estimate for simulations with rigid gears, whose surface includes the compliance of the
-            gears; None in an estimate that assumes rigid gears.
+        rigid_gears: the estimate for simulations with rigid gears; its surface includes the compliance of the gears.
+            None in an estimate that assumes rigid gears.
     """
 
     surface: Surface
@@ -106,7 +106,7 @@ def identify_contact(
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> ContactEstimate:
-    """Estimate the surface from a recording with contact, with elastic gears and, in `rigid_gears`, with rigid gears.
+    """Estimate the surface from a recording with contact, for elastic gears and, in `rigid_gears`, for rigid gears.
 
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
@@ -134,9 +134,9 @@ def identify_contact(
 
 
 def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | None, refit: Fit) -> Press | None:
-    """Return forces in presses that were not fitted: those in `other`, else the last, after a refit without it.
+    """Return forces in unfitted presses: those of `other`, else the last press, after a refit without this press.
 
-    Return None if there is no `other` and fewer than two presses.
+    Return None if `other` is None and there are fewer than two presses.
     """
     if other is not None:
         return press_errors(other.reweighted(u), u, presses(other, u))
@@ -150,8 +150,8 @@ def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | No
 def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
     """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution for rigid gears u (8,).
 
-    The weights remain those of rigid gears. The residual of elastic gears is smaller; weights from it would ignore
-    the error of the friction law: on elastic twins 0 to 9, 23 of 80 intervals would miss the true value, not 9.
+    The weights remain those of the fit with rigid gears. Weights from the smaller residual of elastic gears would
+    ignore the friction law's error: on elastic twins 0 to 9, 23 instead of 9 of 80 intervals would miss the truth.
     """
     return _fitted(problem, problem.space.with_gears(u))
 

@@ -28,7 +28,7 @@ PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least squares over u (U,), surface and gears, and the arm's model errors w (r,) with a standard normal prior.
+    """Least squares over u (U,), which describes surface and gears, and the arm's model errors w (r,) ~ N(0, I).
 
     Each of the R rows is a window in which a joint slides in one direction (see `TorqueResidual`). Resting joints
     have no rows, since their friction may have any value between the breakaway torques. A closed form eliminates w,
@@ -38,12 +38,12 @@ class ContactProblem:
     gears act as a spring in series with the surface. Presses with different lever arms distinguish the two springs.
 
     Attributes:
-        torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
+        torque: torque residual without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
         error: (T, n) Nm, residual torque of the arm with the parameters x, before subtraction of the contact torque.
         directions: (T, n, r) Nm, derivative of the residual torque with respect to w.
         sigma: (T, n) Nm, standard deviation of each residual torque, which the fit treats as independent.
         space: the space of the vectors u.
-        sag: (F, n, 3) m per rad/Nm; gravity moves the tip by minus the sum over j of sag[:, j] times compliance j.
+        sag: (F, n, 3) m per rad/Nm; gravity moves the tip by -sum_j c[j] sag[:, j] for compliances c (n,) rad/Nm.
     """
 
     torque: TorqueResidual

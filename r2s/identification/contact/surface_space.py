@@ -31,19 +31,19 @@ FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 # Deflection of gears, rad, at the largest torques: standard deviation of a normal prior about 0; upper bound. Strain
 # wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
 DEFLECTION, SOFTEST = 0.01, 0.05
-SCATTER, FARTHEST = 0.2, 0.6  # standard deviation and limit of a joint's relative deviation from mean times `shape`
+SCATTER, FARTHEST = 0.2, 0.6  # a joint's deflection / (mean deflection * `shape`) - 1: standard deviation; limit
 LEAST_ACCURATE = 0.4  # largest allowed `accuracy`; two standard deviations then stay within FARTHEST and SOFTEST
 
 
 @dataclass(frozen=True)
 class Gears:
-    """Prior of the gears' deflection by the joints' largest torques.
+    """Prior of the gears' deflection under the joints' largest torques.
 
     Attributes:
         shape: (n,) deflection of each joint, relative to the mean over joints.
         center, width: mean and standard deviation, rad, of the mean deflection.
         scatter: relative standard deviation of a joint's deflection.
-        stated: whether the stiffness of the gears was stated.
+        stated: whether the user stated the stiffness of the gears.
     """
 
     shape: np.ndarray
@@ -54,19 +54,19 @@ class Gears:
 
 
 def unknown_gears(n: int) -> Gears:
-    """Return the prior of n gears of unknown stiffness, which are probably stiff."""
+    """Return the prior of n gears of unknown stiffness; small deflections are most likely."""
     return Gears(np.ones(n), 0.0, DEFLECTION, SCATTER, False)
 
 
 def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float = 0.1) -> Gears | None:
-    """Return the prior of gears of known stiffness, or None if nothing is stated.
+    """Return the prior of gears of known stiffness, or None if `stiffness` is None.
 
     Half of the variance is common to all gears, as an error of the data sheet would be.
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints.
-        stiffness: Nm/rad, one value per joint, or that of the strongest joint; at their largest torques, all joints
-            then twist by the same angle. accuracy: relative standard deviation of the stiffness.
+        stiffness: Nm/rad, one value per joint, or one value for the strongest joint; in the second case, all gears
+            deflect equally at the joints' largest torques. accuracy: relative standard deviation of the stiffness.
 
     Raises:
         UserError: a stiffness is not positive, `accuracy` is not in (0, LEAST_ACCURATE], or the gears are too soft.
@@ -98,7 +98,7 @@ class SurfaceSpace:
     deflection at the largest torques, and each joint's relative deviation from this mean times `Gears.shape`.
 
     Attributes:
-        tau_max: (n,) Nm, largest torques of the joints. gears: prior of their deflection by these torques.
+        tau_max: (n,) Nm, largest torques of the joints. gears: prior of the gears' deflection.
     """
 
     origin: np.ndarray
@@ -128,7 +128,7 @@ class SurfaceSpace:
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
 
     def compliance(self, u: np.ndarray) -> np.ndarray:
-        """Return the compliance (..., n) rad/Nm of the gears for u (..., U); 0 if u lacks values for gears."""
+        """Return the compliance (..., n) rad/Nm of the gears for u (..., U); 0 if u describes no gears."""
         if u.shape[-1] == SURFACE:
             return np.zeros((*u.shape[:-1], len(self.tau_max)))
         relative = 1.0 + FARTHEST * (2.0 * u[..., SURFACE + 1 :] - 1.0)
@@ -151,7 +151,7 @@ class SurfaceSpace:
         return Surface(point, normal, K * UNIT_DEPTH ** (rest[0] - 1.0), *rest)
 
     def tilt_of(self, normal: np.ndarray) -> np.ndarray:
-        """Return the change (2,) of u[:2] that tilts the first plane's normal to the direction `normal` (3,)."""
+        """Return the change (2,) of u[:2] that tilts the normal `self.normal` to the direction `normal` (3,)."""
         return self.axes @ (normal / (normal @ self.normal)) / WIDTH[:2]
 
     def unit(self, height: float, slope: float, exponent: float, friction: float) -> np.ndarray:

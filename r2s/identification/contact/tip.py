@@ -13,7 +13,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface, normal_force
 
 NEWTON = 10  # iterations for two springs in series; relative error below 1e-6 for exponents of 1 to 2
-SHALLOW = 1e-6  # least share of the surface in the deflection, so that the slope of the surface's force is defined
+SHALLOW = 1e-6  # least share of the surface in the total deflection, so that the force curve has a slope
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class TipMotion:
         step: s, time between two instants. starts: (F,) bool, whether a new continuous motion starts at an instant.
         centre: (F, 3) m, center of the tip. radius: m, radius of the tip.
         axes, origins: (F, n, 3), joint axes, and points on these axes, in the base frame. dq: (F, n) rad/s, velocity.
-        play: m, largest tip path by encoder noise alone; a path shorter than `play` only bends bristles elastically.
-        compliance: (n,) rad/Nm, compliance of the gears, whose deflection motor encoders do not measure; (0,):
-            rigid gears.
+        play: m, largest tip path due to encoder noise; a path shorter than `play` only bends bristles elastically.
+        compliance: (n,) rad/Nm, compliance of gears whose deflection the encoders do not measure; an empty array
+            means rigid gears.
     """
 
     step: float
@@ -89,7 +89,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
 
     Friction is mu F z with the bristle deflection z (Dahl 1968 in two dimensions): dz = (dx - |dx| z) / bristle. Here
     x is the tip's deepest point, projected onto the surface. Encoder noise of a resting tip adds up in |dx| and would
-    let bristles relax. Therefore a path shorter than `play` only bends bristles elastically.
+    relax the bristles. Therefore a path shorter than `play` only bends bristles elastically.
 
     Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
     with compliances C and the force F g = F (n - mu z). `bristle` includes the gears' deflection along the surface.
@@ -155,8 +155,8 @@ def _contact(motion, settings, point, normal, law, tau, out):
 def _in_series(soft, K, exponent, damping, depth, rate):
     """Return force, depth and its rate at a surface behind a spring of compliance `soft`, m/N, by Newton's method.
 
-    depth, rate: m, m/s, the sum of both deflections and its rate. The computed rate of the surface's depth neglects
-    damping.
+    depth, rate: m, m/s, total deflection of spring and surface, and its rate. The returned rate of the surface's
+    depth neglects damping.
     """
     if soft <= 0.0 or depth <= 0.0:
         return normal_force(K, exponent, damping, depth, rate), depth, rate

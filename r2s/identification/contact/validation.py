@@ -53,7 +53,7 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 
 
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
-    """Return the forces that a surface u (U,) predicts and the forces from joint torques, in the masks `parts`.
+    """Return predicted and measured forces on a surface u (U,) in presses, given one mask per press (`parts`).
 
     Assume that the measured force has the direction of the predicted force. A weighted least-squares fit to the
     torques of joints in motion then determines the ratio of the measured to the predicted force.

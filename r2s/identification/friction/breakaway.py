@@ -1,21 +1,21 @@
 """Estimate the breakaway torque of each joint from recorded ramps (Table II of the paper that r2s follows).
 
 A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). At the end of a ramp, the
-joint has accelerated for 10 to 150 ms and the command has risen further. A real joint also creeps before its release:
-the joint's bristles bend by millirads, at a growing rate. Neither a threshold nor a parabola can separate creep from
-release. So r2s fits this model, in which a joint at x creeps and then slides when the command u exceeds U:
+joint has accelerated for 10 to 150 ms and the command has risen further. Before breakaway, a physical joint also
+creeps: bristles bend by millirads, at a growing rate. Neither a threshold nor a parabola separates creep from
+breakaway. In the model that r2s fits, a joint at x creeps at first, and slides when the command u exceeds U:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
 The command u at the joint is positive in the ramp's direction, and kappa is the inverse inertia. Below the command U,
 stiction balances u, and bristles bend over the creep length z (Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976). At
-release, friction falls from U to a lower value (0 in the paper's eq. 6, where z = 0); `jump` is this decrease times
-kappa. The free fit estimates all these parameters and needs no model of the arm.
+breakaway, friction falls from U to a lower value (0 in the paper's eq. 6, where z = 0); `jump` is this decrease times
+kappa. The fit without `Slide` estimates all parameters of the equation and needs no model of the arm.
 
-If friction falls over a range of velocities (Stribeck), motion begins slowly, and the free fit with its sudden `jump`
-overestimates U (by 4 to 22 mNm on an arm with known U). A second fit replaces `jump` by jump (1 - exp(-(v / fall)^2))
-and uses the parameters `Slide` of an identified arm; on the same arm the second fit's error of U was below 0.2 mNm.
-r2s uses the second fit if this fit explains the motion as well as the free fit.
+If friction falls over a range of velocities (Stribeck), motion begins slowly, and the fit without `Slide`
+overestimates U (by 4 to 22 mNm on an arm with known U), because `jump` is sudden. The fit with `Slide`, parameters of
+an identified arm, replaces `jump` by jump (1 - exp(-(v / fall)^2)); on the arm with known U, this fit's error of U
+was below 0.2 mNm. r2s uses the fit with `Slide` if it explains the motion as well as the fit without `Slide`.
 """
 
 from collections.abc import Callable, Iterator
@@ -29,11 +29,11 @@ from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.recordings.ramps import Ramps
 
-MOVED = 5e-3  # rad, largest motion of the rows in a fit; real joints and the twin creep 1 to 3 mrad before release
+MOVED = 5e-3  # rad, largest motion of the rows in a fit; joints creep 1 to 3 mrad before breakaway, also on the twin
 MIN_ROWS = 10  # least number of rows in a fit
 ENCODER = 2e-5  # rad, standard deviation of position residuals: encoder noise of a Panda
 DIFFERENCE = 1e-3  # finite-difference step, relative to the scale of each parameter
-RELEASE_S = 2e-3  # s, accuracy of the fitted time of release
+RELEASE_S = 2e-3  # s, accuracy of the fitted time of breakaway
 STEP = 1e-3  # s, longest integration step
 # bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), rest (rad) and drift (rad/s)
 LOW = np.log(1e-5), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
@@ -42,7 +42,7 @@ RIGID = 1e-8  # rad, creep length of a joint that does not creep
 DRIFT = 3e-4  # rad/s, prior sigma of a slow drift: a resting joint may still settle
 SIDES = "negative", "positive"
 KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
-WORSE = 1.01  # if the misfit of a fit with `Slide` exceeds the free fit's by this factor, use the free fit
+WORSE = 1.01  # the fit with `Slide` is not used if its misfit exceeds that of the fit without by this factor
 BACK = 0.0, 0.03, 0.1  # initial values of U: distances below the last command, relative to the ramp's rise
 DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, which a short motion does not determine
 STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # initial creep length, rad, and share of the guessed slide time
@@ -53,15 +53,15 @@ class Breakaway:
     """Commands (without gravity) at which n joints broke away in K ramps.
 
     Attributes:
-        command: (n, 2) Nm, mean command at release in negative and positive direction; NaN without a release. The
+        command: (n, 2) Nm, mean command at breakaway in negative and positive direction; NaN without breakaway. The
             breakaway torque is the sum of `command` and the joint's offset, but ramps do not determine the offset.
-        spread: (n, 2) Nm, standard deviation of the release command over ramps; NaN for fewer than two ramps.
-        count: (n, 2), number of ramps with a release. ramped: (n, 2), number of all ramps.
-        held: (n, 2) Nm, the largest command without motion if no ramp released the joint; 0 otherwise.
-        resolution: (n, 2) Nm, accuracy of a ramp's release command: `RELEASE_S` times the ramp's rate.
-        value: (K,) Nm, release command of each ramp; NaN without a release.
+        spread: (n, 2) Nm, standard deviation of the breakaway command over ramps; NaN for fewer than two ramps.
+        count: (n, 2), number of ramps with a breakaway. ramped: (n, 2), number of all ramps.
+        held: (n, 2) Nm, largest command without motion if the joint broke away in no ramp; 0 otherwise.
+        resolution: (n, 2) Nm, accuracy of a ramp's breakaway command: `RELEASE_S` times the ramp's rate.
+        value: (K,) Nm, breakaway command of each ramp; NaN without breakaway.
         misfit: (K,) rad, RMS difference between measured and fitted positions. A misfit well above the encoder noise
-            (or above 5e-5 rad for real stick-slip) shows that the fitted model does not describe the joint's motion.
+            (or above 5e-5 rad for physical stick-slip) shows that the model does not describe the joint's motion.
         joint, sign, pose: (K,), joint, direction and pose of each ramp, see `Ramps`.
     """
 
@@ -97,7 +97,7 @@ class Slide:
         level: (K,) Nm, command for slow sliding at a speed above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad, viscous friction.
         fall: (K,) rad/s, Stribeck velocity: friction falls from breakaway to `level` as exp(-(v / fall)^2).
-        misfit: (K,) rad, `Breakaway.misfit` of fits without `Slide`; worse fits with `Slide` are dropped, see WORSE.
+        misfit: (K,) rad, `Breakaway.misfit` of the fits without `Slide`, see WORSE.
     """
 
     kappa: np.ndarray
@@ -110,14 +110,14 @@ class Slide:
 def estimate_breakaway(
     ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, slide: Slide | None = None
 ) -> Breakaway:
-    """Estimate from t, q and tau of ramps the commands at which joints broke away.
+    """Estimate, from t, q and tau of the ramps, the commands at which joints broke away.
 
     The estimate is NaN if the joint moves by less than MOVED rad along the ramp, or moves before the command rises.
 
     Args:
         ramps: recorded ramps at any rate, in which the command rises from rest (falls for sign -1). For an encoder
             noise of 2e-5 rad, the error is the ramp's rate times 0.5 ms (small inertia) to 3 ms (large inertia).
-        delay, lag: s, dead time and time constant between command and torque; r2s adds the hold of the command.
+        delay, lag: s, dead time and time constant between command and torque; r2s adds half of the command's hold.
         slide: an identified arm's motion after breakaway; None: use only the fit that needs no model of the arm.
 
     Raises:
@@ -192,12 +192,12 @@ def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarr
 
 
 def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Fit all parameters to x (T,) rad under commands u (T,) Nm; return U, Nm (NaN: about u[0]), and misfit, rad."""
+    """Fit all parameters to x (T,) rad under commands u (T,) Nm; return U, Nm (NaN if near u[0]), and misfit, rad."""
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
     near, used = _parts(x)
-    guess = 1.5 * (t[-1] - t[near])  # time since release if x grew quadratically
+    guess = 1.5 * (t[-1] - t[near])  # time since breakaway if x grew quadratically
     low, high = np.array([u[0] + 1e-3 * span, *LOW]), np.array([u[-1], *HIGH])
 
     def residuals(p: np.ndarray) -> np.ndarray:
@@ -285,7 +285,7 @@ def _slides(t, u, U, kappa, z, damping, jump, fall):
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Return positions x (T,) rad from the module docstring's equation; fall = 0: friction falls at once at release.
+    """Return positions x (T,) rad from the module docstring's equation; fall = 0: friction falls at once at U.
 
     The integration is implicit in velocity, and therefore stable even for creep lengths far below the encoder noise.
     """

@@ -1,9 +1,9 @@
 """Estimate the presliding distance, over which the bristles of friction with memory bend after a reversal.
 
 The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
-bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters. But
-only reversals distinguish some of them, such as offset and asymmetry. The last steps of the search therefore vary
-these parameters together with the distance, but only the distance is returned.
+bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters. But only
+reversals distinguish some parameters from each other, such as offset and asymmetry. The last steps of the search
+therefore vary the parameters in WITH together with the distance, but only the distance is returned.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,16 +25,16 @@ from r2s.physics.dynamics import Dynamics
 from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
-WINDOW_S, STRIDE = 0.2, 5  # s; ms; of the replays, which are short because friction reverses within about 50 ms
+WINDOW_S, STRIDE = 0.2, 5  # s, ms: length and averaging time of replays; friction reverses within about 50 ms
 TRIED = 9  # number of log-spaced distances; within the usual bounds, neighbors differ by a factor of 1.8
 STEPS, FTOL = 4, 1e-2  # search for the distance alone: most steps; least relative gain of a step
 JOINT_STEPS, SMALL = 4, 0.05  # search that also varies WITH: most steps; it ends below this relative change
 # parameters whose errors change the estimated distance; viscous friction, inertia and delay change it by 1 % or less
 WITH = ("coulomb", "asymmetry", "rise", "offset")
-# lower limit of the logarithm's standard deviation: a window's first bristle state comes from smoothed velocity, so
+# lower limit of the log distance's sigma: a window's first bristle state comes from smoothed velocity, so
 # in tests estimates of known distances erred by up to 1.5 %, even with true values of all other parameters
 MIN_SIGMA = 0.02
-RIDGE = 1e-6  # information added to every value on the unit cube, as a distance may have a flat prior and no data
+RIDGE = 1e-6  # information added to every value on the unit cube: a distance may have a flat prior and no data
 
 
 def estimate_presliding(
@@ -47,12 +47,12 @@ def estimate_presliding(
     nthread: int,
     report: Report,
 ) -> dict[str, np.ndarray]:
-    """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of its logarithm}, estimated from replays.
+    """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of the log distance}, estimated from replays.
 
     Args:
         dynamics: dynamics of the arm fitted to torque. torque_data: torque residual that `dynamics` minimizes.
         known: posterior of the torque fit, which is the prior of the parameters in WITH.
-        prior: prior of all parameters; only that of the presliding distance is used.
+        prior: prior of all parameters; only the prior of the presliding distance is used.
         seed: seed of the random draws from the posterior. nthread: threads of the physics. report: see `identify`.
     """
     windows = cut_windows(recording, WINDOW_S)
@@ -82,8 +82,8 @@ def estimate_presliding(
 def nearest_distance(data: ReplayResidual) -> np.ndarray:
     """Simulate TRIED distances, each in all joints at once; return each joint's best distance (n,) on the unit cube.
 
-    A search must not start at a distance that is several times too small: weights from the residual at this distance
-    would suppress all reversals.
+    A search must not start at a distance that is several times too small, because the residual's weights at such a
+    distance would suppress all reversals.
     """
     u = np.tile(np.linspace(0.0, 1.0, TRIED)[:, None], data.space.n)
     cost = (data(data.space.from_unit(u)) ** 2).reshape(TRIED, -1, data.space.n).sum(1)

@@ -2,9 +2,9 @@
 
 Friction varies between ramps, because of posture, load and cables. Two ramps per joint and direction hardly determine
 a variance: by Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors. Therefore r2s
-averages a joint's variance with the mean variance of all joints of the same size, which weighs as much as
-PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small, because joints of the
-same size differ in scatter, on twins by factors of 3 and more. Without any repeats, r2s assumes the scatter REPEATS.
+averages a joint's variance with the mean variance of all joints of the same size; this mean has the weight of
+PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small: the scatter of joints
+of the same size differs, on twins by factors of 3 and more. If no ramp is repeated, r2s assumes the scatter REPEATS.
 """
 
 from typing import NamedTuple
@@ -13,19 +13,19 @@ import numpy as np
 
 from r2s.identification.friction.breakaway import Breakaway
 
-PRIOR_REPEATS = 2.0  # weight of the scatter of joints of the same size, in repeats
+PRIOR_REPEATS = 2.0  # weight of the mean variance of all joints of the same size, in repeats
 REPEATS = 1e-3  # standard deviation between repeated ramps, relative to tau_max; 0.8e-3 to 1e-3 on twins
 
 
 class Certainty(NamedTuple):
-    """Standard error (n, 2) Nm of mean release commands (NaN: no release), and its degrees of freedom (n, 2)."""
+    """Standard error (n, 2) Nm of mean breakaway commands (NaN: no breakaway), with degrees of freedom (n, 2)."""
 
     sigma: np.ndarray
     freedom: np.ndarray
 
 
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
-    """Return standard errors of the mean commands at release; joints with equal tau_max (n,) Nm have the same size.
+    """Return standard errors of mean breakaway commands; joints with equal tau_max (n,) Nm have the same size.
 
     If no joint of a size has repeated ramps, r2s assumes the mean scatter of all joints, in proportion to tau_max.
     """

@@ -1,4 +1,4 @@
-"""Residual rows that fit friction at the onset of sliding to breakaway ramps."""
+"""Residual of breakaway ramps, which fits the model's friction at the onset of sliding."""
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from r2s.recordings.ramps import Ramps
 
 # standard deviation of net torque minus friction, relative to the command; due to creep and the onset of sliding
 SIGMA = 0.03
-LEAST = 1e-3  # relative to tau_max; all smaller commands have the same standard deviation
+LEAST = 1e-3  # relative to tau_max; commands smaller than this have the standard deviation of a command of this size
 
 
 class StaticFriction:
-    """Residual of K ramps with a release: net torque at release minus the model's friction at the onset of sliding.
+    """Residual of K ramps with a breakaway: net torque at breakaway minus the model's friction when sliding begins.
 
-    Recordings of motion contain little information on the rise of Stribeck friction near standstill.
+    Without ramps, recordings contain little information on the rise of Stribeck friction near standstill.
     """
 
     def __init__(self, robot: Robot, ramps: Ramps, edges: Breakaway):
@@ -35,7 +35,7 @@ class StaticFriction:
         self._inertia = regressor(robot, q, still, unit)[own, self.joint].reshape(len(kept), -1)
 
     def net_torque(self, d: Dynamics) -> np.ndarray:
-        """Return the torque (..., K) Nm, without friction, that acts on the joint at each of the K releases."""
+        """Return the torque (..., K) Nm, without friction, that acts on the joint at each of the K breakaways."""
         standard = LinkInertia(d.mass, d.com, d.inertia).standard()
         left = (standard.reshape(*standard.shape[:-2], -1) - self._nominal) @ self._gravity.T
         drag = d.drag[..., self.joint, :]
@@ -43,7 +43,7 @@ class StaticFriction:
         return self.command + pull - left
 
     def slide(self, d: Dynamics) -> Slide:
-        """Return parameters of motion after each release (NaN without a release) for a Stribeck friction family."""
+        """Return each ramp's motion parameters after breakaway (NaN: no breakaway) for a Stribeck friction family."""
         phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
         sign = np.where(self.side, 1.0, -1.0)
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
@@ -56,7 +56,7 @@ class StaticFriction:
         return Slide(kappa, level, viscous, fall, self._misfit)
 
     def breakaway(self, d: Dynamics) -> np.ndarray:
-        """Return the mean net torques (n, 2) Nm at release; directions without a release have the torques of `d`."""
+        """Return mean net torques (n, 2) Nm at breakaway; directions without breakaway have the torques of `d`."""
         net, out = self.net_torque(d), d.breakaway.copy()
         for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
             out[j, side] = net[(self.joint == j) & (self.side == side)].mean()

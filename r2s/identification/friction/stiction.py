@@ -73,9 +73,9 @@ def scan_breakaway(
 ) -> np.ndarray:
     """Return the breakaway torques (n, 2) Nm with which `dynamics` replays the recording best.
 
-    A gradient search would fail, because the replay error jumps if a joint starts to slide one step sooner. A pass
-    varies one breakaway torque at a time and minimizes the replay error of its joint. Coarse passes scan from 0 to
-    `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, because joints affect each other.
+    A gradient search would fail: the replay error jumps if a joint starts to slide one step sooner. In each pass, a
+    candidate differs in one breakaway torque, and the replay error of its joint is minimized. Coarse passes scan from
+    0 to `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, as joints affect each other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

@@ -9,7 +9,7 @@ from r2s.physics.rigid_body import LinkInertia
 
 NAMES = ("mass", "x", "y", "z", "d1", "d2", "d3", "s12", "s13", "s23")
 # prior standard deviations: SIZE, of the logarithm of a body's size along an axis, relative to a ball of water of the
-# same mass (a steel block is half as large, an empty box of 2 kg three times as large); SHEAR, of its shear
+# same mass (a steel block is half as large, an empty box of 2 kg three times as large); SHEAR, of s12, s13, s23
 SIZE, SHEAR = 0.7, 0.5
 HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: mass over rated mass; distance and shape over their prior sigma
 STEP = 1e-6  # finite-difference step, relative to the width of the bounds
@@ -20,7 +20,7 @@ class BodySpace:
     """Coordinates z (10,) of a body in the end effector's frame: mass, center of mass, shape of the second moment.
 
     The second moment about the center is mass gyration^2 V V^T, V = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]]
-    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). Every z with positive mass describes a possible body.
+    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). Every z with positive mass is physically possible.
 
     Attributes:
         heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the center's coordinates.

@@ -21,7 +21,7 @@ def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mappi
     `arm.payload`, `arm.declared_payload` and `data.declared_payload` read payload.yaml; `robot.tool` reads tool.json.
 
     Args:
-        path: the payload.yaml to write. robot: the loaded arm. source: recording, calibration and run.
+        path: the payload.yaml to write. robot: the loaded arm. source: names of recording, calibration, run.
     """
 
     def numbers(values: np.ndarray) -> Any:
@@ -36,7 +36,7 @@ def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mappi
         entry = {"unit": UNITS[name], "value": numbers(value)}
         entry |= {"interval95_low": numbers(low), "interval95_high": numbers(high)}
         document["parameters"][name] = entry | {"identifiable": np.asarray(found.identifiable[name]).tolist()}
-    # with all digits, because rounding may make a thin body's tensor inconsistent
+    # with all digits, because rounding may make a thin body's tensor unphysical
     document["payload"] = {name: np.asarray(value).tolist() for name, value in found.values.items()}
     columns = found.tensor.T.ravel().tolist()
     document["libfranka"] = {"load_mass": found.mass, "F_x_Cload": found.centre.tolist(), "load_inertia": columns}

@@ -1,4 +1,4 @@
-"""Linearize the torque residual of an arm with a payload in the payload's parameters and the model's errors."""
+"""Linearize the torque residual of a loaded arm with respect to payload parameters and errors of the arm's model."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -56,7 +56,7 @@ class Rows:
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,): sum((slope @ phi + constant)^2) is the cost at best w, up to a constant."""
+        """Slope (K, 10), constant (K,): |slope @ phi + constant|^2 plus a fixed number is the cost at the best w."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -128,7 +128,7 @@ class LoadedTorque:
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Linearize the residual at `payload` (parameters phi (10,)); weights ignore torque from errors w (r,)."""
+        """Linearize the residual at `payload` (parameters phi (10,)); weights exclude torque from errors w (r,)."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

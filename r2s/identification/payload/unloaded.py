@@ -16,7 +16,7 @@ def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff
     """Return the recording with the payload's torque subtracted from tau.
 
     Rigid-body torque is linear in the inertial parameters of a payload. Measured and motor torque contain the weight
-    of the payload. Commands do not contain a declared payload's weight, because gravity compensation carries it.
+    of the payload. Commands do not contain a declared payload's weight, because gravity compensation adds it.
 
     Args:
         payload: the known payload. cutoff_hz: torque cutoff of the identification; acceleration has a higher cutoff.

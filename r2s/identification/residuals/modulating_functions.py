@@ -28,7 +28,7 @@ GUARD = 8e-3  # s between a window and a stop, because the low-pass spreads the 
 STEADY = 0.2  # largest relative change of velocity over the distance PRESLIDING, for a friction law with memory
 STEADY_ROWS = 101  # rows of the polynomial fit to test STEADY; over five rows, noise looks like acceleration
 MAX_LATENCY = 0.04  # s, longest latency of a command
-HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of eighths of the step for which a command is held
+HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of eight equal parts of a command's hold, in steps
 # Gauss-Laguerre quadrature for a first-order lag; the omitted four points have less than 1e-10 of the weight
 LAG_POINTS, LAG_WEIGHTS = (x[:12] for x in np.polynomial.laguerre.laggauss(16))
 
@@ -41,7 +41,7 @@ class SlidingMotion:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2, motion. bristle: (F, n), presliding state.
         means: for each piece of the recording, n sparse matrices (moments, instants) with the window weights of each
             joint. A moment without a window has an empty row.
-        seen: (T, n) bool, whether there is a window around the moment in which the joint slides in one direction.
+        seen: (T, n) bool, whether the moment has a window; in a window, the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of a window's mean acceleration for white encoder noise of 1 rad.
         encoder: (n,) rad, standard deviation of the encoder noise.
         delayed: (T, L, n) Nm, window means of the command after each of L delays: -1 ms, 0, 1 ms, ...
@@ -72,8 +72,8 @@ class SlidingMotion:
         """Find windows, centered every 1 / `rate_hz` s, in which a joint is faster than `slowest` rad/s.
 
         For a friction law with memory (`slid` > 0), bristles bend over `presliding_rad` (a number or (n,)) after a
-        reversal. A window therefore starts only when the joint has slid by `slid` rad after a reversal. Velocity must
-        be nearly constant over the distance PRESLIDING, because bristle friction depends on earlier velocities.
+        reversal. After a reversal, a window starts only when the joint has slid by `slid` rad. In a window, velocity
+        is nearly constant over the distance PRESLIDING, because bristle friction depends on earlier velocities.
 
         Raises:
             UserError: no trajectory is longer than 2 EDGE_S.
@@ -153,7 +153,7 @@ class SlidingMotion:
     def command(self, delay: float, lag: float) -> np.ndarray:
         """Return window means (T, n) Nm of the command after the hold, the `delay` in s and the `lag` in s.
 
-        It is the mean of u(t - delay - hold - x), with hold uniform over a step and x exponential with mean `lag`.
+        The command is the mean of u(t - delay - hold - x), hold uniform over a step, x exponential with mean `lag`.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
@@ -166,7 +166,7 @@ class SlidingMotion:
 
 
 def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
-    """Fit polynomials of order 4 or less to the angles, over at most `most` rows each; return a derivative (T, n)."""
+    """Fit polynomials of order <= 4 to at most `most` rows of q each; return the `order`-th derivative (T, n)."""
     out = np.zeros_like(recording.q)
     for s in recording.stretches:
         rows = min(most, s.stop - s.start - (s.stop - s.start + 1) % 2)

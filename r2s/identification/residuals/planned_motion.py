@@ -1,4 +1,4 @@
-"""Represent a planned motion, which is free of noise and needs no filter, in place of a recording."""
+"""Represent a planned motion, which has no noise and needs no filter, in place of a recording."""
 
 from dataclasses import dataclass
 
@@ -57,5 +57,5 @@ class PlannedMotion:
     rows = filtered
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the command (T, n) Nm that acts after `delay` and `lag`, s, to first order in both."""
+        """Return the command (T, n) Nm that acts after `delay` and `lag` (s), linearized in `delay` and `lag`."""
         return self.tau - (delay + lag) * self.change

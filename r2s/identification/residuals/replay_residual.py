@@ -1,6 +1,6 @@
 """Replay residual (output error) of commanded motion: simulated minus recorded joint angles, eq. (8) of the paper.
 
-Every candidate starts each window at the measured state and receives the recorded commands. All windows of many
+In each window, every candidate is simulated from the measured state with the recorded commands. All windows of many
 candidates are simulated in one batch. Residuals are in standard deviations, see `reweighted`.
 """
 
@@ -16,7 +16,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-USUAL = 0.9  # noise is estimated from this share of the windows: those with the least residual
+USUAL = 0.9  # share of the windows, those with the least residual, from which noise is estimated
 HUBER = 1.5  # ratio of a window's RMS residual to the median, above which the window is down-weighted
 Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite-difference steps
 TORQUE_SIGMA, MIN_TORQUE_SIGMA = 0.05, 1e-4  # Nm, first guess and lower limit of a window's unexplained torque
@@ -28,11 +28,11 @@ class ReplayResidual:
 
     The error of a window is modeled as Z b + e. For each joint, b ~ N(0, diag(d)) contains the errors of start angle
     and start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise.
-    The covariance of Z b + e whitens the error. Finite differences yield Z. First values of d and s come from
-    the recording, later values from a fit. `clusters` (R,) is each row's block; before a fit, each window is a block.
+    The covariance of Z b + e whitens the error. Finite differences yield Z. The first d and s come from the
+    recording, later estimates from a fit. `clusters` (R,) is each row's block; before a fit, each window is a block.
 
     Args:
-        space: the parameters. recording, windows: the data, see `cut_windows`. stride: ms, averaging time of angles.
+        space: parameters to estimate. recording, windows: see `cut_windows`. stride: ms, averaging time of angles.
         batch: number of candidates that are simulated at once. nthread: number of threads; 0: all cores.
     """
 
@@ -170,8 +170,8 @@ def _random_effects(
     """Estimate the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e by maximum evidence.
 
     MacKay's fixed-point iteration (Neural Computation 4(3), 1992) starts at `sigma` and `noise`. The variance of b is
-    the sum of its squared estimates over the number of well-determined b. Their average over windows is subtracted
-    first, because a wrong parameter (mostly an offset) causes it. The standard deviation of b is >= `min_sigma` (K,).
+    the sum of squared estimates of b, divided by the number of well-determined b. The estimates' mean over windows is
+    subtracted first: a wrong parameter (mostly an offset) causes it. The standard deviation of b is >= `min_sigma`.
     """
     _, rows, k = z.shape
     n = len(noise)

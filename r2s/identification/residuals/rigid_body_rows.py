@@ -39,7 +39,7 @@ class RigidBodyRows:
         still, shape = np.zeros_like(m.q), (*m.q.shape, -1)
         commanded = torque == "commanded"
         rest, y = rigid_body(robot, m.q, m.dq, m.ddq, None if commanded else robot.gravity)
-        rest = m.rows(rest - robot.armature * m.ddq)  # candidates add their own rotor torque
+        rest = m.rows(rest - robot.armature * m.ddq)  # the torque residual adds the rotor torque of each candidate
         nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         weight = m.rows(regressor(robot, m.q, still, still, robot.gravity).reshape(shape))
         y = m.rows(y.reshape(shape))

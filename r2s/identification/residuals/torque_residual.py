@@ -1,7 +1,7 @@
 """Torque residual (equation error): torque predicted at the measured motion minus recorded torque.
 
 For link-side and motor torque, r2s minimizes only the torque residual, because only commands can be replayed. For
-commanded torque, a fit of the torque residual is a fast first search. Residuals are in standard deviations.
+commanded torque, a fit of the torque residual is a fast search before replays. Residuals are in standard deviations.
 """
 
 from collections.abc import Iterator
@@ -27,24 +27,24 @@ from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, too small for curvature to matter
-MAX_CORRELATION = 40  # rows, limit of the correlation length: a slowly drifting residual still counts as several rows
+MAX_CORRELATION = 40  # rows, limit of the correlation length: a slow drift still counts as several rows
 MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 30_000  # recordings above 5 min (at 100 Hz) get fewer rows per s; for a cutoff of 10 Hz, 20 per s suffice
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
 AT_ONCE = 8  # candidates whose link torques are computed in one pass over the regressor
 PART = 2048  # number of moments whose Jacobian is in memory at once
-FULLY_BENT = 4.0  # presliding distances; bristles then bend to 98 % from rest, and to 96 % after a reversal
+FULLY_BENT = 4.0  # presliding distances, over which bristles bend to 98 % from rest, and to 96 % after a reversal
 
 
 class TorqueResidual:
     """Immutable torque residual of a zero-phase filtered recording.
 
     The constructor computes the regressor of rigid-body torque once. Friction is computed from velocities with a
-    higher cutoff, then filtered as the recorded torque, so that both change equally fast when a joint reverses.
+    higher cutoff, then filtered like recorded torque, so that friction and torque change equally fast at a reversal.
 
     Args:
-        space: the parameters to estimate. recording: a recording or a planned motion, which is not filtered.
-        cutoff_hz: cutoff of the zero-phase filter. rate_hz: rows per second.
+        space: the parameters to estimate. recording: a recording, or a planned motion, which needs no filter.
+        cutoff_hz: cutoff of the zero-phase filter. rate_hz: residual rows per second.
         presliding_rad: rad, distance over which bristles bend, a number or (n,).
         slowest: rad/s; if positive, rows are means over windows in which the joint is faster than `slowest` and does
             not reverse (modulating_functions.py), and the weights of rows include encoder noise.
@@ -69,7 +69,7 @@ class TorqueResidual:
             if slowest:
                 of: Any = partial(SlidingMotion.of, slowest=slowest, slid=slid)
             else:
-                # for commanded torque, use the derivative of q: logged dq is late, by a filter or a step
+                # for commanded torque, use the derivative of q: logged dq is late, by a filter's delay or by a step
                 late = from_q(robot.n) if self.commanded else lateness(recording, cutoff_hz)
                 late = late.as_logged if space.nominal.late_alike else late
                 of = partial(SmoothMotion.of, cutoff_hz=cutoff_hz, late=late)
@@ -85,7 +85,7 @@ class TorqueResidual:
         self._sharp = bool(slowest)
         self._mean_sign = {memory: m.filtered(self._sign(memory, slice(None))) for memory in (False, True)}
         self.block = blocks_of(m.t, self._rigid.q, self._period)
-        # blocks of held-out rows; rows at equal times share a block, as otherwise short trajectories would dominate
+        # blocks of held-out rows; rows at equal times share a block, so that short trajectories do not dominate
         self.half_second: np.ndarray = np.unique(np.floor(m.t / BLOCK_S), return_inverse=True)[1]
         self.lead_s, self._external = 0.0, np.zeros(1)
         self._weights = self._weights_at(self._seen_errors(space.start), fitted=False)
@@ -116,7 +116,7 @@ class TorqueResidual:
     def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
         """Return a copy for bristles that bend over `presliding_rad` (n,) rad during the motion of `recording`.
 
-        The copy is weighted as before a fit. To save memory, the copy shares motion and regressors with the original.
+        The copy has weights as before a fit, and shares motion and regressors with the original to save memory.
         """
         of = partial(self._of, presliding_rad=presliding_rad)
         bristle = np.concatenate([of(piece).bristle for piece in _pieces(recording, of)])
@@ -136,7 +136,7 @@ class TorqueResidual:
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: parts of an earlier evaluation; a part is reused if the parameters in it are equal.
+        known: torques of an earlier evaluation; a torque is reused if the parameters on which it depends are equal.
         """
         d, own = dynamics, self._known(dynamics, known)
         # a link-side sensor's gain does not scale friction
@@ -147,7 +147,7 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None, links: np.ndarray | None = None) -> "_Known":
-        """Return the parts of an error that are slow to compute; parts of `like` with equal parameters are reused.
+        """Return the torques that are slow to compute; torques in `like` are reused if their parameters are equal.
 
         links: (T, n) Nm, torque of the links of `d`; None: compute this torque.
         """
@@ -230,7 +230,7 @@ class TorqueResidual:
             yield r[rows].ravel(), self._assembled(changes, rows, len(x)) / h
 
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
-        """Return changes (R, P) of the residual; for column k, only value k changes from x (P,) to `stepped` (P,)."""
+        """Return changes (R, P) of the residual; in column k, only parameter k changes from x (P,) to `stepped`."""
         return self._assembled(self._changes(x, stepped)[1], slice(None), len(x))
 
     def _changes(
@@ -238,9 +238,9 @@ class TorqueResidual:
     ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
         """Return the torque error (T, n) at x, and [(parameter block, indices in x, change)] to `stepped`.
 
-        A change is one of torque (T, n) or, for L parameters of links, one of standard parameters (n, 10 n, L).
-        The latter need no evaluation, because torque is linear in standard parameters. A joint's value in another
-        parameter block affects only this joint's torque, so one evaluation steps the values of all joints.
+        `change` is a change of torque (T, n) or, for L link parameters, of standard parameters (n, 10 n, L). Changes
+        of standard parameters need no evaluation, as torque is linear in them. In other parameter blocks, a joint's
+        value affects only this joint's torque, so one evaluation steps the values of all joints.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -329,7 +329,7 @@ class _Known(NamedTuple):
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
-    """Filter a recording piece by piece with `of`; return the joined motion and its rigid-body torque."""
+    """Filter a recording piece by piece with `of`; return the joined motion and the rigid-body torque."""
     motions = [of(piece) for piece in _pieces(recording, of)]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     joined = type(motions[0]).joined(motions)

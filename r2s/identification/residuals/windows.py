@@ -61,11 +61,11 @@ class Windows:
     def bristles(self, d: Dynamics) -> np.ndarray:
         """Return the presliding state (..., W, n) at the start of each window, for dynamics with batch axes (...).
 
-        The state starts from 0 in each trajectory and follows the recorded velocity. Without memory, it is always 0.
+        The state starts from 0 in each trajectory and follows recorded velocity; without friction memory, it is 0.
         """
         if not d.family.has_memory:
             return np.zeros((len(self.at), self.dq.shape[1]))
-        named = "presliding" in d.family.names[: d.phi.shape[-1]]  # a user's law may lack this
+        named = "presliding" in d.family.names[: d.phi.shape[-1]]  # a user's friction law may lack this parameter
         distance = d.phi[..., d.family.names.index("presliding")] if named else np.full(d.phi.shape[:-1], PRESLIDING)
         kinds, kind = np.unique(distance.reshape(-1, distance.shape[-1]), axis=0, return_inverse=True)
         pieces = [self.dq[a:b] for a, b in pairwise([*self.begins, len(self.dq)])]
@@ -84,8 +84,8 @@ def cut_windows(
 
     Args:
         limit: largest number of windows; a longer recording yields `limit` evenly spaced windows.
-        slowest: rad/s. A window ends when a joint is slower; the next one starts when all joints are faster. A tiny
-            change of a parameter could shift a slow joint's breakaway. Joints that never move are ignored.
+        slowest: rad/s. A window ends when a joint is slower, and the next window starts when all joints are faster,
+            as a tiny parameter change could shift a slow joint's breakaway. Joints that never move are ignored.
         edges: (n, 2) Nm, lower and upper breakaway command of each joint, widened by SCATTER. A slow joint ends a
             window only if its command lies between its two breakaway commands.
 
@@ -140,7 +140,7 @@ def cut_windows(
 
 
 def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, int]]:
-    """Split `count` rows at the `slow` rows into windows of at most `steps` rows; return each (start, length)."""
+    """Split `count` rows at the `slow` rows into windows of at most `steps` rows; return (start, length) of each."""
     out = []
     for a, b in pairwise([-1, *slow.tolist(), count - 1]):
         run = b - a - 2 - HALF  # the fit of a start state uses only rows without slow joints
@@ -169,7 +169,7 @@ class StartState:
 
     @staticmethod
     def of(grid: Recording) -> "StartState":
-        """Return the estimator of start states in a recording `grid` with 1 kHz."""
+        """Return the estimator of start states in `grid`, a recording at 1 kHz."""
         n = grid.n_joints
         seen = [s for s in grid.stretches if s.stop - s.start > STATE_SAMPLES]
 
@@ -194,7 +194,7 @@ class StartState:
         return StartState(noise, kernel, np.sqrt(((kernel * size[:, None]) ** 2).sum(-1)).T)
 
     def __call__(self, grid: Recording, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return q, dq (W, n) rad, rad/s at the row indices `at` (W,), each HALF rows or more inside a trajectory."""
+        """Return q, dq (W, n) rad, rad/s at the row indices `at` (W,), HALF rows or more from a trajectory's ends."""
         rows = at[:, None] + np.arange(STATE_SAMPLES) - HALF
         seen = np.concatenate([grid.q[rows], grid.dq[rows]], 1)
         q, dq = np.einsum("nks,wsn->kwn", self.kernel, seen)

@@ -16,7 +16,7 @@ from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
 HOLD_STEPS = 0.5  # in steps, mean latency of a command that is constant over a step
-FRICTION_CUTOFF = 4.0  # cutoff of velocity for friction, relative to the cutoff of torque; high: sharp reversals
+FRICTION_CUTOFF = 4.0  # cutoff of velocity for friction, relative to that of torque; high: sharp reversals
 SHIFT = 0.05  # step between stored time shifts, in cutoff periods; cubic interpolation then errs by 2e-4
 SHIFTS = -0.03, 0.05  # s, range of the stored time shifts of torque
 MOST_SHIFT = 20  # ms, largest step between shifts; interpolation needs four shifts within SHIFTS
@@ -32,7 +32,7 @@ class SmoothMotion:
         t: (T,) s, sample times. q, dq, ddq, tau: (T, n), filtered forward and backward.
         friction_dq: (F, n) rad/s, velocity at FRICTION_HZ, with a higher cutoff than dq. bristle: (F, n), presliding
             state. friction_dq and bristle have half a kernel of constant rows before and after each trajectory.
-        kernel: (K,), weights of the low-pass. spans: for each sample, the first of its K rows in friction_dq.
+        kernel: (K,), weights of the low-pass. spans: for each sample, the index of its first row in friction_dq.
         delayed: (T, L, n) Nm, tau at L time shifts in the range SHIFTS, `shift_s` s apart.
     """
 
@@ -56,7 +56,7 @@ class SmoothMotion:
         presliding_rad: np.ndarray | float = PRESLIDING,
         late: Lateness | None = None,
     ) -> "SmoothMotion":
-        """Resample to 1 kHz, filter forward and backward, differentiate, remove the ends, and sample at `rate_hz`.
+        """Resample to 1 kHz, filter forward and backward, differentiate, remove EDGE_S at ends, sample at `rate_hz`.
 
         rate_hz: rows per second, at most FRICTION_HZ. late: delay of dq, which is compensated; None: no delay.
 

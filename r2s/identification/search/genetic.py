@@ -24,7 +24,7 @@ class Genetic:
     Attributes:
         population: number of individuals, all simulated at once.
         generations: largest number of generations, G_max. minutes: time limit.
-        spread: standard deviation of the first population about the start, on the unit cube; at most the prior's.
+        spread: standard deviation of the first population about the start, on the unit cube; at most `prior_width`.
         patience, tolerance: the search ends if the best cost improves by less than the share `tolerance` over
             `patience` generations.
         seed: seed of all random draws.

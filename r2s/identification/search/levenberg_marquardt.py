@@ -11,7 +11,7 @@ import numpy as np
 
 DAMPING = 1e-3  # first damping factor, relative to the diagonal of J^T J (Marquardt's scaling)
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # lower limit: a pure Gauss-Newton step; upper limit: almost no step
-TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful one
+TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful factor
 RETRIES = 3  # batches of trials per Jacobian
 
 

@@ -45,7 +45,7 @@ class Fold(NamedTuple):
     test: TorqueResidual
 
     def score(self, space: ParameterSpace, prior: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Fit `space`; return the mean square error (blocks, n) Nm^2 of held-out torque per half-second block."""
+        """Fit parameters; return the mean square error (blocks, n) Nm^2 of held-out torque per half-second block."""
         own, test = self.fit.on(space), self.test
         u, _ = fit_torque(Problem.of(own, own, prior))
         square = test.seen * test.error(space.dynamics(space.from_unit(u)[None]).one(0)) ** 2
@@ -64,7 +64,7 @@ class CrossValidation:
         bounds, prior: bounds and prior of the parameters, see `search_space` and `Problem.of`.
         folds: number of folds.
         cutoff_hz: cutoff of the zero-phase filter.
-        report: function that receives progress rows. stated: the user's statements; only fixed values are used.
+        report: function that receives progress rows. stated: the user's values; only fixed ones are used.
     """
 
     robot: Robot

@@ -45,7 +45,7 @@ def select_terms(
         trials = [score([*chosen, name]) for name in left]
         k = int(np.argmin([t.mean() for t in trials]))
         less = best - trials[k]
-        if less.mean() <= CLEARLY * less.std() / np.sqrt(len(less)):  # without held-out rows both are 0
+        if less.mean() <= CLEARLY * less.std() / np.sqrt(len(less)):  # without held-out rows, both sides are 0
             break
         chosen.append(left[k])
         best = trials[k]

@@ -1,7 +1,7 @@
 """Decide whether an identification corrects the lateness of link-side torque and of the logged dq.
 
 The log alone determines the lateness of dq relative to q (r2s/recordings/lateness.py); the lateness of torque needs a
-fit. If an arm filters torque and dq alike, both are equally late and need no correction, because inertial torque and
+fit. If an arm filters torque and dq alike, they are equally late and need no correction, because inertial torque and
 friction refer to the same time; a correction of only dq would increase the error. On a physical Panda, dq is 5.3 ms
 late and torque about 2 ± 0.5 ms. Correcting only the Panda's dq raised the error on held-out motion of the training
 part, but the training residual did not reveal this error.
@@ -20,7 +20,7 @@ from r2s.identification.structure.cross_validation import RATE_HZ, CrossValidati
 from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
-SURE = 4.0  # standard deviations: 3, plus a third, as model error reduced the coverage of 95 % intervals to 85 %
+SURE = 4.0  # standard deviations: 3, raised by a third, because 95 % intervals covered 85 % due to model error
 UNCLEAR = 2.0  # standard deviations between an estimated delay and the largest plausible one
 BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted motion have similar speeds
 
@@ -28,11 +28,11 @@ BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether to estimate the delay of torque, "alike": whether torque and dq are equally late}.
 
-    If dq is on time, or its lateness unknown, r2s estimates the delay of torque unless it is clearly below LATE_S: a
-    delay fixed at 0 would have no uncertainty. If dq is late, r2s first fits torque with corrected dq. If torque
-    then clearly has a delay, r2s corrects torque and dq. Otherwise it corrects only dq if this lowers the error of
-    held-out torque by more than one standard error, else it uses torque and dq as logged and treats both as equally
-    late. With folds < 2, it corrects only dq.
+    If dq is on time, or the lateness of dq unknown, r2s estimates the delay of torque unless this delay is clearly
+    below LATE_S: a delay fixed at 0 would have no uncertainty. If dq is late, r2s first fits torque with corrected
+    dq, and corrects torque and dq if torque clearly has a delay in this fit. If not, r2s corrects only dq, unless
+    this hardly lowers the error of held-out torque (by one standard error or less); torque and dq as logged are then
+    treated as equally late. With fewer than 2 folds, r2s corrects only dq if torque has no clear delay.
     """
     on_time = not np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure).any()
     if DELAY in terms:

@@ -29,8 +29,8 @@ class AdapterComparison:
     Attributes:
         measures: {key: compared measure}. headline: the measure that summarizes a row.
         scores: a line per measure, condition and row: `mean`, 95 % interval `low` to `high`; `difference` from the
-            row `reference` (None: no reference); 95 % interval `worse_low` to `worse_high` of how much worse it is;
-            numbers of `stopped` episodes, of those common to all rows (`asked`), of averaged `episodes`, of `arms`.
+            row `reference` (None: no reference); 95 % interval `worse_low` to `worse_high` of how much worse the row
+            is; counts of `stopped` episodes, episodes common to all rows (`asked`), averaged `episodes`, and `arms`.
         losses: table with a line per condition and row. `value` is the mean of the headline measure in the condition;
             `nominal` is its mean over the same arms and episodes in the nominal condition.
         costs: table with a line per row. `us` is the adapter's computing time per cycle, microseconds.
@@ -107,8 +107,8 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
     """Return the part of the table `AdapterComparison.scores` for one measure and one condition.
 
-    An episode without a value in one row is omitted in all rows: a stopped episode has no RMSE, no gap and infinite
-    distance. A row without any values causes no omissions. The mean of a single episode has no interval.
+    An episode without a finite value in one row is omitted in all rows; a stopped episode, for example, has no RMSE.
+    A row without any values causes no omissions in other rows. The mean of a single episode has no interval.
 
     Args:
         shared: output of `in_common`. measure: the compared measure. reference: {row: reference row or None}.
@@ -189,7 +189,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Return a line about a row: its headline measure in its worst condition, and where its reference is better."""
+    """Return a line on a row: headline measure in the worst condition; conditions with a better reference."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:
@@ -211,7 +211,7 @@ def verdict(found: AdapterComparison, row: str) -> str:
 
 
 def _place(found: AdapterComparison, worse: pd.DataFrame) -> str:
-    """Describe a condition in which a row is worse: "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)"."""
+    """Name a condition and the worse measures of a row: "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)"."""
     parts = []
     for r in worse.to_dict("records"):
         m = found.measures[r["measure"]]

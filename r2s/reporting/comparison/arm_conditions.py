@@ -18,7 +18,7 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     """Return the settings of conf/arm that differ from their nominal values, such as {"payload": 1.0}.
 
     Args:
-        arm: config of the arm. typed: overridden config keys; those of the arm ("arm.live") count as settings, too.
+        arm: config of the arm. typed: overridden config keys; keys of the arm ("arm.live") also count as settings.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])

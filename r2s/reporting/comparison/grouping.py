@@ -61,7 +61,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
     names = [_joined(seeds[0].algo, p) for seeds, p in zip(sets, parts, strict=True)]
     for name in list(names):
         twins = [k for k, other in enumerate(names) if other == name]
-        if len(twins) > 1:  # they differ in settings without an override, such as those of +experiment=
+        if len(twins) > 1:  # the sets differ in settings without an override, such as settings of +experiment=
             changed = differing([sets[k][0].settings for k in twins])
             for k in twins:
                 more = {_short(s): sets[k][0].settings[s] for s in changed if s in sets[k][0].settings}
@@ -70,7 +70,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: differing settings}; algo settings are compared within an algorithm, others in all runs."""
+    """Return {algorithm: differing settings}; compare algo settings per algorithm, other settings in all runs."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}
@@ -81,7 +81,7 @@ def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys whose values differ between the settings, or that are missing in some of them."""
+    """Return the keys with values that differ between the settings, or that some settings omit."""
     keys = dict.fromkeys(k for s in settings for k in s)
     return [k for k in keys if len({repr(s.get(k)) for s in settings}) > 1]
 

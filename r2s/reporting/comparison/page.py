@@ -42,7 +42,7 @@ def comparison_page(
     """Write tables (CSV), figures, report.md and recording.rrd of a comparison of trainings.
 
     Args:
-        run: run folder to write to. robot: the arm. grouped: the groups. apart: {incomparable run: reason}.
+        run: run folder to write to. robot: the arm. grouped: the trainings. apart: {incomparable run: reason}.
         others: {folder without a finished training: reason}.
 
     Returns:
@@ -96,7 +96,7 @@ def _sections(
 
 
 def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]:
-    """Return a report section of reasons for each heading in {heading: {run: reason}}; omit headings without runs."""
+    """Return a report section per heading in `parts`, {heading: {run: reason}}; omit headings without runs."""
     return {heading: [[f"{k}: {v}" for k, v in why.items()]] for heading, why in parts.items() if why}
 
 

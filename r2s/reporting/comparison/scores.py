@@ -14,7 +14,7 @@ Grouped = Mapping[str, Sequence[Trained]]
 
 
 def measures_in(grouped: Grouped) -> MeasureTable:
-    """Return the measures of the task that all runs share."""
+    """Return the measure table of the task, which is the same in all runs."""
     return next(iter(grouped.values()))[0].measures
 
 
@@ -36,7 +36,7 @@ def summary_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def improvement_table(grouped: Grouped) -> pd.DataFrame:
-    """Return, per pair of groups, the probability that a run of the first group is better than one of the second."""
+    """Return, per pair of groups, the probability that a run of the first beats a run of the second group."""
     rows, table = [], measures_in(grouped)
     pairs = [(first, second) for first in grouped for second in grouped if first != second]
     for first, second in pairs:
@@ -79,7 +79,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return two scores (S,) at S held-out seeds: of the best setting at the other seeds, and the median of settings.
+    """Return, at S held-out seeds, the score (S,) of the setting best at the other seeds, and the median score (S,).
 
     Args:
         settings: {seed: score} of each setting; a larger score is better. Only seeds common to all settings are used;
@@ -118,7 +118,7 @@ def is_number(value: object) -> bool:
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return a square of strings for one measure of an `improvement_table`: probability that a row beats a column."""
+    """Return a matrix of strings from an `improvement_table`: probability that the row's group beats the column's."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}

@@ -16,16 +16,16 @@ from r2s.reporting.trackers.tracker import flat
 from r2s.runs import parts_of
 from r2s.tasks.measures import MeasureTable
 
-# config groups that a training reads, besides its seed; runs with equal values in them form one group of seeds
+# config groups that a training reads, besides its seed; runs with equal values in all these groups are one group
 READ = (
     *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
 )
-ALIKE = ("robot", "task")  # config groups with equal values in comparable runs
-# key of `origin` -> why runs that differ in it are not comparable: code affects results, a machine affects speed
+ALIKE = ("robot", "task")  # config groups that must have equal values in comparable runs
+# {key of `origin`: why runs with different values are not comparable}; code affects results, a machine affects speed
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
-MOST_BUDGETS = 2.0  # largest ratio of two comparable budgets: beyond it the longer training wins by its length
+MOST_BUDGETS = 2.0  # largest ratio of comparable budgets: beyond this ratio, the longer training wins by its length
 UNFINISHED = {"running": "unfinished"}
 
 
@@ -37,7 +37,7 @@ class Trained:
         folder, seed, algo: run folder, random seed, name of the algorithm.
         settings: config values that the training used, such as {"algo.lr": 5e-4, "dr.phi_relative": 0.1}.
         alike: config values that comparable runs share, such as {"task.ctrl_hz": 50, "evaluation.episodes": 200}.
-        origin: commit, machine, threads and device from meta.json, each may be None; of a controller only the commit.
+        origin: commit, machine, threads, device from meta.json, or None; of a model-based controller only the commit.
         typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether the run used +experiment=toy, a training too short for the policy to learn.
         minutes: budget of the run in minutes; None if the run has a budget in env_steps.
@@ -121,7 +121,7 @@ def _read(folder: Path) -> Trained:
     curve, last = _evaluations(folder, measures)
     learned, read = last["env_steps"] > 0, set(READ)
     if config.get("calibration"):
-        read -= {"friction", "inertia"}  # the calibration replaces them
+        read -= {"friction", "inertia"}  # groups that the calibration replaces
     if not learned:
         read -= {"budget", "costs", "matmul", "reward"}
     typed = {k: v for k, v in typed_in(folder).items() if k.split(".")[0] in read | {"experiment"}}
@@ -144,7 +144,7 @@ def _read(folder: Path) -> Trained:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    """Return commit, machine, threads and device of a run; a resumed run lists the values of all parts."""
+    """Return commit, machine, threads and device of a run; for a resumed run, of all its parts between stops."""
     found: dict[str, set[str]] = {key: set() for key in ORIGIN}
     for part in parts_of(json.loads((folder / "meta.json").read_text())):
         git, machine = part["git"] or {}, part["machine"] or {}
@@ -187,9 +187,9 @@ def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, di
 def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
     """Return the largest set of comparable runs, and {run: reason} for all other runs.
 
-    Runs are comparable if robot, task, evaluation, commit and machine agree and budgets differ by at most the factor
+    Runs are comparable if robot, task, evaluation and all of ORIGIN agree, and budgets differ by at most the factor
     `MOST_BUDGETS`. Of sets of equal size, sets without +experiment=toy have priority, then sets with more env steps.
-    A run that repeats the settings and seed of an earlier run is left out, because it adds no evidence.
+    Only the first run with given settings and seed is kept, because a repetition adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -208,7 +208,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why a run is not comparable with `first`, the smallest-budget run of a set; "" if it is comparable."""
+    """Return why a run is not comparable with `first`, the smallest-budget run of a set; "" for a comparable run."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]

@@ -30,8 +30,8 @@ class Transferred:
     Attributes:
         folder: run folder. start: start time, from meta.json. policy: absolute path of the policy's run folder.
         adapter: name in conf/adapt. settings: the adapter's settings, such as {"filter_s": 0.087}.
-        arm: name such as "twin, rigid, seed 0". condition: result of `condition`. robot: robot config in training.
-        measures: measures of the task. length: duration and policy rate, as "4 s at 100 Hz". goals: number of goals.
+        arm: name such as "twin, rigid, seed 0". condition: output of `condition`. robot: robot config in training.
+        measures: measures of the task. length: episode length and rate, as "4 s at 100 Hz". goals: number of goals.
         us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
         episodes: a row per episode, indexed by goal, with `MeasureTable.transfer`, gap and arm_stopped (0 or 1).
     """
@@ -117,8 +117,8 @@ def _names(goals: np.ndarray) -> Iterator[str]:
 def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[str, str]]:
     """Return the largest set of comparable transfers, and {run: reason} for all other transfers.
 
-    Transfers are comparable if robot, task and number of goals agree and they share goals. Of several runs with the
-    same policy, adapter, arm and condition, only the latest run is used.
+    Transfers are comparable if robot, task and number of goals agree, and if some goals are the same. Of several runs
+    with one policy, adapter, arm and condition, only the latest run is used.
     """
     first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
     apart = {r.folder.name: why for r in found if (why := _difference(r, first))}

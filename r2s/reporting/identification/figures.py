@@ -57,7 +57,7 @@ def torque_figure(
 def position_figure(
     path: Path, windows_q: np.ndarray, predicted: Mapping[str, np.ndarray], dt: float = SIM_DT
 ) -> Path:
-    """Draw the open-loop error: |predicted - measured|, for {label: (W, S, n)} and windows_q (W, S, n), rad.
+    """Draw the open-loop error, rad: |q - windows_q| for predicted {label: q (W, S, n)} and measured windows_q.
 
     `dt` is the time step of the S rows, s. Lines are medians over the W windows; bands contain 90 % of the windows.
     """
@@ -136,7 +136,7 @@ def _band(
 
 
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw the cost of each search over time, relative to the cost at the search's start; shade steps without cost.
+    """Draw the cost of each search over time, relative to the search's start; shade the searches in SCANS.
 
     Costs are comparable only within one search, because each search uses new weights of the residuals.
     """

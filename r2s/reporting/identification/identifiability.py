@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """List combinations that only the prior determines; of those of parameters kept nominal, give just the number."""
+    """List combinations that only the prior determines; only count combinations of parameters kept nominal."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}
@@ -73,7 +73,7 @@ def _grouped(names: Sequence[str], n: int = 0) -> str:
 
 
 def _combination(parts: Mapping[str, float]) -> str:
-    """Return a null direction as "0.81 d1 of link 3 - 0.57 d2 of link 3"; its sign makes the first part positive."""
+    """Return a null direction as "0.81 d1 of link 3 - 0.57 d2 of link 3"; the first term is made positive."""
     flip = -1.0 if next(iter(parts.values())) < 0 else 1.0
     terms = [f"{'-' if flip * part < 0 else '+'} {abs(part):.2f} {_grouped([name])}" for name, part in parts.items()]
     return " ".join(terms).removeprefix("+ ")

@@ -55,7 +55,7 @@ class Evidence(NamedTuple):
     """Content of an identification's page that `IdentificationResult` does not contain.
 
     Attributes:
-        pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, highest joint speeds in the validation motion.
+        pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, 99.5 % quantiles of validation speed.
         whiteness: result of `whiteness_table` for the validation motion. base: result of `base_table`.
         window_s: length of a replay, s. cutoff_hz: cutoff of the torque fit's low-pass, Hz.
     """

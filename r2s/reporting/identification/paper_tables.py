@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return a cell per link with its value of `get`, identifiable if all its parameters in `blocks` are."""
+        """Return a cell per link with the value of `get`, identifiable if the link's parameters in `blocks` are."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]
@@ -129,7 +129,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     if full:
         columns = {"mass, kg": cells(lambda x: x.mass, LINK[:1])}
         for k, axis in enumerate("xyz"):
-            # the log-Cholesky factor is upper triangular: coordinate k of the center depends on t_k and later ones
+            # the log-Cholesky factor is upper triangular: coordinate k of the center depends on t_k to t_3
             columns[f"centre {axis}, mm"] = cells(partial(_centre, k), LINK[7 + k :])
         words = (
             "Mass and centre of mass in the link's frame, old → new. A value is identifiable (no ?) if all its "
@@ -159,7 +159,7 @@ def _consistency(d: Dynamics) -> str:
 
 
 def friction_table(robot: Robot, nominal: Dynamics, found: IdentificationResult, fastest: np.ndarray) -> list[Item]:
-    """Return Table IV for the identified friction family, with its friction level at speeds `fastest` (n,) rad/s."""
+    """Return Table IV for the identified friction family, and the friction level at speeds `fastest` (n,) rad/s."""
     space, d = found.space, found.dynamics
     own = [b for b in d.family.names if b in space.blocks]
     columns = {named(b): [v.cell for v in values(space, found.found, b, found.unseen)] for b in own}

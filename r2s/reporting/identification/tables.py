@@ -126,7 +126,7 @@ def _before_after(columns: Mapping[str, Sequence[Sequence[float]]], index: pd.In
 
 
 def identification_table(console: Console, robot: Robot, identified: IdentificationResult, summary: Mapping) -> None:
-    """Print `identification_tables`."""
+    """Print the tables of `identification_tables`."""
     for title, table in identification_tables(robot, identified, summary).items():
         print_table(console, table, title, SHORT if title.startswith("identified") else None)
     if identified.refused:

@@ -1,4 +1,4 @@
-"""Test the whiteness of the torque residual: compare the residual with equally filtered white noise."""
+"""Test the whiteness of the torque residual: compare the residual with white noise after the same filter."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -81,7 +81,7 @@ def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.nda
     longest = int(np.diff(edges).max())
     lags = np.arange(max(min(round(LAGS_S / step) + 1, longest // 2), 2))
     _, h = freqz_sos(butter(4, cutoff_hz, fs=1 / SIM_DT, output="sos"), worN=np.arange(8192) / 8192 * np.pi)
-    power = np.abs(h) ** 4  # power gain of both passes
+    power = np.abs(h) ** 4  # power gain of both filter passes
     white = np.fft.irfft(np.append(power, 0.0))
     white = np.interp(lags * step, SIM_DT * np.arange(len(white) // 2), white[: len(white) // 2] / white[0])
     pairs = np.maximum(np.diff(edges)[:, None] - lags, 0).sum(0)

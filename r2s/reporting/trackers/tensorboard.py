@@ -10,7 +10,7 @@ from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Tensorboard(LoggerTracker):
-    """Tracker that writes event files: scalars, settings, figures, and paths of files that they cannot contain."""
+    """Tracker that writes event files: scalars, settings, figures, and the paths of other files."""
 
     def __init__(self) -> None:
         optional_import("tensorboard", "tracker=tensorboard", "trackers")
@@ -32,7 +32,7 @@ class Tensorboard(LoggerTracker):
             self._begins = False
             self._settings()
         super().log(table, numbers, step)
-        self._logger.flush()  # otherwise a killed run loses two minutes of rows
+        self._logger.flush()  # otherwise a killed run loses its rows of the last two minutes
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
         """Log the figures, the paths of the files, and the status."""

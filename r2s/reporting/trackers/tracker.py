@@ -62,7 +62,7 @@ class Tracked:
 
 
 class Tracker(Protocol):
-    """Interface to a tool that shows runs; a single thread calls a tracker, which is created before the run folder.
+    """Interface to a tool that shows runs; a single thread calls a tracker, which r2s creates before the run folder.
 
     After an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
     """

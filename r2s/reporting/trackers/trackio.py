@@ -20,7 +20,7 @@ class Trackio:
 
     def __init__(self, folder: str, project: str = "r2s"):
         os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
-        os.environ.setdefault("TRACKIO_DIR", str(Path(folder).absolute()))  # read at import
+        os.environ.setdefault("TRACKIO_DIR", str(Path(folder).absolute()))  # trackio reads the variable at import
         optional_import("trackio", "tracker=trackio", "trackers")
         self._project = project
 

@@ -19,7 +19,7 @@ LINE = 1.6  # points, width of a line
 
 
 def entity(*parts: str) -> str:
-    """Return the path of a rerun entity with these parts."""
+    """Return the path of a rerun entity from its `parts`."""
     return rr.new_entity_path(list(parts))
 
 
@@ -43,7 +43,7 @@ def log_series(
 
 
 def starts_of(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
-    """Return the start times of K episodes, equal for all arms, and the end time of the last one: (K + 1,) s."""
+    """Return the start times of K episodes, equal for all arms, and the end time of the last episode: (K + 1,) s."""
     count = max((len(sequence) for sequence in episodes.values()), default=0)
     longest = [max(s[k].duration for s in episodes.values() if k < len(s)) + PAUSE for k in range(count)]
     return np.concatenate([[0.0], np.cumsum(longest)])

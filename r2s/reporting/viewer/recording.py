@@ -26,7 +26,7 @@ OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times the cut
 
 
 def write_recording(path: str | os.PathLike, robot: Robot, content: Content) -> Path:
-    """Write `path` (.rrd) and return it."""
+    """Write the content to `path` (.rrd), and return the path."""
     path = Path(path)
     episodes = {label: sequence for label, sequence in content.episodes.items() if sequence}
     content = replace(content, episodes=episodes)
@@ -57,7 +57,7 @@ def _limits(stream: rr.RecordingStream, torque: np.ndarray, seconds: float) -> N
 
 
 def _overlay(stream: rr.RecordingStream, label: str, overlay: Overlay) -> None:
-    """Log one torque plot per joint; the entity paths put the broad measured line below the predicted lines."""
+    """Log one torque plot per joint; numbered entity paths put the broad measured line below the predicted lines."""
     clock, _ = without_pauses(overlay.t)
     rows = at_rate(clock, OVERLAY_HZ)
     index = [rr.TimeColumn("time", duration=clock[rows])]
