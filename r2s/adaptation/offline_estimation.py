@@ -17,7 +17,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
-LEAST_HZ = 200.0
+LEAST_HZ = 200.0  # Hz, our choice: four rows per span of the estimator
 UNKNOWN_PAUSE_S = 60.0  # s, assumed for a pause of unknown length: enough time to change the payload
 
 

@@ -249,9 +249,10 @@ class Driver:
     def _bounded(
         self, tau: np.ndarray, dq: np.ndarray, ddq: np.ndarray, bounds: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to tau with acceleration in `bounds`, and whether the two differ.
+        """Return the torque (n,) Nm nearest to tau with acceleration in `bounds`, and whether it differs from tau.
 
-        ddq: (n,) rad/s^2, acceleration from tau. bounds: inverse mass matrix, then lowest and highest ddq (n,).
+        ddq: (n,) rad/s^2, acceleration from tau. bounds: inverse mass matrix, then lowest and highest ddq (n,), which
+        are widened by the friction that light joints certainly have.
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():
