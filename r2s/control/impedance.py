@@ -1,8 +1,9 @@
 """`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs to a target; actions set target or stiffness.
 
 r2s/physics/impedance_laws.py contains the control laws; this module computes their parameters from arm, task and
-model. Default values scale with the arm: a spring's largest force is a share of the torque limit over the lever arm
-at home. A spring's stiffness is the largest force over a distance, or less if the loop's latency requires it.
+model. Default values scale with the arm: a spring's largest force is a share of the force that the torque limit
+allows in all directions at home. A spring's stiffness is the largest force over a distance, or less if the loop's
+latency requires it.
 """
 
 from collections.abc import Sequence

@@ -131,5 +131,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return `sizes` for the largest torque of each joint: the torque limit or, if larger, the recorded torque."""
+    """Return the parameters' scales (`sizes`) for each joint's torque limit or largest recorded torque, if larger."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

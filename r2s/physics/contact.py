@@ -12,7 +12,7 @@ The stiffness of tangential bristles is proportional to the normal force F (Canu
 
 The unknowns are the joint velocities at the end of the step. Normal force and friction are linearized about a guess
 of the unknowns; the constant part adds to the driving torque, the linear part to the mass matrix. stick_slip.py
-solves these equations, so contact can move resting joints. `start_guess` writes the first guess. `add_contact`,
+adds joint stiction, so contact can move resting joints. `start_guess` writes the first guess. `add_contact`,
 `coming_velocity` and `next_guess` run until the guess is accurate, usually once. `finish_contact` ends the step.
 """
 

@@ -119,7 +119,7 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None: at most 2 force_max on 1e5 N/m.
+        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None: at home, at most 2 force_max on 1e5 N/m.
         plane: point and normal; None: a work table below the home posture's tip. asked: N, a task's largest force.
         stop: a key of STOPS (contact_stop.py); None: "release".
 
