@@ -1,7 +1,7 @@
 # make run: everything on the embedded twin. make test: lint and quick tests. Both set up what is missing first.
 # make docs: the site, strictly, into site/. make gazebo-classic: the world plugin of simulator=gazebo_classic.
 # make test-long: the tests that take seconds. make test-slow: those that take minutes.
-# make test-portable: the numeric ones again, as on other processors. make check: all but test-slow, as .ci/run.
+# make test-portable: the numeric ones again, as on other processors. make check: all but test-slow (.ci/run).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -24,7 +24,8 @@ test-slow: $(READY)
 test-portable: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/portable.py -n 2 --dist loadgroup
 
-check: test test-long test-portable
+check:
+	.ci/run
 
 lint: $(READY)
 	$(BIN)/ruff check .

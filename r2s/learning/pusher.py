@@ -65,6 +65,7 @@ class Pusher:
         reach = float(Surface(half, half, 1.0, half=half).reach)
         h = (p[:, 0] * n[:, 1] - p[:, 1] * n[:, 0]) / reach
         self._twists = np.column_stack([n, h / reach]) / (1.0 + h[:, None] ** 2) / TOLERANCE  # tolerances per m
+        self._squares = (self._twists**2).sum(axis=1)
         self._contacts = p - task.tip_radius * n
         self._places = self._along(self._contacts - CLEAR * n)
 
@@ -116,8 +117,7 @@ class Pusher:
         point of the twist w has the length s >= 0 that minimizes |e - s w|. Its time is that of the travel from `at`
         around the box and of the push, without acceleration.
         """
-        squares = (self._twists**2).sum(axis=1)
-        lengths = (self._twists @ e / squares).clip(0.0)
+        lengths = (self._twists @ e / self._squares).clip(0.0)
         remaining = np.linalg.norm(e - lengths[:, None] * self._twists, axis=1)
         around = np.abs(self._places - self._along(at[None]))
         around = np.minimum(around, 4.0 * self._clear.sum() - around)
@@ -149,10 +149,10 @@ class Pusher:
             out[k] = np.sign(at[k]) * clear[k]
             return out
         seen = [k for k in range(4) if not _crosses(at, corners[k], edge + 0.2 * CLEAR)] or list(range(4))
-        ways = [np.linalg.norm(corners[k] - at) + self._left(corners, k, to, edge) for k in seen]
+        ways = [np.linalg.norm(corners[k] - at) + self._way_left(corners, k, to, edge) for k in seen]
         return corners[seen[int(np.argmin(ways))]]
 
-    def _left(self, corners: np.ndarray, first: int, to: np.ndarray, edge: np.ndarray) -> float:
+    def _way_left(self, corners: np.ndarray, first: int, to: np.ndarray, edge: np.ndarray) -> float:
         """Return the length, m, of the shortest way from the corner `first` past other corners to the point `to`."""
         lengths = []
         for step in (1, -1):
