@@ -1,11 +1,11 @@
 """task=press and wipe on the hidden twins: the reference on the nominal and on the identified model, and policies.
 
-    python benchmarks/press.py [env_steps=320000] [rigid_0 elastic_0 ...]
+    python benchmarks/press.py [env_steps=320000] [policies=10] [rigid_0 elastic_0 ...]
 
-Identifies each twin, evaluates `algo=hybrid_force` with both models, with env_steps= trains policies on the
-identified one, with the twin's seed, and runs all on the twin with its surface, EPISODES goals each. Writes
-results/press.md. Finished runs are kept in runs/press and not repeated. A twin takes about 4 minutes of one core, and
-each of its two policies 2.
+Identifies each twin, evaluates `algo=hybrid_force` with both models, and runs both on the twin with its surface,
+EPISODES goals each. With env_steps=, also trains and runs policies on the identified model of the first `policies=`
+twins (default: all), with the twin's seed. Writes results/press.md. Finished runs are kept in runs/press and not
+repeated. A twin takes about 4 minutes of one core, and each of its two policies 5.
 """
 
 import json
@@ -54,7 +54,7 @@ def summarized(task: str, each: dict[str, list[dict[str, float]]], name: str) ->
     return markdown_rows(rows, name)
 
 
-def models_of(task: str, twins: list[Twin], env_steps: str | None) -> dict[str, dict[Twin, str]]:
+def models_of(task: str, twins: list[Twin], env_steps: str | None, policies: int) -> dict[str, dict[Twin, str]]:
     """Train or evaluate what is missing in simulation; return {label: {twin: name of its run}}."""
     common = f"task={task}", f"root={RUNS}", f"evaluation.episodes={SIMULATED}"
     jobs = [[*common, *NOMINAL, "algo=hybrid_force", f"name={task}_nominal"]]
@@ -63,7 +63,8 @@ def models_of(task: str, twins: list[Twin], env_steps: str | None) -> dict[str, 
     if env_steps:
         algos["policy"] = [*ALGO, f"budget.env_steps={env_steps}"]
     for what, words in algos.items():
-        names[f"{what}, identified"] = {(v, s): f"{task}_{what}_{v}_{s}" for v, s in twins}
+        chosen = twins[:policies] if what == "policy" else twins
+        names[f"{what}, identified"] = {(v, s): f"{task}_{what}_{v}_{s}" for v, s in chosen}
         for (v, s), name in names[f"{what}, identified"].items():
             own = f"calibration={RUNS / 'identify' / f'{v}_{s}'}", f"seed={s}"
             jobs.append([*common, *own, *words, f"name={name}"])
@@ -104,12 +105,14 @@ def section(task: str, names: dict[str, dict[Twin, str]]) -> list[str]:
 def main() -> None:
     """Run what is missing and write the page."""
     words = sys.argv[1:]
-    env_steps = next((w.removeprefix("env_steps=") for w in words if w.startswith("env_steps=")), None)
+    given = dict(w.split("=", 1) for w in words if "=" in w)
+    env_steps = given.get("env_steps")
     named = [w for w in words if re.fullmatch(r"(rigid|elastic)_\d+", w)] or ["rigid_0", "elastic_0"]
     twins = [(v, s) for v, _, s in (name.partition("_") for name in named)]
     identify_twins([(v, int(s), RUNS / "identify" / f"{v}_{s}") for v, s in twins], RUNS)
     about = [f"Policies: `{' '.join(ALGO)} budget.env_steps={env_steps}`, the twin's seed."] if env_steps else []
-    parts = about + [part for task in TABLES for part in section(task, models_of(task, twins, env_steps))]
+    policies = int(given.get("policies", len(twins)))
+    parts = about + [part for task in TABLES for part in section(task, models_of(task, twins, env_steps, policies))]
     write_page("press", "Pressing and wiping", " ".join(["python benchmarks/press.py", *words]), parts)
 
 

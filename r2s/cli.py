@@ -109,7 +109,7 @@ def run_job(cfg):
 
 
 def check_paths(cfg):
-    """Check the options that name a file or folder, and convert names that YAML reads as numbers to strings."""
+    """Check the options that name a file or folder; make a name a string if YAML reads the name as a number."""
     for key in PATHS:
         value = cfg[key]
         if value is not None and (isinstance(value, bool) or not isinstance(value, str | int | float) or value == ""):
@@ -166,7 +166,7 @@ def is_completed(cfg):
 
 
 def differing(saved, cfg, most=3, counts=lambda key: True):
-    """Return a line for each of the first `most` keys that differ between `saved` and `cfg` and pass `counts`."""
+    """Return lines for the first `most` keys that differ between `saved` and `cfg` and for which `counts` is True."""
     from omegaconf import OmegaConf
 
     from r2s.reporting.trackers.tracker import flat
@@ -231,7 +231,7 @@ def end_workers():
 
 
 def end_job(error):
-    """Print an error and exit with status 2; in a sweep, append the error to the sweep's error file instead."""
+    """Print an error, and exit with status 2 or, in a sweep, append the error to the sweep's error file."""
     status = fail(error)
     if FAILED not in os.environ:
         sys.exit(status)

@@ -1,10 +1,10 @@
 """Provide numba's `njit`, `cfunc` and `vectorize` with a compilation cache that notices changes in other modules.
 
-numba caches a compiled function and recompiles the function when its source file changes. But cached code also
-contains called functions from other files. After a change in physics/safety_filter.py, numba would therefore run
-arm/driver.py with the old filter. This module makes numba recompile the functions of a package, such as r2s/arm,
-after a change in a compiled module of this package or of r2s/physics, or in a module from which such a compiled
-module imports constants. Compiled code may call functions only in its own package and in r2s/physics.
+numba caches a compiled function and recompiles the function when its source file changes. But numba does not notice
+changes in other files from which cached code calls functions. After a change in physics/safety_filter.py, numba would
+therefore run arm/driver.py with the old filter. With this module, numba recompiles the functions of a package, such
+as r2s/arm, after a change in the compiled modules of the package or of r2s/physics, or in a module from which those
+compiled modules import constants. Compiled code may call functions only in its own package and in r2s/physics.
 """
 
 import hashlib

@@ -51,14 +51,14 @@ def torchrl_env(num_envs: int = 32, *, seed: int = 0, overrides: Sequence[str] =
 
 
 def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any, Any, Any, int]:
-    """Return robot, task, domain randomization, reward and number of threads for a training with these options.
+    """Return robot, task, domain randomization, reward and number of threads for a training with the given options.
 
     Args:
         settings: {option: value} of SETTINGS, such as {"task": "reach", "calibration": RUN, "dr": "identified"}.
         overrides: further options as on the command line, such as "task.episode_s=3".
 
     Raises:
-        TypeError: a name is not in SETTINGS. UserError: a value or an override is wrong.
+        TypeError: a name in `settings` is not in SETTINGS. UserError: a value or an override is wrong.
     """
     for name in settings:
         if name not in SETTINGS:  # TypeError: only then does sb3 try again without render_mode

@@ -12,7 +12,7 @@ FAILED = "R2S_FAILED"  # environment variable that a sweep sets: file for the er
 
 
 class UserError(ValueError):
-    """A user's mistake. The message states option or file, expected value, actual value and nearest allowed name."""
+    """A user's mistake; the message names option or file, expected value, actual value and nearest allowed name."""
 
 
 class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
@@ -60,8 +60,8 @@ def import_failure(error: ImportError, package: str, install: str) -> str:
     """Return why an import failed: the package, a package that it needs, or a shared library is missing.
 
     Args:
-        error: exception that the import raised: ModuleNotFoundError if a package is missing, ImportError with the
-            name of an extension module if a shared library such as libGL is missing.
+        error: exception of the import: ModuleNotFoundError if a package is missing, ImportError if a shared library,
+            such as libGL, is missing.
         install: argument of `pip install` that installs the package.
     """
     if not isinstance(error, ModuleNotFoundError):

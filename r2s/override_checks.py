@@ -198,7 +198,7 @@ def check_option(group: str, value: Any, options: Sequence[str]) -> None:
 
 
 def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]], multirun: bool) -> UserError:
-    """Return the error for the first override that Hydra refuses, by adding the overrides one by one."""
+    """Add the overrides one by one, and return the error for the first override that Hydra refuses."""
     from hydra import compose
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException

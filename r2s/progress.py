@@ -1,4 +1,4 @@
-"""Show the progress of long computations: completed share, elapsed time and remaining time."""
+"""Show the progress of long computations: completed fraction, elapsed time and remaining time."""
 
 import atexit
 import time
@@ -45,7 +45,7 @@ class Progress:
             self._writer.start()
 
     def __call__(self, share: float, text: str = "") -> None:
-        """Show that `share` (0 to 1) of the work is done, followed by `text`."""
+        """Show that the fraction `share` (0 to 1) of the work is done, and show `text`."""
         if self._calls is None:
             self._show(share, text)
         else:

@@ -1,7 +1,8 @@
 """Make, resume and read run folders runs/<stage>/<name>/ with config, provenance, tables and summary.
 
 The status in meta.json is `running` from the start, and remains `running` if the process is killed. A run folder
-receives its final name when the first files are complete. A lock on overrides.yaml allows only one process to write.
+receives its final name when the first files are complete. A lock on overrides.yaml allows only one process to write
+in a run folder.
 """
 
 import csv
@@ -36,7 +37,8 @@ class Job:
     """Description of a job, stored in the job's run folder.
 
     Attributes:
-        stage, name: run folder runs/<stage>/<name>. r2s adds a number if the name exists; name None: `default_name`.
+        stage, name: run folder runs/<stage>/<name>. r2s adds a number to a name that exists; if name is None,
+            `default_name` chooses a name.
         config: composed config as YAML text. overrides: overrides as the user typed them.
         seed: seed of the run. threads: number of threads; 0: one per core. device: device of the learner.
         inputs: files that the run reads; meta.json records their SHA-256. parents: run folders that the run uses.
@@ -244,7 +246,7 @@ class Run:
             self.tracker.summary(document)
 
     def _write_meta(self) -> None:
-        """Write meta.json, which lists all parts of a resumed run and the sum of their wall clocks."""
+        """Write meta.json, which lists all parts of a resumed run and the sum of their durations."""
         self._noted = time.monotonic()
         own = round(self._noted - self._began, 3)
         self._meta["wall_clock_s"] = round(own + sum(p["wall_clock_s"] for p in self._earlier), 3)
@@ -289,7 +291,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
 
 
 def parts_of(meta: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the parts of a run, each with start, duration, code and machine; a run without resume has one part.
+    """Return start, duration, code and machine of each part of a run; each resume of the run begins a new part.
 
     Raises:
         UserError: meta.json is damaged.
@@ -382,7 +384,7 @@ def default_name(overrides: Iterable[str]) -> str:
 
 
 def _take_name(folder: Path, parent: Path, name: str, exact_name: bool) -> Path:
-    """Rename a folder to `name`, or if this name exists to name_2, name_3, ...; exact_name allows only `name`."""
+    """Rename a folder to `name`, or to name_2, name_3, ... if `name` exists; exact_name allows only `name`."""
     if not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name.startswith("."):
         raise UserError(f"name: {name!r} cannot be a folder's name")
     for k in range(1, 2 if exact_name else 1000):

@@ -327,6 +327,7 @@ def test_the_stage_compares_adapters_unless_there_is_a_training(tmp_path):
     assert "stage=compare compares adapters if runs= has transfers only" in out
 
 
+@pytest.mark.long
 def test_no_finished_transfer_is_one_line(tmp_path):
     carry(tmp_path / "runs" / "transfer", "died", [1.0], status="failed")
     one_line(

@@ -84,6 +84,7 @@ def swing(adapter, *, seconds=2.0, rate=1.0, payload=None, push=0.0, noise=0.0):
     return (np.array(x) for x in zip(*rows, strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", MAKES)
 def test_an_adapter_on_an_arm_that_equals_its_model_changes_nothing(make):
     """To 1e-3 Nm, in slow motion: a time step of 1 ms has an error of half the change of torque."""
@@ -102,6 +103,7 @@ def test_the_observer_cancels_a_push():
     assert np.abs(np.delete(added, 1, axis=1)).max() < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("make", "latency"), zip(MAKES, (FILTER_S + SPAN * SIM_DT, ACCELERATION_S), strict=True))
 def test_a_payload_s_torque_is_added(make, latency):
     """The torque of the payload for the same motion, one second after it was attached.

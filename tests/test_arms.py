@@ -215,6 +215,7 @@ def test_goals_lie_within_reach(write):
 # --- shipped arms
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_arm_is_ready_for_every_stage(name):
     """Home is inside the limits, not singular and above the table; goals and safe excitations exist."""

@@ -55,6 +55,7 @@ def test_intervals_under_torque_ripple(times, slower):
     assert coverage(times, slower, RIPPLE) >= 0.85
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("times", [1, 6])
 def test_intervals_under_white_noise(times):
     """90 to 98 %, within two standard errors of the draws."""

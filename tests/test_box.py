@@ -190,6 +190,7 @@ def oblique(stiffness, h, explicit=False):
     return pushed(contact, (-0.072, 0.02), (0.1, 0.0), 0.5, h, explicit=explicit)[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stiffness", [5e3, 1e5])
 def test_halving_the_step_converges(stiffness):
     """A push by a point amplifies each error of the yaw. At 1 ms it is within 4 %."""

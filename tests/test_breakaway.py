@@ -210,6 +210,7 @@ def by_hand(t, onset, creep=0.0, rate=2.0, far=0.012, noise=1e-5, seed=0, flip=1
     return Recording(t[keep], q[keep], np.zeros_like(q[keep]), tau[keep], "commanded")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flip", [1, -1])
 @pytest.mark.parametrize("hz", [250, 1000])
 @pytest.mark.parametrize("onset", [0.06, 0.301])

@@ -225,6 +225,7 @@ def train_briefly(env, algo, concurrent=False):
     train(env, algo, evaluate, loop, Budget(None, 1200))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("starts", "every", "evaluated"), [(0, 160, [160]), (160, 40, [164, 200, 240])])
 def test_updates_begin_with_the_first_transition_and_evaluations_keep_their_distance(panda, starts, every, evaluated):
     """Also without random steps, and where evaluations were due before the first update."""
@@ -296,6 +297,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(panda):
     assert train_until_it_breaks(env, algo).startswith("the loss of update 41 is nan, after ")
 
 
+@pytest.mark.long
 def test_an_evaluation_that_is_not_finite_stops_the_run(panda):
     env = make_env(panda)
 

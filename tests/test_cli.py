@@ -209,6 +209,7 @@ def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
     assert f"already finished: {tmp_path}/train/lr0.001" in r2s(*sweep).stdout
 
 
+@pytest.mark.long
 def test_a_command_that_a_job_of_a_sweep_runs_fails_by_itself(tmp_path):
     """It ends with status 2 and is no failed job of the sweep, so that the job sees that its command failed."""
     env = os.environ | {"R2S_FAILED": str(tmp_path / "failed.txt")}
@@ -386,6 +387,7 @@ def one_line(done, pattern):
     assert re.search(pattern, lines[0])
 
 
+@pytest.mark.long
 @pytest.mark.skipif(any(find_spec(name.split(".")[0]) for name in RELEASES), reason="Gazebo is here")
 def test_a_missing_gazebo_gets_one_line(trained, tmp_path):
     done = r2s("stage=transfer", f"policy={trained}", "simulator=gazebo", "arm=none", f"root={tmp_path / 'runs'}")

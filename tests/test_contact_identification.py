@@ -191,6 +191,7 @@ def test_presses_without_slides_leave_friction_unknown(arm, surface, found):
     assert one.tilt_deg > 10 * found.tilt_deg  # one place hardly tells the tilt
 
 
+@pytest.mark.long
 def test_a_second_recording_validates(arm, surface, recording):
     """data.contact_validation: presses elsewhere on the surface, with other forces."""
     other = press_recording(arm, surface, SEED, replace(QUICK, loads=(8.0, 12.0, 7.0, 16.0), places=((0.03, -0.04),)))

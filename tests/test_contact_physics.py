@@ -310,6 +310,7 @@ def test_a_surface_needs_a_tool(panda):
         Simulator(panda, d, 1, 1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["sigmoid", "coulomb", "stribeck"])
 def test_an_independent_simulator_presses_alike(name):
     """Replayed open loop in windows of 0.5 s, from the true depth, normal forces agree within 0.5 N RMS."""

@@ -175,6 +175,7 @@ def test_the_reflexes_of_an_arm_follow_the_force_of_its_task():
         thresholds_of(PANDA, PushLimit(80.0, 0.05, POINT, UP))
 
 
+@pytest.mark.long
 def test_the_emulated_box_holds_an_arm_that_presses():
     """Where it presses it stays, and elsewhere inside the surface nothing can be placed."""
     task = make_task()

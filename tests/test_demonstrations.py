@@ -92,6 +92,7 @@ def test_a_policy_of_a_surface_task_begins_as_the_hybrid_controller(name):
     assert make_parts(composed("task=press", f"algo={name}", "algo.demonstrations=0")).demonstrator is None
 
 
+@pytest.mark.long
 def test_demonstrations_that_fill_the_budget_are_one_line(tmp_path):
     done = r2s("+experiment=toy", "algo=tqc", "algo.demonstrations=4000", f"root={tmp_path}")
     assert (done.returncode, list(tmp_path.iterdir())) == (2, [])

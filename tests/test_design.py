@@ -52,6 +52,7 @@ def best(arm, space):  # noqa: F811
     return planned(arm, space)
 
 
+@pytest.mark.long
 def test_the_chosen_widths_are_smaller_than_the_defaults(arm, best):  # noqa: F811
     """Of the planned motion, by its own measure and by that of a recording, than of a default motion as long."""
     motion, widths = best
@@ -100,6 +101,7 @@ def test_a_long_motion_is_of_segments_with_ways_between(arm, space, monkeypatch)
     assert Recording(motion.t, motion.q, motion.dq, 0 * motion.q, "motor").find_period() is None
 
 
+@pytest.mark.long
 def test_obstacles_are_kept_clear_of(arm):  # noqa: F811
     """By MuJoCo's own distances of a model with capsules; without the box the same motion would hit it."""
     robot = with_bodies(arm)

@@ -17,7 +17,7 @@ MOST_WORDS = 20_000  # of all pages in docs/
 def table(page: Path, heading: str) -> list[list[str]]:
     """Return the cells of the rows of the first table below `## heading`, its head left out."""
     below = page.read_text().split(f"## {heading}\n", 1)[1].split("\n## ")[0]
-    rows = [line.strip("|").split(" | ") for line in below.splitlines() if line.startswith("|")]
+    rows = [line.strip("|").split("|") for line in below.splitlines() if line.startswith("|")]
     return [[cell.strip().strip("`") for cell in row] for row in rows[2:]]
 
 

@@ -122,6 +122,7 @@ def faulty(client, panda):
         yield address
 
 
+@pytest.mark.long
 def test_every_fault_stops_with_libfrankas_reason(client, faulty, panda):
     """A few lost packets have no effect; each fault ends the motion with libfranka's reason and can be cleared."""
     _, make, _ = client

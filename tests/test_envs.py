@@ -33,6 +33,7 @@ def calibration(panda, tmp_path):
     return folder
 
 
+@pytest.mark.long
 def test_an_environment_has_the_arms_of_its_calibration(calibration):
     """dr=none gives every arm the identified offsets, dr=identified draws of their posterior."""
     env = torchrl_env(**SMALL, calibration=calibration, dr="none")

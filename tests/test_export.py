@@ -201,6 +201,7 @@ def test_so_it_is_for_other_arms(arm, panda):
     assert np.abs(by_law(contract, motion) - motion["tau"]).max() < LAW_NM
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("arm", ["panda", "fr3"])
 def test_near_each_limit_the_bundle_runs_the_law_of_its_arm(arm):
     """Joints that approach their limits, one by one: the driver of the arm's client, command by command.

@@ -150,6 +150,7 @@ def test_its_native_form_is_its_numpy_form(own_family, arm):
         np.testing.assert_allclose(out[k], dq[k] + step, rtol=0, atol=bound)
 
 
+@pytest.mark.long
 def test_it_is_identified(result):
     """From the uniform start the curves come within 5 % of the truth where the motion was."""
     found = result.dynamics
@@ -160,6 +161,7 @@ def test_it_is_identified(result):
     np.testing.assert_allclose(found.friction(dq), truth, rtol=0.05)
 
 
+@pytest.mark.long
 def test_it_goes_through_the_file(result, own_family, arm, tmp_path):
     """parameters.yaml names the dotted path and the record's units, and loads again as the same arm."""
     save_parameters(tmp_path / "parameters.yaml", *result.saved, {})

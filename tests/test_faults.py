@@ -49,6 +49,7 @@ def calls(path):
     return [(ast.unparse(node.func), node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_nothing_that_is_read_runs(path):
     """No call loads a pickle; calls that could are given the option against it."""
@@ -60,6 +61,7 @@ def test_nothing_that_is_read_runs(path):
             assert given.get(key) is value, f"{path}:{call.lineno}: {name} without {key}={value}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_servers_listen_on_loopback_only(path):
     """Calls that bind a socket or serve name an address, which is a loopback address."""

@@ -470,6 +470,7 @@ FAULTS = st.dictionaries(
 )
 
 
+@pytest.mark.long
 @examples(6)
 @given(faults=FAULTS, spoil_from=st.integers(0, 20), acts=st.booleans())
 def test_a_faulty_arm_ends_stopped_and_within_its_torque_limits(faults, spoil_from, acts):

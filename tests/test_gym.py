@@ -74,6 +74,7 @@ def test_the_checker_has_no_complaint(name, few):
         check_env(gym.make(name, overrides=few).unwrapped, skip_render_check=True)
 
 
+@pytest.mark.long
 def test_a_name_makes_one_arm_or_a_batch():
     """`r2s.envs:` imports the module that registers the names; `make_vec` makes one simulator."""
     assert gym.make(f"r2s.envs:{REACH}", overrides=SHORT).spec.id == REACH
@@ -94,6 +95,7 @@ def test_a_seed_gives_its_trajectory():
     assert not np.isclose(path[0][0], path[2][0]).all()
 
 
+@pytest.mark.long
 def test_a_camera_has_the_noise_of_the_task():
     """The pose of a box is off by other amounts with each seed and for each arm, and alone as in a batch."""
     seen = {}
@@ -157,6 +159,7 @@ def test_without_automatic_resets_the_user_resets():
         single.step(action)
 
 
+@pytest.mark.long
 def test_rewards_and_ends_are_those_of_r2ss_own_environment():
     """The same starts, goals and actions, with reward=paper and the default: equal observations, rewards, ends."""
     for reward in ("paper", "curriculum"):

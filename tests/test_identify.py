@@ -276,6 +276,7 @@ def test_motion_in_blocks_shorter_than_a_replay_leaves_its_entries_out(arm, trut
         np.testing.assert_array_equal(kept["breakaway"], truth.breakaway)
 
 
+@pytest.mark.long
 def test_a_replay_without_noise_is_the_recording(arm, truth):
     """Without sensor noise, a window from the exact state does what the recorded arm did, delay and lag included."""
     late = replace(truth, delay=2.4e-3, lag=1e-3)
@@ -301,6 +302,7 @@ def test_replays_of_many_candidates_are_those_of_each(arm, wrong, motion):
     assert np.array_equal(rows, np.concatenate([alone(x[k : k + 1]) for k in range(5)]))
 
 
+@pytest.mark.long
 def test_a_long_rest_does_not_spoil_what_the_motion_says(arm, truth, wrong, motion):
     """An arm that stands for most of the recording is still found within 2 % of its friction's level."""
     part, rng, n = motion, np.random.default_rng(0), 12_000

@@ -207,6 +207,7 @@ def test_what_the_data_cannot_tell_stays_nominal_and_is_said(arm, truth, wrong):
     np.testing.assert_allclose(result.dynamics.phi[2], wrong.phi[2], rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.long
 def test_combinations_that_only_the_prior_decides_are_named(arm, truth, wrong):
     """While a joint moves, Coulomb asymmetry is an offset: of noisy data the two are named together."""
     level, prior = np.array([0.8, 0.7, 0.6]), SETTINGS["prior"]["measured"]
@@ -283,6 +284,7 @@ MASS = np.array([1.2, 0.8, 1.4])
 SHIFT = np.array([[0.02, 0.01, 0.0], [-0.02, 0.03, 0.02], [0.02, -0.02, 0.03]])
 
 
+@pytest.mark.long
 def test_whole_links_predict_an_arm_of_other_masses_and_centres(arm, truth, wrong, linked):
     """Torque with gravity of a motion that was not fitted is predicted to within 2 % of its size."""
     other = measured(arm, truth, SCALE, 4.0, seed=1, mass=MASS, shift=SHIFT)

@@ -116,6 +116,7 @@ def test_an_extension_that_misses_a_library_says_which(tmp_path, monkeypatch):
         optional_import("half", "arm=x", "panda")
 
 
+@pytest.mark.long
 def test_no_import_is_left_to_chance():
     """Each package that r2s imports is a dependency, or comes with an extra through `optional_import`."""
     files = [*(ROOT / "r2s").rglob("*.py"), *(ROOT / "hydra_plugins").glob("*.py")]

@@ -191,6 +191,7 @@ def test_what_is_known_to_be_constant_does_not_drift(robot, found, motion):
     assert drift_table(sure, found.space, found.x, found.found.samples).empty
 
 
+@pytest.mark.long
 def test_links_from_one_kind_of_torque_are_known_to_the_other(robot, nominal, truth):
     """Link-side torque gives the links, motor torque the friction: its links are then narrower, and as right."""
     stiff = replace(truth, phi=with_family(nominal, "coulomb").phi)  # a link-side sensor sees little friction
@@ -213,6 +214,7 @@ def tools(robot, nominal, truth):
     return {r.name: r for r in logs}
 
 
+@pytest.mark.long
 def test_what_each_recording_adds_is_in_the_table(robot, nominal, tools):
     good = dict(list(tools.items())[:2])
     found = found_in(robot, nominal, joined([*good.values()]))

@@ -51,6 +51,7 @@ def test_what_is_late_does_not_go_into_the_links(robot, motion, lateness):
     assert half[0] < 2e-3  # a quarter of what is late
 
 
+@pytest.mark.long
 def test_a_log_without_lateness_keeps_its_other_values(robot, motion):
     """The delay's interval is shorter than a step and holds 0; nothing moves by a tenth of its half interval."""
     with_term, without = (found_in(robot, motion, *terms) for terms in (["signal_delay"], []))
@@ -63,6 +64,7 @@ def test_a_log_without_lateness_keeps_its_other_values(robot, motion):
         assert np.all(np.abs(ours - theirs) <= 0.1 * half + 1e-9)
 
 
+@pytest.mark.long
 def test_a_known_delay_is_kept(robot, motion):
     """An identification that starts at a delay of 8 ms finds the same one again."""
     start = replace(nominal_dynamics(robot, **conf("friction/uniform")), signal_delay=8e-3)
@@ -74,6 +76,7 @@ def test_a_known_delay_is_kept(robot, motion):
 EQUAL = {"dq_s": 0.0025, "tau_rows": 2}  # behind a filter of 2.5 ms, dq is late by 2 ms, as torque is
 
 
+@pytest.mark.long
 def test_equal_lateness_that_a_fit_is_sure_of_is_corrected(robot, motion):
     """Torque and dq are 2 ms late. With dq alone corrected, link 1 has 0.9 of its inertia about the axis."""
     found = found_in(robot, late(motion, **EQUAL), "signal_delay")

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from test_adaptation import DELAY, PAYLOAD, recording, robot, standard, terms_of, truth
 
 from r2s.adaptation.arm_model import make_arm_model
@@ -102,6 +103,7 @@ def unexplained(arm, rows):
     return np.array(out)
 
 
+@pytest.mark.long
 def test_motion_without_a_payload_corrects_the_model():
     """It finds load-dependent friction, cables and other links: residuals of other motion shrink to a fraction.
 

@@ -124,6 +124,7 @@ def test_what_was_injected_is_found(arm, truth, motion, found):
     np.testing.assert_array_equal(found.dynamics.armature, found.space.block(found.x, "armature"))
 
 
+@pytest.mark.long
 def test_other_motion_is_predicted_to_the_noise(arm, start, truth, motion):
     """RMSE on motion that was not fitted, with all terms and beliefs of conf/: a third above that of the truth."""
     found = found_in(arm, start, motion)

@@ -43,6 +43,7 @@ def test_it_reaches_every_goal(panda, task, dynamics):
     assert first == second
 
 
+@pytest.mark.long
 def test_a_wrong_model_shows(panda, task, dynamics):
     """Believing the published OLD friction, it does worse: what it does comes from its model."""
     evaluate = make_evaluation(panda, task, lambda rng, m: dynamics, episodes=24, nthread=1)

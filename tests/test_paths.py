@@ -38,6 +38,7 @@ def test_violations_of_a_path_are_named():
     assert "(1, 7)" in violation([home])
 
 
+@pytest.mark.long
 def test_nothing_touches_between_two_samples():
     """On every allowed path all distances stay positive at a finer sampling."""
     postures, checked = allowed(), 0

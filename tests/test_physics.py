@@ -216,6 +216,7 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
     return held
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", THREE, ids=named)
 @pytest.mark.parametrize(
     ("which", "everything"), [("panda", False), ("panda", True), ("damped", True), ("hanging", True)]

@@ -70,6 +70,7 @@ def test_an_action_of_torque_is_a_share_of_what_the_task_may_command():
         np.testing.assert_allclose(limit, 0.6 * PANDA.tau_max)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stiffness", [2e3, 1e5])
 def test_the_reference_on_the_true_model_ends_within_a_newton(stiffness):
     """On the softest and on the most rigid surface, before the step and at the end, without a jump at the step.

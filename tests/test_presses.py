@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from test_cli import TOY, r2s, succeed
 from test_press import DR_CONF, PANDA, TRUE
 
@@ -18,6 +20,8 @@ from r2s.learning.randomization import ContactRandomization
 from r2s.physics.contact_layout import EXPONENT, FORCE, K
 from r2s.physics.impedance import FORCE_MAX
 from r2s.physics.robot import SIM_DT
+from r2s.stages import pipeline
+from r2s.stages.build import CONF
 from r2s.stages.data import ArmData
 
 
@@ -79,6 +83,19 @@ def slope_at_10_newton(contact):
     """Return dF/dd, N/m, of F = K d^e at 10 N, of a row of `contact_columns`."""
     k, e = contact[K], contact[EXPONENT]
     return e * k ** (1 / e) * 10.0 ** (1 - 1 / e)
+
+
+def test_changes_for_an_adapter_act_only_in_transfers():
+    """Arm and surface are identified without the payload that the adapter has to estimate."""
+    words = ["stage=pipeline", "task=press", "adapt=rls", "arm.payload=1"]
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        config = compose("config", words, return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        cfg = pipeline.compose_step(words, "stage=pipeline")
+        arm, surface, _, transfers = pipeline.commands(cfg, "a", words)
+    assert "data.presses=6" in surface["surface"]
+    assert not [w for w in arm["identify"] + surface["surface"] if w.startswith("arm.payload")]
+    assert all("arm.payload=1" in transfers[label] for label in ("identified", "adapted"))
 
 
 @pytest.mark.slow

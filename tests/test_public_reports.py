@@ -396,6 +396,7 @@ def test_a_repair_is_noted(tmp_path, recording):
     assert "q of joint 1 jumps by a turn" in turns
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("source", "gravity", "said"),
     [
@@ -422,6 +423,7 @@ def test_alphabetical_order_is_seen_in_each_kind_of_torque(ur, torque):
         check_recording(ur, replace(r, **{k: getattr(r, k)[:, ALPHABET] for k in ("q", "dq", "tau")}))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("torque", ["measured", "commanded", "motor"])
 def test_an_arm_that_is_only_wrongly_modelled_passes(ur, seed, torque):

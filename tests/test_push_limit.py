@@ -104,6 +104,7 @@ def test_driver_and_simulator_limit_alike():
     assert float(sim.contact_force[0] @ UP) > 5.0
 
 
+@pytest.mark.long
 def test_the_reference_presses_as_well_within_a_limit():
     """The task's forces and its approach stay below the limit, so that it changes little."""
     draw = make_draw(stiffness=[1e5, 1e5])

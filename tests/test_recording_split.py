@@ -85,6 +85,7 @@ def test_repetitions_started_by_hand_are_aligned():
     assert apart.in_phase() is apart
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("error", [0.005, 0.008, 0.015])
 def test_a_soft_arm_repeats_its_motion(error):
     """Six repetitions, each with another tracking error (rad RMS), have a period; no phase is in both parts."""

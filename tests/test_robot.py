@@ -143,6 +143,7 @@ def test_what_is_given_goes_over_the_file(write):
     np.testing.assert_allclose(robot.model(gravity=False).jnt_range[:, 0], -1)
 
 
+@pytest.mark.long
 def test_another_arm_goes_through_environment_and_identification(arm):
     """Three joints: an episode starts and steps, an excitation keeps its limits, a residual is computed."""
     nominal = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "sigmoid"})

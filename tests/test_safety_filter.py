@@ -137,6 +137,7 @@ def test_the_rate_tolerates_the_latency():
     assert lowest(2 * RATE) < -0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("delay", [0.0, 2.5e-3, 5e-3, 8e-3])
 def test_no_chattering(delay):
     """Pinned against speed limits, then against a position limit, commands come to rest for any delay of an arm."""

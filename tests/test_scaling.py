@@ -78,6 +78,7 @@ def test_an_arm_of_forty_times_the_size_has_forty_times_the_values(arm, torque):
     np.testing.assert_allclose(width[0], width[1], rtol=0.25, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_value_at_its_bound_says_so(arm):
     """It is not identifiable, lies in its interval, and one line names key, value and bound."""
     robot = arm(LARGE)

@@ -111,6 +111,7 @@ def test_a_declared_payload_is_taken_out(groups, robot, truth):  # noqa: F811
     assert np.sqrt((left**2).mean()) < 0.02 * np.sqrt(((loaded.tau - bare.tau)[rows] ** 2).mean())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "line"),
     [

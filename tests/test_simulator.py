@@ -71,6 +71,7 @@ print(all(np.array_equal(a, b) for a, b in zip(before, after, strict=True)))
 """
 
 
+@pytest.mark.long
 def test_other_models_of_the_process_are_untouched():
     """A plain pendulum, and one with as many user numbers of its own, step to the same bits after `install`."""
     done = subprocess.run([sys.executable, "-c", UNTOUCHED], capture_output=True, text=True)

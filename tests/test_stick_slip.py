@@ -98,6 +98,7 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
     return held, events
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", THREE, ids=named)
 @pytest.mark.parametrize("everything", [False, True])
 def test_native_stiction_is_that_of_dense_algebra(panda, everything, law):
@@ -266,6 +267,7 @@ def moreau(inverse, level, drive, v, dt, count, sweeps):
     return v
 
 
+@pytest.mark.long
 def test_events_are_where_time_stepping_puts_them():
     """Coupled joints, edges of Coulomb's own level: as 4000 steps of Moreau's scheme, which knows of no events.
 

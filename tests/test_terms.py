@@ -40,6 +40,7 @@ def hard(arm):  # noqa: F811
     return run(arm, start, motion, [TORQUE], **how), truth, motion
 
 
+@pytest.mark.long
 def test_hard_stiction_does_not_spoil_friction_or_delay(hard):
     """Friction minus offset, which is what motion tells, within 2 % of its level; the delay within 0.2 ms."""
     found, truth, motion = hard
@@ -50,10 +51,12 @@ def test_hard_stiction_does_not_spoil_friction_or_delay(hard):
     assert abs(float(found.dynamics.delay) - 2e-3) < 2e-4
 
 
+@pytest.mark.long
 def test_no_term_enters_that_is_not_there(hard):
     assert not {"viscous_asymmetry", "load", "drag_sin", "link_d1", "armature"} & set(hard[0].space.blocks)
 
 
+@pytest.mark.long
 def test_stiction_is_found_to_be_of_the_net_torque(hard):
     """The rule that replays its stops better, and edges as commands within 30 mNm."""
     found, truth, _ = hard
@@ -143,6 +146,7 @@ def test_a_link_takes_the_place_of_its_tensor():
     assert add_terms(["offset", "inertia_scale"], ["load"]) == ["offset", "inertia_scale", "load"]
 
 
+@pytest.mark.long
 def test_what_is_left_out_is_spread_over_the_recording(hard):
     """With several blocks a fold, each holds motion of all parts, and every row is left out once."""
     motion = hard[2]

@@ -240,6 +240,7 @@ def test_an_update_normalises_what_the_losses_get():
         torch.testing.assert_close(row[key], expected[key].detach())
 
 
+@pytest.mark.long
 def test_the_critics_learn_a_known_return():
     """Where every transition ends the episode, the quantiles' mean goes to the reward of that state."""
     algo, batch = make(lr=3e-3), make_batch()

@@ -178,6 +178,7 @@ def test_csv_is_the_run_folder(root):
     assert not (run.folder / "trackers.json").exists()
 
 
+@pytest.mark.long
 def test_several_are_a_list():
     """`tracker=[csv,mlflow]` takes both, `tracker=wandb` one, and their settings can be typed."""
     assert set(composed("tracker=[csv,mlflow]").tracker) == {"csv", "mlflow"}

@@ -164,6 +164,7 @@ def test_the_best_at_an_edge_is_named():
     assert at_edges(best | {"algo.lr": 5e-3, "x": 2}, space) == []
 
 
+@pytest.mark.long
 def test_defaults_lie_inside_the_grid_and_the_space():
     """Of every algorithm and every number that they search, so that a winner may lie on either side of it."""
     grid = yaml.safe_load((ROOT / "conf" / "experiment" / "paper_grid.yaml").read_text())["grid"]

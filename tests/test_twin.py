@@ -100,6 +100,7 @@ def push(arm, target, cycles):
         arm.command(ramp(arm, target))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_static_friction_holds_the_arm(seed):
     """No creep under zero command, nor under half the breakaway torque in either direction."""

@@ -110,6 +110,7 @@ def late(x):
     return np.concatenate([np.repeat(x[:1], steps, axis=0), x[:-steps]])
 
 
+@pytest.mark.long
 def test_a_late_signal_is_measured(robot, log):
     """Of 10 ms, within 1 ms; a log without has none."""
     found = lines(judged(robot, replace(log, dq=late(log.dq))))["lateness of dq"]

@@ -140,6 +140,7 @@ def test_a_cycle_compiles_nothing(what, tmp_path):
     assert run(tmp_path, what, "warm", NUMBA_CACHE_DIR=str(tmp_path / "cache")) == "0 []"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", MAKES)
 def test_warm_up_changes_no_bit(make):
     """Neither of an adapter, of its motions, nor of a random generator."""

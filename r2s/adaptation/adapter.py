@@ -6,9 +6,9 @@ import numpy as np
 
 
 class Adapter(Protocol):
-    """An object that computes a torque at 1 kHz, which the driver of one arm adds before the safety filter.
+    """An object that computes, at 1 kHz, a torque that the driver of one arm adds before the safety filter.
 
-    An adapter must be picklable, because adapter and policy of a real-time arm run in different processes.
+    An adapter must be picklable, because the adapter and the policy of a real-time arm run in different processes.
     """
 
     def begin(self) -> None:

@@ -29,8 +29,9 @@ class AdapterContext:
     """Result of an arm's identification, from which a function such as `observer` creates an adapter for this arm.
 
     Attributes:
-        robot, dynamics: the identified arm. posterior: parameter space and posterior draws; None without draws.
-        unloaded: two recordings of commanded torque without a payload; None without such recordings.
+        robot, dynamics: the identified arm. posterior: parameter space and samples of the posterior; None without
+            samples.
+        unloaded: two recordings with commanded torque and without a payload; None without such recordings.
     """
 
     robot: Robot
@@ -45,7 +46,7 @@ class AdapterContext:
 
     @cached_property
     def corrected(self) -> tuple[ArmModel, Noise]:
-        """Return the arm's model after a correction fitted to `unloaded`, and the corrected model's uncertainty."""
+        """Return the arm's model, corrected by a fit to `unloaded`, and the uncertainty of the corrected model."""
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 

@@ -1,7 +1,8 @@
 """Convert an identified arm to arrays for compiled functions: links, friction and latency.
 
-One table per joint, whose columns are speeds, represents any friction law. At the presliding deflection z in [-1, 1],
-friction equals z times the row FORWARD (z >= 0) or BACKWARD (z < 0), plus the row SPEED_ONLY.
+A table for each joint, with a column for each speed, represents any friction law. At the presliding deflection z in
+[-1, 1], friction is z FORWARD + SPEED_ONLY if z >= 0, else z BACKWARD + SPEED_ONLY; the names denote rows of the
+table.
 """
 
 from typing import NamedTuple
@@ -47,7 +48,7 @@ class ArmModel(NamedTuple):
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
-    """Return the `ArmModel` of one arm; d: dynamics of this arm alone, without a batch dimension."""
+    """Return the `ArmModel` of one arm; d: the arm's `Dynamics`, without a batch dimension."""
     position, axes = ee_pose(robot)
     compensated = np.column_stack([robot.mass, robot.mass[:, None] * robot.com])
     compensated[-1] += d.declared_payload

@@ -1,4 +1,4 @@
-"""Detect contacts by forces far above their standard deviation, and recognize a payload's weight; compiled."""
+"""Detect contacts (forces far above their standard deviation) and a payload's weight, in compiled code."""
 
 import numpy as np
 
@@ -23,12 +23,12 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def detect(thresholds, floor, state):
-    """Test whether a contact begins or ends, if any joint moves; friction of resting joints hides forces.
+    """Test whether a contact begins or ends, but only while a joint moves: friction of resting joints hides forces.
 
-    A force test and an impact test check the hypothesis that no force acts. An impact raises the filter's variances,
-    which would hide the impact from the force test. The impact test therefore keeps the covariance from before a
-    sudden rise of the innovations, for at most IMPACT cycles. The impact test low-passes the force, because vibrating
-    gears make the estimated force oscillate.
+    A force test and an impact test check the hypothesis that no force acts. An impact raises the variances of the
+    wrench filter, and high variances hide the impact from the force test. When the innovations rise suddenly, the
+    impact test therefore keeps the earlier covariance for at most IMPACT cycles. The impact test low-passes the
+    force, because vibrating gears make the estimated force oscillate.
     """
     x, P, contact, calm, smooth = state.x, state.P, state.contact, state.calm, state.smooth
     n = state.joints.shape[1]
@@ -54,7 +54,7 @@ def detect(thresholds, floor, state):
 
 @njit(cache=True, error_model="numpy")
 def _square(P, floor, force):
-    """Return the squared force, in units of the covariance P[:3, :3] with floor^2 added to each axis."""
+    """Return f^T (P[:3, :3] + floor^2 I)^-1 f, the square of `force` f (3,) N in units of its covariance."""
     square = floor**2
     a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]
     d, e, f = P[1, 1] + square, P[2, 1], P[2, 2] + square
@@ -69,7 +69,7 @@ def _square(P, floor, force):
 
 @njit(cache=True, error_model="numpy")
 def weigh(arm, state):
-    """Add up the tip's travel while the force points down; beyond 5 cm, the force is a payload's weight."""
+    """Measure the tip's path while the force points down; after 5 cm, the force counts as a payload's weight."""
     x, P, joints, J, contact = state.x, state.P, state.joints, state.jacobian, state.contact
     g = np.sqrt((arm.gravity * arm.gravity).sum())
     if contact[TOUCHES] == 0.0 or g == 0.0:

@@ -1,7 +1,7 @@
 """Freeze an adapter in contact, because adapters treat a contact force as a model error and push against the force.
 
-In contact, the gate freezes the estimate and returns the torque that the adapter added REWIND cycles before
-the detection.
+In contact, the gate freezes the adapter's estimate and returns the torque that the adapter added REWIND cycles before
+the gate detected the contact.
 """
 
 from typing import Protocol

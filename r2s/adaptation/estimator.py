@@ -4,8 +4,9 @@
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A call takes about 15 us, or 50 us at the end of a span. Reading `now` takes longer. `now` reports the payload as a
-physical body, whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1), 2018).
+A call takes about 15 us, or 50 us at the end of each 20 ms span. Reading `now` takes longer. `now` reports the
+payload as a physical body, whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1),
+2018).
 """
 
 from dataclasses import dataclass
@@ -69,7 +70,7 @@ class Estimator:
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Start a motion from rest and keep the estimate; a pause of `pause_s` before the motion adds variance."""
+        """Start a motion from rest; keep the estimate, with added variance if a pause of `pause_s` came before."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None
@@ -128,7 +129,7 @@ class Estimator:
 
     @property
     def now(self) -> Estimate:
-        """Return the estimate at the end of the last span; computed on reading, so that `__call__` stays fast."""
+        """Return the estimate at the end of the last 20 ms span, computed here so that `__call__` stays fast."""
         if self._now is None:
             self._now = self._report(self._changed)
         return self._now
@@ -141,7 +142,7 @@ class Estimator:
 
     @property
     def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:
-        """Return the Kalman filter, the state of `update_residual`, and the last residual; do not modify these."""
+        """Return the Kalman filter, the state of `update_residual`, and the last residual; callers only read them."""
         return self._filter, self._state, self._residual
 
     def _report(self, changed: bool) -> Estimate:
@@ -173,8 +174,9 @@ class Estimator:
 def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the physical body nearest to x (10,): mass kg, center (3,) m, tensor (3, 3) kg m^2 about the center.
 
-    Mass and first moments stay unchanged, as the data determine them well. The nearest non-negative second moment
-    about the center replaces the estimated one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
+    Mass and first moments stay unchanged, because the data determine them well. The nearest non-negative second
+    moment about the center replaces the estimated one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive
+    semi-definite.
     """
     m = float(x[0])
     if m <= 0.0:

@@ -4,15 +4,17 @@ The feedforward uses the payload's estimated mass and center, clipped by `plausi
 estimate x with covariance P predicts the torque c = h x in Nm. The vector h consists of ten payload terms (gravity,
 Coriolis, acceleration), the model's friction, and 1 for the offset. The torque c has the variance s^2 = h P h^T. The
 feedforward torque is w c with a weight w. For the true torque c*, the mean square error E (w c - c*)^2 is smallest at
-w = c*^2 / (c*^2 + s^2). Since c^2 - s^2 is an unbiased estimate of c*^2, r2s chooses
+w = c*^2 / (c*^2 + s^2). Because c^2 - s^2 is an unbiased estimate of c*^2, r2s chooses the weight
 
     w = max(0, 1 - s^2 / c^2).
 
-If |c| is below s, w is 0. The formula is the positive-part James-Stein estimator (1961) of a single number.
+The weight w is 0 if |c| < s. The torque w c is the positive-part James-Stein estimator (1961) of the single number
+c*.
 
-The feedforward follows the motion without delay, but a low-pass over one span smooths the torque step at a new
-estimate. Without this low-pass, a torque step twists elastic gears, the Kalman filter explains the twist by a new
-payload, and the new estimate causes another step: on an elastic development twin, steps of 30 Nm repeated at 25 Hz.
+The feedforward follows the motion without delay, but a low-pass with a time constant of 20 ms smooths the torque step
+at a new estimate. Without a low-pass, a torque step twists elastic gears, the Kalman filter explains the twist by a
+new payload, and the new estimate causes another torque step. On an elastic development twin, torque steps of 30 Nm
+then repeated at 25 Hz.
 """
 
 import numpy as np
@@ -29,7 +31,7 @@ from r2s.physics.robot import SIM_DT
 
 
 class Feedforward:
-    """An `Adapter` that adds the estimated torque, and adds less of this torque if the estimate is uncertain.
+    """An `Adapter` that adds the estimated torque, reduced by a weight if the estimate is uncertain.
 
     Args:
         arm: the corrected model. noise: uncertainty of the corrected model.
@@ -92,7 +94,7 @@ def plausible_payload(x, most, out):
 
 @njit(cache=True, error_model="numpy")
 def shrinkage_weights(filter, residual, payload, weight):
-    """Compute the shrinkage weight of each joint's torque at the end of a span, and write all (n,) to `weight`."""
+    """Write the shrinkage weights of the joints' torques, at the end of a 20 ms span, to `weight` (n,)."""
     x, P, n = filter.x, filter.P, len(weight)
     h, at = np.empty(BODY + 2), np.empty(BODY + 2, dtype=np.int64)
     for j in range(n):
@@ -110,7 +112,7 @@ def shrinkage_weights(filter, residual, payload, weight):
 
 @njit(cache=True, error_model="numpy")
 def _estimated_torque(x, state, payload, weight, slow, torque):
-    """Write the weighted torque of x and `payload` to `torque` (n,) Nm; slow: (n, 10), low-pass of `payload_p`."""
+    """Write the weighted torque of x and `payload` to `torque` (n,) Nm; slow: (n, 10), low-passed `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
         total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j]

@@ -1,4 +1,4 @@
-"""Estimate payload, friction and offsets with a Kalman filter; compiled.
+"""Estimate payload, friction and offsets with a Kalman filter, in compiled code.
 
 The state of an arm with n joints has N = 10 + 4 n components:
 - the payload's mass, first moments and tensor about the payload frame: kg, kg m, kg m^2;
@@ -8,8 +8,9 @@ The state of an arm with n joints has N = 10 + 4 n components:
 - per joint the relative error of the momentum rate, an Ornstein-Uhlenbeck process.
 
 The filter processes the momentum residual of one joint after the other. Breakaway or a vibrating gear causes large
-residuals for one or two spans. Huber's function (Robust Statistics, 1981) therefore reduces the weight of innovations
-beyond HUBER standard deviations. The filter still follows a payload change, with large innovations for more spans.
+residuals for one or two spans of 20 ms. Huber's function (Robust Statistics, 1981) therefore reduces the weight of
+innovations beyond HUBER standard deviations. The filter still follows a payload change, because its innovations stay
+large for more than two spans.
 """
 
 from typing import NamedTuple
@@ -85,7 +86,7 @@ class Filter(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def update(filter, noise, residual):
-    """Predict and correct the filter's state with the residual of one span, and test for a payload jump."""
+    """Predict and correct the filter's state with the residual of one 20 ms span, and test for a payload jump."""
     predict(filter, noise, residual)
     correct(filter, noise, residual)
     detect(filter, noise)
@@ -93,7 +94,7 @@ def update(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def predict(filter, noise, residual):
-    """Predict, over one span, the state's mean, covariance and response to payload jumps (`signature`)."""
+    """Predict mean, covariance and response to payload jumps (`signature`) of the filter one 20 ms span ahead."""
     P, counts, n, moving = filter.P, filter.counts, len(residual.y), False
     for j in range(n):
         moving |= residual.sliding[j] > 0.0
@@ -115,7 +116,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Increase variances, at most to the prior's, because the payload may change in a pause of `seconds`."""
+    """Increase variances, at most to those of the prior, because a payload may change in a pause of `seconds`."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:

@@ -1,8 +1,9 @@
-"""Compute an arm's momentum and its derivatives (columns) with respect to a payload's inertial parameters; compiled.
+"""Compute an arm's momentum and its derivatives (columns) by a payload's inertial parameters, in compiled code.
 
 The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q) (De Luca and Mattone, ICRA 2003). Let S_j be the
 screw axis of joint j about the base origin, and h_j the total momentum of all bodies that joint j moves. Then p_j is
-S_j . h_j, and element j of C^T dq is dS_j/dt . h_j. Both products are linear in each body's inertial parameters.
+S_j . h_j, and element j of C^T dq is dS_j/dt . h_j. The products S_j . h_j and dS_j/dt . h_j are linear in each
+body's inertial parameters.
 """
 
 from typing import NamedTuple
@@ -39,7 +40,7 @@ def _cross(ax, ay, az, bx, by, bz):
 
 @njit(cache=True, error_model="numpy")
 def momentum(arm, q, dq, terms, work):
-    """Write momentum and torques of an arm at q, dq (n,) rad, rad/s to `terms`; scratch: work (n, MOMENTUM_WORK)."""
+    """Write an arm's momentum and torques at q, dq (n,) rad, rad/s to `terms`; work (n, MOMENTUM_WORK): workspace."""
     n = len(q)
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     px, py, pz = 0.0, 0.0, 0.0
@@ -101,7 +102,7 @@ def momentum(arm, q, dq, terms, work):
 
 @njit(cache=True, error_model="numpy")
 def _payload_columns(arm, R, p, w, v, terms, work):
-    """Write the payload's columns to `terms`; R, p: pose of the last link; w, v: its twist about the base origin."""
+    """Write the payload's columns to `terms`; R, p and w, v: last link's pose, and twist about the base origin."""
     frame, (px, py, pz), (wx, wy, wz), (vx, vy, vz) = arm.payload_frame, p, w, v
     rx, ry, rz = rotate(R, frame[0], frame[1], frame[2])
     px, py, pz = px + rx, py + ry, pz + rz

@@ -1,12 +1,14 @@
-"""Compute the momentum residual: mean torque over 60 ms that command, friction and links do not explain; compiled.
+"""Compute the momentum residual: 60 ms mean of the torque that command, friction and links do not explain.
 
-The change of momentum equals the integral of all torques, so the residual needs no accelerations. Let m be the moving
-average of (integral of the model torque - momentum). The residual y = (m(t) - m(t - T)) / T in Nm compares two
-averages at a distance of one span, T s. The residual is linear in the unknown parameters x: y = H x + noise.
+The change of momentum equals the integral of all torques, so the residual needs no accelerations. Let I be the
+integral of the model torque, p the momentum, and m the moving average of I - p. The residual y = (m(t) - m(t - T)) /
+T in Nm compares two averages that lie one span, T = 20 ms, apart. The residual is linear in the unknown parameters x:
+y = H x + noise.
 
-The moving average has triangular weights over two spans, so y averages torque by a quadratic spline over three spans.
-Elastic gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm. Sampling once per span would
-alias this vibration to a few hertz. The triangle passes 2.4 % of a 60 Hz vibration, the spline 0.4 %.
+The moving average has triangular weights over two spans (40 ms), so y averages torque with the weights of a quadratic
+spline over three spans (60 ms). Elastic gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30
+Nm. Sampling the momentum every 20 ms would alias a vibration of 50 to 60 Hz to a few hertz. The triangular weights
+pass 2.4 % of a 60 Hz vibration, the spline weights 0.4 %.
 """
 
 from typing import NamedTuple
@@ -59,7 +61,7 @@ class ResidualState(NamedTuple):
 
 
 class MomentumResidual(NamedTuple):
-    """Residual of n joints at the end of a span; means are over the last three spans."""
+    """Residual of n joints at the end of a 20 ms span; all means are over the last three spans (60 ms)."""
 
     y: np.ndarray  # (n,) Nm, the residual
     payload: np.ndarray  # (n, 10), the payload's columns of y
@@ -83,7 +85,7 @@ class MomentumResidual(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def update_residual(arm, state, q, dq, tau, out):
-    """Process one cycle; return whether a span ended and `out` contains the residual of this span.
+    """Process one cycle; return whether a 20 ms span ended and `out` contains this span's residual.
 
     Args:
         arm: `ArmModel`. state: `ResidualState`, updated in place. q, dq: (n,) rad, rad/s, measured in this cycle.
@@ -139,7 +141,7 @@ def _integrate(arm, state, q, dq, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_to_sums(state, q, dq):
-    """Add this cycle to two overlapping triangular sums, with peaks at the start and at the end of this span."""
+    """Add this cycle to two sums with triangular weights, which peak at the start and the end of this 20 ms span."""
     rising, p, payload_p = state.counts[CYCLE] + 1, state.terms.p, state.terms.payload_p
     for k, weight in ((FALLING, SPAN - rising), (RISING, rising)):
         sums, payload_sums = state.sums[k], state.payload_sums[k]
@@ -156,7 +158,7 @@ def _add_to_sums(state, q, dq):
 
 @njit(cache=True, error_model="numpy")
 def _close_span(arm, state, out):
-    """Write the residual at the end of a span, and reset all integrals to zero, so that no integral grows large."""
+    """Write the residual at the end of a 20 ms span; reset all integrals to zero, so that no integral grows large."""
     whole = SPAN * SPAN  # sum of the weights of a triangle
     scale = 1.0 / (whole * SPAN * SIM_DT)  # from sums to a change of means per second
     sums, slid, n = state.sums, state.slid, len(out.y)

@@ -18,7 +18,7 @@ Prior = tuple[np.ndarray, np.ndarray]  # standard deviations of relative frictio
 
 
 def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
-    """Compute the prior of friction and offsets from the posterior draws (S, P) of an identification."""
+    """Compute the prior of friction and offsets from an identification's posterior samples (S, P)."""
     d = space.dynamics(samples)
     sliding = np.full(space.n, tuning.LEVEL_SPEED)
     levels = 0.5 * (d.friction(sliding) - d.friction(-sliding))
@@ -27,7 +27,7 @@ def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
 
 
 def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
-    """Return the default `Noise` for an arm without recordings; `prior` may be None (no posterior)."""
+    """Return the default `Noise` of an arm; prior: from `prior_of`, or None for 30 % of the friction level."""
     n = len(arm.level)
     zero = np.zeros(n)
     friction, offset = prior or (zero + 0.3, 0.3 * arm.level)
@@ -60,7 +60,7 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 
 
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
-    """Return the momentum residuals of all spans of a recording with commanded torque."""
+    """Return a commanded recording's momentum residuals: one per 20 ms span, from a trajectory's third span on."""
     n, out = recording.n_joints, []
     q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # array type of an arm's signals
     for stretch in recording.stretches:
@@ -77,10 +77,11 @@ def fit_noise(
     """Return the model correction from two motions without a payload, and the noise of the corrected model.
 
     The motion `train` yields a first model correction. The noise is fitted to the residuals of the corrected model in
-    the motion `other`: covariances at lags of 60 to 300 ms yield a joint's model error, and the remaining variance
-    yields white noise that grows with the momentum rate. Each joint's noise is then scaled to give innovations the
-    predicted variance. A factor on all noise then limits the odds of a payload change to the number of spans.
-    `train` and `other` together determine the returned correction and the prior means of friction and offsets.
+    the motion `other`. Covariances at lags of 60 to 300 ms yield a joint's model error; the remaining variance yields
+    white noise that grows with the momentum rate. The noise of each joint is then scaled until the joint's
+    innovations have the predicted variance. A factor on the noise of all joints then limits the odds of a false
+    payload change to the number of residuals. `train` and `other` together determine the returned correction and the
+    prior means of friction and offsets.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)
@@ -118,7 +119,7 @@ def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
 
 
 def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: float) -> tuple[float, float, float]:
-    """Fit joint j's white noise, Nm, its growth with the momentum rate, and the model error, Nm (default `model`)."""
+    """Return joint j's white noise, Nm, its growth with the momentum rate, and model error, Nm (default `model`)."""
     columns = np.array([[r.friction[j], 1.0] for r in residuals])
     y, sliding = np.array([r.y[j] for r in residuals]), np.array([r.sliding[j] > 0 for r in residuals])
     fitted = columns @ np.linalg.lstsq(columns[sliding], y[sliding], rcond=None)[0]
@@ -138,7 +139,7 @@ def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: f
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
-    """Return `noise` after multiplying the white noise and the errors of each joint by a factor `scale` (n,)."""
+    """Return `noise` with the white noise and the errors of each joint multiplied by a factor, `scale` (n,)."""
     parts = {name: getattr(noise, name) * scale for name in ("white", "momentum_share", "model", "reversal")}
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["momentum_share"]))
 
@@ -158,7 +159,7 @@ def _without_payload(noise: Noise) -> Noise:
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Filter M residuals; return the `Filter`, normalized innovations (M, n) (nan: joint at rest), log odds (M,)."""
+    """Filter M residuals; return `Filter`, normalized innovations (M, n), nan for joints at rest, log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)
@@ -169,12 +170,12 @@ def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.nd
 
 
 def _largest_odds(noise: Noise, residuals: list[MomentumResidual]) -> float:
-    """Return the largest log odds of a payload change in a motion without payload change, after its first tenth."""
+    """Return the largest log odds of a payload change after the first tenth of a motion without a payload change."""
     return float(_run(noise, residuals)[2][len(residuals) // 10 :].max())
 
 
 def _innovation_scale(noise: Noise, residuals: list[MomentumResidual]) -> np.ndarray:
-    """Return (n,) root mean squares of the normalized innovations of an arm without a payload."""
+    """Return each joint's root mean square (n,) of the normalized innovations, for an arm without a payload."""
     size = np.abs(_run(_without_payload(noise), residuals)[1])[len(residuals) // 10 :]  # offsets have settled
     scale = np.ones(size.shape[1])
     for j in range(len(scale)):

@@ -1,12 +1,13 @@
-"""Disturbance observer: the momentum residual, added to the policy's torque through a first-order low-pass.
+"""Add the momentum residual, after a first-order low-pass, to the policy's torque (disturbance observer).
 
 The momentum p = M(q) dq obeys dp/dt = tau + C^T dq - g - friction - d, which yields the disturbance torque d without
-accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006). Here d is
-the mean over three spans (momentum_residual.py), and tau the command after the identified delay and lag. The low-pass
-filter_s dd^/dt = d - d^ yields the estimate d^.
+accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006). The
+observer uses the mean of d over 60 ms (momentum_residual.py); tau is the command after the identified delay and lag.
+The low-pass filter_s dd^/dt = d - d^ yields the estimate d^.
 
-If a joint does not slide throughout the three spans, stiction may hold it, and the residual only bounds d. The
-estimate of d then changes only as far as the bounds require, because stiction also supports the arm in training.
+If a joint does not slide throughout the 60 ms, stiction may hold the joint, and the residual only bounds d. While
+stiction may hold a joint, the estimate d^ changes only as far as these bounds require, because stiction also supports
+the arm in training.
 """
 
 import numpy as np
@@ -52,7 +53,7 @@ class Observer:
 
 @njit(cache=True, error_model="numpy")
 def _observe(arm, state, residual, q, dq, tau, share, disturbance):
-    """Process one cycle; update `disturbance` (2, n) Nm: mean over three spans, and its low-pass of gain `share`."""
+    """Process one cycle; update `disturbance` (2, n) Nm: 60 ms mean, and this mean low-passed with gain `share`."""
     measured, filtered = disturbance[0], disturbance[1]
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):

@@ -31,9 +31,9 @@ def fit_correction(
 
     Args:
         robot, dynamics: the identified arm.
-        posterior: parameter space and posterior draws, for the uncertainty of friction and offsets.
+        posterior: parameter space and posterior samples, for the uncertainty of friction and offsets.
         unloaded: two recordings with commanded torque and without a payload, for example those of the identification.
-            Without recordings (None), the correction is zero and the model error a tenth of the friction level.
+            Without recordings (None), the correction is zero, and the model error is a tenth of the friction level.
     """
     arm = make_arm_model(robot, replace(dynamics, declared_payload=np.zeros(4)))  # identification declares none
     prior = prior_of(*posterior) if posterior is not None else None
@@ -62,7 +62,7 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
 def estimate_recording(
     robot: Robot, estimator: Estimator, recording: Recording, report: Callable[[Estimate], None] | None = None
 ) -> list[Estimate]:
-    """Return the estimate at the end of every span of the recording; pass each one to `report` at once."""
+    """Return the estimates at the ends of a recording's 20 ms spans; pass each new estimate to `report` at once."""
     recording, out = at_rate(robot, recording), []
     for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         estimator.begin(pause_s)
@@ -75,7 +75,7 @@ def estimate_recording(
 
 
 def pauses(recording: Recording) -> list[float]:
-    """Return the pause before each trajectory, s; it is UNKNOWN_PAUSE_S if the recording's clock restarts there."""
+    """Return the pause, s, before each trajectory; UNKNOWN_PAUSE_S if the clock restarts with the trajectory."""
     starts = [recording.t[s.start] for s in recording.stretches]
     ends = [recording.t[s.stop - 1] for s in recording.stretches]
     between = [float(b - a) for a, b in zip(ends[:-1], starts[1:], strict=True)]
@@ -83,7 +83,7 @@ def pauses(recording: Recording) -> list[float]:
 
 
 def table(estimates: list[Estimate]) -> pd.DataFrame:
-    """Return a row per estimate: each value and the half width of its 95 % interval."""
+    """Return a table with a row for each estimate: its values and the half widths of their 95 % intervals."""
     columns: dict[str, list] = {"t": [e.t for e in estimates]}
     columns |= {"mass_kg": [e.mass for e in estimates], "mass_kg_half": [e.mass_half for e in estimates]}
     for name, unit in (("centre", "m"), ("friction", ""), ("offset", "Nm")):
@@ -97,7 +97,7 @@ def table(estimates: list[Estimate]) -> pd.DataFrame:
 
 
 def format_estimate(estimate: Estimate) -> str:
-    """Return the estimate in one line."""
+    """Return an estimate as one line of text."""
     payload = f"{max(estimate.mass, 0.0):.3f} ± {estimate.mass_half:.3f} kg"
     if np.isfinite(estimate.centre).all():
         values = zip(estimate.centre, estimate.centre_half, strict=True)

@@ -1,10 +1,11 @@
-"""Detect sudden payload changes (jumps), and correct the Kalman filter's estimate after a jump; compiled.
+"""Detect sudden payload changes (jumps), and correct the Kalman filter after a jump, in compiled code.
 
 The generalized likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976) treats each of the last ONSETS spans
-as a possible onset of a jump. For each onset, the test stores the Kalman filter's response to a jump (signature) and
-computes the odds of a jump under a prior. If no jump occurs, the odds averaged over the onsets have expectation 1,
-and exceed x with a probability of at most 1 / x (Markov's inequality). A threshold equal to the number of tests in
-ten hours thus allows one false alarm in ten hours. Model errors have heavier tails, so the aim is one per hour.
+of 20 ms as a possible onset of a jump. For each onset, the test stores the Kalman filter's response to a jump
+(signature) and computes the odds of a jump under a prior. If no jump occurs, the mean odds over all onsets have
+expectation 1, so they exceed x with a probability of at most 1 / x (Markov's inequality). A threshold equal to the
+number of tests in ten hours thus allows one false alarm in ten hours. Model errors have heavier tails than normal
+errors, so the aim is one false alarm per hour.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ MEAN, ONSET = range(2)  # indices of `Filter.log_odds`
 
 @njit(cache=True)
 def begin_onset(filter):
-    """Add the present span to the possible onsets of a jump, in place of the oldest onset if all slots are used."""
+    """Make this 20 ms span a possible onset of a jump; it replaces the oldest onset if all slots are used."""
     at = filter.counts[NEXT]
     filter.signature[at] = 0.0
     filter.information[at] = 0.0

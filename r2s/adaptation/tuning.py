@@ -1,7 +1,8 @@
 """Tuning constants of the package adaptation, each with unit and source.
 
 Constants without a named source are estimates of the order of magnitude. benchmarks/payload.py tested all constants
-together on development twins (seeds 0 to 9). The benchmark's argument NAME=VALUE changes one constant for a test.
+together on development twins (seeds 0 to 9). The argument NAME=VALUE of benchmarks/payload.py changes one constant
+for a test.
 """
 
 import numpy as np

@@ -6,12 +6,13 @@
 
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
 tool (wrench_filter.py). A contact begins when the squared force, in units of the force's covariance, exceeds a
-threshold for 15 ms while a joint moves. This force test is a chi-square test of the hypothesis that no force acts. An
-impact test detects impacts (contact_detection.py). The two tests together aim at one false alarm per hour. The least
-threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors, `contact_thresholds` computes
-the thresholds from recordings without contact. The largest squared force of each half second has an exponential tail
-(extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, 3.3),
-which is extrapolated to an hour. Without recordings, the observer uses only the force test.
+threshold for 15 ms while a joint moves. The force test is a chi-square test of the hypothesis that no force acts. An
+impact test detects impacts (contact_detection.py). The force test and the impact test together aim at one false alarm
+per hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors,
+`contact_thresholds` computes the thresholds from recordings without contact. The largest squared force of each half
+second has an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch,
+Modelling Extremal Events, 1997, 3.3). `contact_thresholds` extrapolates this tail to one hour. Without recordings,
+the observer uses only the force test.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,13 +44,12 @@ class WrenchObserver:
     """Observer that estimates the wrench on one arm, cycle by cycle.
 
     Attributes:
-        thresholds: (2,), thresholds of the two contact tests, for force and for impact: squared forces in units of
-            their covariances.
+        thresholds: (2,), of the force test and the impact test: squared forces in units of their covariances.
         tool: tool of the robot; None for a robot without a tool.
 
     Args:
-        robot, dynamics: the identified arm. thresholds: as the attribute; None: twice GAUSSIAN for the force test,
-            and no impact test.
+        robot, dynamics: the identified arm. thresholds: see the attribute; None: 2 GAUSSIAN for the force test, and
+            no impact test.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):
@@ -71,7 +71,7 @@ class WrenchObserver:
         self._state = WrenchState.fresh(len(self._arm.level), self._components)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
-        """Process q, dq (n,) rad, rad/s and command (n,) Nm without gravity of one cycle; return `in_contact`.
+        """Process one cycle: q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return `in_contact`.
 
         If a value is not finite, reset the estimate as `begin` does.
 
@@ -106,7 +106,7 @@ class WrenchObserver:
 
     @property
     def wrench(self) -> np.ndarray:
-        """Wrench on the arm at the tip, base axes: (3,) N with a tool, else (6,) N and Nm."""
+        """Wrench on the arm at the tip, in base axes: force (3,) N with a tool, else force and moment (6,) N, Nm."""
         return self._state.x[: self._components]
 
     @property
@@ -136,7 +136,7 @@ class WrenchObserver:
 
     @property
     def squares(self) -> np.ndarray:
-        """(2,), squared forces of force test and impact test; `thresholds` are their limits."""
+        """(2,), squared forces of the force test and the impact test, which the tests compare with `thresholds`."""
         return self._state.contact[[SQUARE, IMPACT_SQUARE]]
 
     @property
@@ -167,7 +167,8 @@ def observe_recording(
     """Return a table with one row per millisecond: wrench, half widths of its 95 % intervals, contact, tip position.
 
     Args:
-        estimator: estimates a payload, whose effect is subtracted; with a tool, contact freezes the estimate.
+        estimator: estimates a payload, whose effect is subtracted; if the robot has a tool, contact freezes the
+            estimate.
         report: called with each new estimate of the payload.
     """
     recording = at_rate(robot, recording)
@@ -211,7 +212,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why rate or length makes the recordings unfit for `contact_thresholds`; None if they are fit."""
+    """Return why recordings are too slow or too short for `contact_thresholds`; None if they are neither."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]
@@ -237,7 +238,7 @@ def contact_thresholds(robot: Robot, observer: WrenchObserver, free: Sequence[Re
 
 
 def _exceeded_hourly(maxima: np.ndarray) -> float:
-    """Extrapolate block maxima (N,) to the squared force that they exceed ALARMS_PER_TEST times per hour."""
+    """Extrapolate `maxima` (N,) to the squared force that block maxima exceed ALARMS_PER_TEST times per hour."""
     level = np.quantile(maxima, 1.0 - tuning.TAIL)
     excess = np.mean(maxima[maxima >= level] - level)
     blocks_per_hour = 3600.0 / tuning.BLOCK_S

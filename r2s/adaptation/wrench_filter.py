@@ -1,4 +1,4 @@
-"""Kalman filter of the external wrench, the momentum, and the friction model's error; compiled.
+"""Estimate external wrench, momentum and friction error with a Kalman filter, in compiled code.
 
 The state has N = w + 2 n components: the wrench at the tip in base axes, with w = 3 (force) or 6 (force and moment);
 for each of n joints, the error b of the friction f = f_model + b, Nm; and the generalized momentum p, Nm s, which is
@@ -8,12 +8,13 @@ and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Elect
 The uncertainty of a joint's friction depends on whether the joint moves (wrench_friction.py).
 - The momentum of a joint in motion determines the wrench precisely, because the friction error b is small and has a
   short correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain.
-- A joint at rest only bounds the wrench. Friction at rest balances all other torques, and may be any torque between
-  the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of a
-  uniform distribution between the edges. If the friction family has bristles, the joint angle determines the bristle
-  deflection, and so friction, with a smaller variance.
-The filter assumes that the wrench changes as the tip moves on stiff surroundings. If all joints rest, the filter
-assumes that only a person's hand changes the force. Joint friction hides any change below breakaway.
+- A joint at rest yields only bounds on the wrench. Friction at rest balances all other torques, and may be any torque
+  between the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of
+  a uniform distribution between the edges. If the friction family has bristles, the joint angle determines the
+  bristle deflection and thereby the friction, with a smaller variance.
+The filter assumes that the wrench changes when the tip moves against stiff surroundings. If all joints rest, the
+filter assumes that only a person's hand changes the force. Joint friction hides any force change that is too small to
+make a joint slide.
 """
 
 import numpy as np
@@ -114,7 +115,7 @@ def _shake(state):
 
 @njit(cache=True, error_model="numpy")
 def _begin(noise, state):
-    """Initialize the filter with the measured momentum and with a wrench of zero and small variance."""
+    """Initialize the filter with the measured momentum and with a zero wrench of small variance."""
     x, P, joints = state.x, state.P, state.joints
     n = joints.shape[1]
     w = len(x) - 2 * n
@@ -184,7 +185,7 @@ def _hidden(noise, joints, j):
 
 @njit(cache=True, error_model="numpy")
 def _wrench_variance(noise, state):
-    """Return by how much the variance of each force component, N^2, grows in this cycle (process noise)."""
+    """Return the growth, N^2, of the variance of each force component in this cycle (process noise)."""
     joints, J = state.joints, state.jacobian
     n = joints.shape[1]
     speed = creep = 0.0
@@ -229,7 +230,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """For each joint at rest, limit friction to the breakaway torques (edges), and variance to that of `_hidden`."""
+    """Keep friction at rest between the breakaway torques (edges), and its variance at most that of `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)

@@ -1,8 +1,9 @@
-"""Friction in the wrench filter: determine which joints rest, and the direction (side) of sliding; compiled.
+"""Determine, for the wrench filter, which joints rest, and in which direction (side) the other joints slide.
 
 The friction of a joint at rest balances all other torques. The mass matrix M couples joints at rest (r) to joints in
-motion (s). With A = M_rs M_ss^-1, the momentum of the joints at rest changes by dp_r/dt = A (dp_s/dt - M'_ss dq_s) +
-M'_rs dq_s, and their friction is f_r = u_r + J_r^T wrench - dp_r/dt.
+motion (s). With A = M_rs M_ss^-1 and M' = dM/dt, the momentum of the joints at rest changes by dp_r/dt = A (dp_s/dt -
+M'_ss dq_s) + M'_rs dq_s. The friction of the joints at rest is f_r = u_r + J_r^T wrench - dp_r/dt, with the known
+torque u_r.
 """
 
 import numpy as np
@@ -121,7 +122,7 @@ def _model(arm, noise, state, j, angle, side, speed, moved):
 
 @njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
-    """Detect whether joint j rests; a joint at rest that creeps counts as in motion for one cycle."""
+    """Detect whether joint j rests; a resting joint that creeps counts as moving for one cycle."""
     crept, joints[CREEP, j] = joints[CREEP, j], 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])
@@ -148,7 +149,7 @@ def _unlagged(joints, j):
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, of friction f with wrong sign (probability p), 4 f^2 p (1 - p), and presliding."""
+    """Return the friction variance, Nm^2: 4 f^2 p (1 - p), p the probability of a wrong sign, plus presliding."""
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # approximately the normal cdf

@@ -1,14 +1,15 @@
 """Combine two estimates of the external force: from the momentum and from an identified surface.
 
 The joint angles yield the tip's penetration depth, and the law of the surface (r2s/physics/surface.py) yields the
-normal force F_s. The variance s^2 of F_s comes from the surface's posterior, encoder noise, and errors of the law. A
-Kalman update along the normal n combines F_s with the force F from momentum, which has the covariance P, as F' =
-F + P n (F_s - n . F) / (n . P n + s^2). A low-pass first filters F_s - n . F, because the measured angles are noisy.
+normal force F_s. The variance s^2 of F_s comes from the surface's posterior, encoder noise, and errors of the law.
+The momentum yields the force F with covariance P. A Kalman update along the normal n combines F and F_s: F' = F + P n
+(F_s - n . F) / (n . P n + s^2). Before the update, a low-pass filters F_s - n . F, because the measured angles are
+noisy.
 
 The force F_s is wrong if the tip touches a different surface or if the identified surface has moved. An innovation
 test (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore rejects a surface
 if the low-passed innovation exceeds REFUSED standard deviations. The estimate ignores a rejected surface until the
-motion ends, because with a small force any surface would pass the test.
+motion ends, because any surface would pass the test at a small force.
 """
 
 from collections.abc import Sequence
@@ -37,7 +38,7 @@ class SurfaceLaw(NamedTuple):
 
 
 def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle: float) -> SurfaceLaw:
-    """Return the `SurfaceLaw` of a surface and of at most `tuning.SURFACE_DRAWS` posterior draws."""
+    """Return the `SurfaceLaw` of a surface and of at most `tuning.SURFACE_DRAWS` posterior samples."""
     each = [surface, *draws[: tuning.SURFACE_DRAWS]]
     law = [np.concatenate([[s.coefficient, s.exponent, s.damping], s.point, s.normal]) for s in each]
     return SurfaceLaw(np.array(law, dtype=float), float(radius), float(angle))
@@ -47,7 +48,8 @@ class FusedWrench(WrenchObserver):
     """A `WrenchObserver` whose force estimate also uses an identified surface; contact detection ignores the surface.
 
     Args:
-        surface: identified surface. draws: samples of its posterior (r2s/identification/contact/contact_file.py).
+        surface: identified surface. draws: samples of the surface's posterior
+            (r2s/identification/contact/contact_file.py).
 
     Raises:
         UserError: the robot has no tool.
@@ -106,7 +108,7 @@ class FusedWrench(WrenchObserver):
 
 @njit(cache=True, error_model="numpy")
 def surface_force(law, k, tip, rate):
-    """Return force, N, and depth, m, of a tip (3,) m that penetrates at `rate` m/s, from row k of `law.law`."""
+    """Return force, N, and depth, m, of a tip (3,) m that penetrates surface k of `law.law` at `rate` m/s."""
     row = law.law[k]
     depth = law.radius
     for c in range(3):

@@ -1,1 +1,1 @@
-"""Arms with one common interface: driver, policy runners, recorder, hidden twins, and clients of real arms."""
+"""Simulated and real arms behind one interface, and the code that drives them and records their motion."""

@@ -1,8 +1,8 @@
-"""Command an arm through its driver; no other module of r2s commands an arm.
+"""Command an arm through its driver; outside the emulator, no other module of r2s commands an arm.
 
 Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives
-only the driver's torques; tests/test_command_loop.py checks that no other code commands an arm. Every cycle checks
-for a stop request (r2s/arm/stop_request.py). Once the driver has brought the arm to rest, the loop ends the arm's
+only the driver's torques; tests/test_command_loop.py checks that no other code commands an arm. The loop checks for a
+stop request (r2s/arm/stop_request.py) in every cycle. When the driver has stopped the arm, the loop ends the arm's
 motion and raises ArmStopped with the reason of the stop.
 """
 
@@ -38,10 +38,11 @@ class CommandLoop:
         clock: s, three perf_counter times of the last cycle: before the driver, after the driver, after the adapter.
 
     Args:
-        arm: the arm. driver: limits the torques of all motions of this loop.
-        log: receives (state, torque) of every cycle before the torque is sent.
-        adapter: called once per cycle; the driver adds its torque in the next cycle. If the adapter raises an
-            exception, the driver receives no more commands and so stops the arm; then the loop raises the exception.
+        arm: the arm. driver: the driver, which limits every torque that the loop sends.
+        log: queue to which the loop appends (state, torque) in every cycle, before it sends the torque.
+        adapter: called once per cycle; the driver adds the adapter's torque in the next cycle. If the adapter raises
+            an exception, the loop sends the driver no more commands. The driver stops the arm, and the loop raises
+            the exception.
     """
 
     def __init__(
@@ -60,7 +61,11 @@ class CommandLoop:
         self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
 
     def place(self, q: np.ndarray) -> ArmState:
-        """Move the arm to q (n,) rad and begin a motion from rest there; raise ArmStopped as `Arm.move_to` does."""
+        """Bring the arm to rest at q (n,) rad and begin a motion there.
+
+        Raises:
+            StopRequested: a stop was requested. ArmStopped: see `Arm.move_to`.
+        """
         self._check_request()
         self._reset()
         try:
@@ -83,14 +88,14 @@ class CommandLoop:
         self.rest(hold)
 
     def __call__(self, command: np.ndarray | None, hold: np.ndarray | None = None) -> ArmState:
-        """Run one cycle and return the state of the next one.
+        """Run one cycle and return the state of the next cycle.
 
         Args:
             command: (c,), input of the control law; None: no new command. hold: (n,) Nm, see `DriverBatch.__call__`.
 
         Raises:
             StopRequested: a stop was requested, and the driver has brought the arm to rest.
-            ArmStopped: the arm stopped itself, or the driver brought it to rest; the motion has ended.
+            ArmStopped: the arm stopped itself, or the driver brought the arm to rest; the motion has ended.
         """
         if self.driver.stopping is None and (reason := requested()) is not None:
             self._requested = True
@@ -106,7 +111,7 @@ class CommandLoop:
         return self.state
 
     def _step(self, command: np.ndarray | None, hold: np.ndarray | None) -> None:
-        """Run one cycle like `_cycle`, but without raising ArmStopped once the driver has brought the arm to rest."""
+        """Run one cycle like `_cycle`, but do not raise ArmStopped when the driver has brought the arm to rest."""
         if self._ended:
             raise ArmStopped("the motion is over")
         began = time.perf_counter()
@@ -125,7 +130,7 @@ class CommandLoop:
         self.state = self.arm.read()
 
     def rest(self, hold: np.ndarray | None = None) -> None:
-        """Damp the motion for at most 0.5 s, until the arm rests under the command `hold` (n,) Nm.
+        """Damp the motion until the arm rests under the command `hold` (n,) Nm, for at most 0.5 s.
 
         Unless the arm is in contact, `resist` adjusts `hold` to brake the joints that continue to move.
         If `hold` is None, as after a contact, the final command is zero.
@@ -153,7 +158,7 @@ class CommandLoop:
     def halt(self, reason: str) -> None:
         """Damp the arm to rest under zero command, and raise ArmStopped with `reason`.
 
-        If the driver is already stopping the arm, do nothing, because a stop itself leads off the planned motion.
+        Do nothing if the driver is already stopping the arm, because every stop deviates from the planned motion.
         """
         if self.driver.stopping is not None:
             return
@@ -161,9 +166,9 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return the reason if the driver was stopping the arm or the arm stops itself, else None.
+        """Stop the arm; return the reason if the driver was stopping the arm or if the arm stops itself, else None.
 
-        A driver with a push limit first handles a contact force, as in any stop (r2s/physics/contact_stop.py).
+        A driver with a push limit first holds or ends a contact, as in any stop (r2s/physics/contact_stop.py).
         """
         reason = None if self._ended else self.driver.stopping
         if reason is not None:

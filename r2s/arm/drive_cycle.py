@@ -41,14 +41,14 @@ class Memory(NamedTuple):
 
     Attributes:
         command: (m, c), the last finite commands. law: (m, k), memory of the control law.
-        target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `Actuation`.
+        target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `condition_joint`.
         sent: (m, n) Nm, the last torque command.
         held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop without contact still applies this sum.
         share: (m,), factor on the allowed speeds, which is 1 in a motion and decreases in a stop (`_brake`).
-        cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, and the stop's start.
+        cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, or the stop's start.
         why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the safety filter acted.
         rests: (m,), whether each arm is at rest. commanded: (m,), whether each arm has received a command.
-        least: (m, K) m, smallest allowed distances between the bodies of the fence's K pairs.
+        least: (m, K) m, smallest allowed distance between the two bodies of each of K pairs (fence.py).
         push: (m, COLUMNS), parameters and state of the push limit (push_limit.py); (m, 0): no push limit.
     """
 
@@ -84,7 +84,7 @@ class Given(NamedTuple):
     """Inputs of the driver of m arms in one cycle.
 
     command: (m, c), commands, used if `new` is True. added: (m, n) Nm, adapter torques, used if `adds` is True.
-    hold: (m, n) Nm, part of the target that a stop still applies. contact: (m,), whether each arm is in contact.
+    hold: (m, n) Nm, part of the target torque that a stop keeps. contact: (m,), whether each arm is in contact.
     """
 
     command: np.ndarray
@@ -98,8 +98,8 @@ class Given(NamedTuple):
 class Bounds(NamedTuple):
     """Settings of the driver: `torque` and `added`, (n,) Nm, bound the target torque and the adapter's torque.
 
-    The driver stops arms beyond q_low, q_high, dq_max (n,) rad, rad/s, or without a finite command for `deadline` s.
-    spring: (n,) Nm/rad, stiffness in `resist`. factor: gain of the low-pass. fade: cycles that the soft start lasts.
+    The driver stops an arm beyond q_low, q_high, dq_max (n,) rad, rad/s, or without finite command for `deadline` s.
+    spring: (n,) Nm/rad, stiffness for `resist`. factor: gain of the low-pass. fade: number of soft-start cycles.
     """
 
     torque: np.ndarray
@@ -148,7 +148,7 @@ def _watch(i, q, dq, given, bounds, memory):
 def resist(dq, spring, most, held):
     """Adjust the torque `held` (n,) Nm of a stop to brake the joints that still move; dq: (n,) rad/s, joint speeds.
 
-    A joint continues to move if it carries an undeclared load, or if `held` still compensates kinetic friction.
+    A joint may continue to move because of an undeclared load, or because `held` compensates kinetic friction.
 
     Args:
         spring: (n,) Nm/rad, SPRING^2 times each joint's inertia. most: (n,) Nm, largest magnitude of `held`.
@@ -193,7 +193,7 @@ def _kinematics(model, q):
 def _brake(i, seen, arm, bounds, model, memory):
     """Set the target torque of arm i in a stop, and lower the allowed speeds from the present speed toward zero.
 
-    `stop_torque` handles contact only in stops with code SILENT, LAW_NOT_FINITE or REQUESTED.
+    Only for the stop codes SILENT, LAW_NOT_FINITE and REQUESTED, `stop_torque` holds or ends a contact.
     """
     needs, why = 0.0, memory.why[i]
     memory.target[i] = 0.0
@@ -214,8 +214,9 @@ def drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the torque commands (m, n) Nm of this cycle.
 
     Args:
-        q, dq: (m, n) rad, rad/s, measured. applied: (m, n) Nm, torques of the last cycle. given, bounds, model:
-            see the classes. control: number and parameters of the control law. memory: `Memory`, updated in place.
+        q, dq: (m, n) rad, rad/s, measured. applied: (m, n) Nm, torques that the arms applied in the last cycle.
+        given, bounds, model: see `Given`, `Bounds`, `Model`. control: number and parameters of the control law.
+        memory: `Memory`, updated in place.
     """
     out, (m, n) = np.empty_like(memory.sent), q.shape
     number, parameters = control

@@ -1,10 +1,11 @@
-"""The driver: once per millisecond it computes, from a policy's command, a torque that respects the arm's limits.
+"""The driver: compute a torque within the arm's limits from a policy's command, once per millisecond.
 
-Each cycle checks that the command is finite and recent (watchdog). The control law (r2s/physics/control_laws.py)
-computes a target torque, which passes soft start and low-pass. The torque of an adapter (r2s/adaptation/adapter.py)
-is added. The safety filter, which training also uses (r2s/physics/safety_filter.py), limits the sum. Finally, the
-driver limits the change from the torque that the arm applied in the last cycle. The driver has no clock and no
-connection to an arm: states and commands are its only inputs, so tests can run it on a million adversarial inputs.
+In each cycle, the driver checks that the command is finite and recent (watchdog). The control law
+(r2s/physics/control_laws.py) computes a target torque, which passes soft start and low-pass. The driver adds the
+torque of an adapter (r2s/adaptation/adapter.py). The safety filter, which training also uses
+(r2s/physics/safety_filter.py), limits the sum of target and adapter torque. Finally, the driver limits the change of
+the torque between two cycles. The driver has no clock and no connection to an arm: its only inputs are states and
+commands. Tests can therefore run the driver on a million adversarial inputs.
 
 `DriverBatch` drives many arms in lock-step; `Driver` drives one arm.
 """
@@ -52,7 +53,7 @@ def spring(robot: Robot) -> np.ndarray:
 
 
 class DriverBatch:
-    """The driver of m arms: the last stage that a torque command passes before it reaches an arm.
+    """The driver of m arms, which computes every torque command that r2s sends to the arms.
 
     Attributes:
         stopping: for each of the m arms, the reason why the driver is bringing this arm to rest; None: no stop.
@@ -61,8 +62,9 @@ class DriverBatch:
         robot: provides limits and nominal links. torque: (n,) Nm, largest target torque of each joint.
         m: number of arms. cutoff_hz: cutoff of the low-pass. period_s: s, time between two policy commands.
         soft_start_s: s over which the target torque fades in at the start of a motion; 0: no fade.
-        friction: (n,) Nm, friction level of each joint. rotors: (n,) kg m^2, as `Dynamics.armature`; None: as
-            `robot.armature`. control: control law that maps commands to torques; None: commands are torques (n,) Nm.
+        friction: (n,) Nm, friction level of each joint. rotors: (n,) kg m^2, rotor inertias
+            (`Dynamics.armature`); None: `robot.armature`.
+        control: control law that maps commands to torques; None: commands are torques (n,) Nm.
         fence: pairs of bodies; the driver stops an arm before the bodies of a pair touch; None: no fence.
         speed_share: factor on all allowed speeds, in (0, 1].
         push_limit: limits the contact force and the approach speed of the robot's tool; None: no limit.
@@ -123,12 +125,12 @@ class DriverBatch:
 
     @property
     def effort(self) -> np.ndarray:
-        """(m, n) Nm, the target torques after the low-pass; policies observe them."""
+        """(m, n) Nm, target torques after the low-pass, which policies observe."""
         return self._memory.effort
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, torque of a stop: adapter torque and `hold`, plus contact torque if the stop holds a contact."""
+        """(m, n) Nm, torque in a stop: adapter torque + `hold` (+ contact torque if the stop holds a contact)."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -136,7 +138,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether the driver has a `push_limit`, so that a stop can hold a contact, release the tool, or retreat."""
+        """Whether the driver has a `push_limit`, so that a stop can hold a contact, release the tip, or retreat."""
         return bool(len(self._push))
 
     @property
@@ -186,7 +188,7 @@ class DriverBatch:
         return out
 
     def stop(self, reason: str) -> None:
-        """Bring all arms to rest from the next cycle on; an arm that is already stopping retains its reason."""
+        """Bring all arms to rest from the next cycle on; an arm that is already stopping retains its first reason."""
         self._memory.why[self._memory.why == RUNS] = REQUESTED
         self.stopping = [reason if own is None else own for own in self.stopping]
 
@@ -237,7 +239,7 @@ class Driver:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop can hold a contact, release the tool, or retreat; see `DriverBatch.decides_contact`."""
+        """Whether a stop can hold a contact, release the tip, or retreat; see `DriverBatch.decides_contact`."""
         return self._drivers.decides_contact
 
     @property

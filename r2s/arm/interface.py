@@ -1,6 +1,6 @@
 """The interface of an arm, real or simulated: move to a posture, read, send one torque per 1 kHz cycle, stop.
 
-The convention is libfranka's: commands exclude gravity, and the arm adds its own gravity compensation. `read`
+As in libfranka, commands exclude gravity, and the arm adds its own gravity compensation. `read`
 returns the state of the current cycle; `command` ends this cycle and waits for the next cycle. Both panda_py's
 `control(callback)` loop and pylibfranka's readOnce/writeOnce can implement `read` and `command`.
 """
@@ -27,11 +27,11 @@ class ArmStopped(RuntimeError):  # noqa: N818 (a stop is not a bug)
 
 
 class NotCleared(ArmStopped):
-    """No operator allowed the arm to move again after an earlier stop; the run ends."""
+    """Error: no operator allowed the arm to move again after an earlier stop; no further motion follows."""
 
 
 class StopRequested(ArmStopped):
-    """A signal, or the end of the process that sends the commands, ended the motion; the run ends."""
+    """Error: a signal, or the end of the commanding process, ended the motion; no further motion follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +44,14 @@ class ArmState:
         tau_J: (n,) Nm, measured link-side torque; it includes gravity, but little of the motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
         tau_ext_hat_filtered: (n,) Nm, torque that the joints exert on the surroundings: tau_J minus the torque
-            of the arm's own model (gravity, load, dynamics). This and all later attributes may be None.
+            of the arm's own model (gravity, load, dynamics). This attribute and all later ones may be None.
         O_F_ext_hat_K: (6,) N, Nm, wrench that the end effector exerts on the surroundings, in the base frame.
         joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,) for joints, (6,) for the end
             effector; above 0 where the external torque or force exceeds the contact or collision threshold.
         control_command_success_rate: share of the last 100 commands that reached the arm; 0 while no motion runs.
         O_T_EE: (16,), pose matrix of the end effector in the base frame, column by column.
         m_ee, m_load: kg, masses of end effector and load that the arm's gravity compensation assumes.
-        box: (6,), pose of a box in the base frame, measured by a camera: center, m, and direction of the first axis.
+        box: (6,), pose of a box in the base frame, measured by a camera: center, m, and direction of its first axis.
     """
 
     t: float
@@ -87,7 +87,7 @@ class ArmState:
 
 @cache
 def signal_sizes(n: int) -> dict[str, int]:
-    """Return how many numbers each of `SIGNALS` has on an arm of n joints."""
+    """Return the number of values of each signal in `SIGNALS`, for an arm of n joints."""
     return dict(zip(SIGNALS, (n, 6, n, 6, n, 6, 1, 16, 1, 1), strict=True))
 
 
@@ -115,14 +115,14 @@ class Arm(Protocol):
         """Send tau (n,) Nm WITHOUT gravity for one cycle, and wait for the next cycle.
 
         Raises:
-            ArmStopped: tau is not finite, exceeds tau_max, or differs from tau_J_d by more than dtau_max * 1 ms; a
-                joint left its position or velocity limits; or the arm had already stopped.
+            ArmStopped: tau is not finite, |tau| > tau_max, |tau - tau_J_d| > dtau_max * 1 ms, a joint has left its
+                position or velocity limits, or the arm had already stopped.
 
         """
         ...
 
     def stop(self) -> None:
-        """End the motion; do nothing if it has already ended."""
+        """End the motion; do nothing if the motion has already ended."""
         ...
 
 
@@ -131,9 +131,9 @@ class Operated(Protocol):
     """An `Arm` with an operator, who must agree before the arm moves again after any stop.
 
     Attributes:
-        operator: function that asks the operator, given the reason of the stop, and returns whether the arm may move.
+        operator: function that receives a stop's reason, asks the operator, and returns whether the arm may move.
             Without an operator (None), the arm may not move again after a stop.
-        blocked: reason of a stop about which `move_to` must first ask the operator; None: no such stop. Code that
+        blocked: reason of a stop that the operator has not cleared; None: no such stop. Code that
             stops the arm's motion must write the reason to `blocked`.
     """
 

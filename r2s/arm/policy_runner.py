@@ -1,7 +1,7 @@
 """Run a policy on an arm that waits for commands: observe, query the policy at its rate, command the arm at 1 kHz.
 
-The clock of a twin, or of the emulator in lock-step, stands still while the policy computes, so runs are repeatable
-bit for bit. For arms whose clock does not wait, see r2s/arm/realtime_process.py.
+The clock of a twin, or of the emulator in lock-step, stands still while the policy computes. Repeated
+evaluations are therefore bit-identical. For arms whose clock does not wait, see r2s/arm/realtime_process.py.
 """
 
 import time
@@ -34,8 +34,9 @@ class Stop:
     """Why an episode ended early.
 
     Attributes:
-        episode: index from 0. when: time in the episode, or "on the way to its start". reason: reason of the stop.
-        log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, command Nm.
+        episode: index from 0. when: time of the stop in the episode, or "on the way to its start".
+        reason: reason of the stop. log: (k, 1 + 4 n), last second before the stop, at 1 kHz: t s, q rad,
+            dq rad/s, tau_J_d Nm, command Nm.
     """
 
     episode: int
@@ -68,16 +69,16 @@ class PolicyRunner:
 
     Attributes:
         stops: stops that ended episodes early. timing: see `Timing`.
-        done: number of episodes begun: `place` calls after which `halted` was None.
+        done: number of `place` calls that began an episode (after which `halted` was None).
         speeds: (1, T, n) rad/s, joint speeds after each control step of the last episode, see `smooth_speeds`.
-        halted: why no further episode runs: a request to stop, the operator's refusal after a stop, or too many
+        halted: why no further episode will run: stop request, the operator's refusal after a stop, or too many
             failed attempts to reach a start. None: not halted.
-        blocked: stop that the operator had not cleared when the last episode ended (`Operated.blocked`), or None.
+        blocked: reason of a stop that the operator had not cleared when the last episode ended, or None.
 
     Args:
         arm: an arm whose clock waits for commands.
         task: rates, torque limits and controller.
-        friction: (n,) Nm, friction level of each joint: `Dynamics.level` of the dynamics the policy was trained on.
+        friction: (n,) Nm, friction level of each joint: `Dynamics.level` of the training dynamics.
         soft_start_s: s over which an episode's torque fades in; recommended on hardware, 0 for twins.
         rotors: (n,) kg m^2, `Dynamics.armature` of the training dynamics; None: rotors of `arm.robot`.
         adapter: adds torque to the policy's torque; None: no adaptation.
@@ -109,10 +110,11 @@ class PolicyRunner:
         self.blocked: str | None = None
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Move to starts (1, n) rad and begin episode `first` there.
+        """Move the arm to starts (1, n) rad, and begin the episode with the index `first`.
 
-        If the arm stops on the way, the episode ends. An `Operated` arm makes up to ATTEMPTS attempts if the operator
-        agrees to each new attempt. If the operator refuses or all attempts fail, no episode runs from now on.
+        If the arm stops on the way to the start, the episode ends. An `Operated` arm makes up to ATTEMPTS attempts to
+        reach the start, if the operator agrees to each new attempt. If the operator refuses or all attempts fail, no
+        further episode will run.
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []
@@ -206,10 +208,10 @@ class PolicyRunner:
 
 
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
-    """Compute smooth joint speeds (k, n) rad/s in every `every`-th cycle, from the angles (n,) rad of all cycles.
+    """Return smoothed joint speeds (k, n) rad/s of every `every`-th cycle, from the angles (n,) rad of all cycles.
 
-    Each speed is the slope of a parabola fitted to the angles up to SMOOTHING_CYCLES before and after its cycle
-    (Savitzky and Golay, Anal. Chem. 36(8), 1964).
+    The speed in cycle k is the slope at k of a parabola fitted to the angles of the cycles k - SMOOTHING_CYCLES to
+    k + SMOOTHING_CYCLES (Savitzky and Golay, Anal. Chem. 36(8), 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:

@@ -1,7 +1,8 @@
 """Record an arm while it presses on a surface and slides along it, to identify the surface.
 
 The arm performs `task=wipe`: hybrid control with the identified model moves the tip along paths on the surface. The
-force rises along one path and falls along the next. Joints must move: stiction hides force (docs/how_to/surfaces.md).
+contact force rises along the first path, falls along the second, and so on. The joints must move, because stiction of
+a resting joint hides contact force (docs/how_to/surfaces.md).
 """
 
 from collections import deque
@@ -72,13 +73,13 @@ def record_presses(
     The rows have the format of `r2s.arm.recorder.record`. The recorded time has gaps of PAUSE_S between paths.
 
     Args:
-        arm: moves above the start of each path, and always stops at the end. dynamics: the arm's dynamics.
+        arm: the arm, which moves above the start of each path and always stops at the end.
         seed: random seed of the paths. progress: called after every path with (paths done, total).
-        timing: receives the durations of the cycles.
+        timing: receives the durations of the cycles. dynamics: dynamics of the arm.
 
     Raises:
-        ArmStopped: arm or driver stopped the motion, or commands were late; `recording`: the completed paths, if any.
-        UserError: the tip does not reach the surface, or no safe path leads there.
+        ArmStopped: arm or driver stopped the motion, or commands came late; `recording`: completed paths, if any.
+        UserError: the tip cannot reach the surface, or no safe path leads to the start of a path.
     """
     robot, control = arm.robot, plan.control(arm.robot)
     goals = plan.goals(robot, np.random.default_rng(seed), count)

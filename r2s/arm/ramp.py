@@ -1,6 +1,6 @@
 """The paper's breakaway protocol: ramp the torque of each joint in turn, in both directions, until the joint moves.
 
-The ramps run on any `Arm`; r2s/identification/friction/breakaway.py estimates breakaway torques from them.
+The ramps run on any `Arm`; r2s/identification/friction/breakaway.py estimates breakaway torques from the ramps.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,7 +41,7 @@ SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return `count` postures (count, n) rad: home, then steps of 0.3 rad in every joint, clipped to the limits."""
+    """Return `count` postures (count, n) rad: home, then steps of +-0.3 rad per joint, 0.2 rad inside the limits."""
     change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
     poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
@@ -65,18 +65,18 @@ def ramp(
 ) -> Ramps:
     """Ramp every joint in both directions at every pose and return one trajectory per ramp.
 
-    A ramp begins with a short rest at zero command. Then one joint's command rises from 0 at `rate`; the commands of
-    all other joints stay 0. The ramp ends when the joint has moved by MOVED, its command reaches `largest`, or any
-    joint has moved by STRAY. The recording omits the stop after each ramp. The rows have the format of
-    `r2s.arm.recorder`. If the error of gravity compensation exceeds a joint's friction, the joint slides at zero
-    command. Braking finds the constant command that stops such a joint; the joint's ramp starts at this command.
+    A ramp begins with a short rest at zero command. Then the command of one joint changes from 0 at +rate or -rate;
+    the commands of all other joints stay 0. The ramp ends when the ramped joint has moved by MOVED, |command| reaches
+    `largest`, or any joint has moved by STRAY. The recording omits the stop after each ramp. The rows have the format
+    of `r2s.arm.recorder`. If the error of gravity compensation exceeds a joint's friction, the joint slides at zero
+    command. `ramp` brakes a sliding joint, and starts its ramp at the constant command under which the joint rests.
 
     Args:
         arm: the arm, which moves to each pose and always stops at the end.
         poses: (P, n) rad, at least 0.15 rad inside the position limits. No motion starts if the arm would come too
             close to the table or to itself at a pose or on a path (r2s/excitation/paths.py).
-        rate: (n,) or one number, Nm/s, slope of the ramps; default: 2.2 for joints with tau_max of at least 40 Nm, 4
-            for weaker joints, and in proportion to tau_max below 12 Nm.
+        rate: (n,) or one number, Nm/s, slope of the ramps; default: 2.2 for joints with tau_max of at least 40 Nm,
+            4 min(1, tau_max / 12 Nm) for weaker joints.
         largest: (n,) or one number, Nm, largest command of a ramp; default 20 % of tau_max.
         progress: called after every ramp with (ramps done, total); it must return within the 1 kHz cycle.
         timing: receives the durations of the cycles.
@@ -135,7 +135,7 @@ class _Drive:
 
     Attributes:
         rows: t, q, dq and command of every cycle since the list was last emptied.
-        base: (n,) Nm, command under which the arm rests. held: (n,) Nm, mean command in the last braking cycles.
+        base: (n,) Nm, command under which the arm rests. held: (n,) Nm, mean of the last braking commands.
     """
 
     def __init__(self, loop: CommandLoop, timing: Timing):
@@ -189,7 +189,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints (`next_joint` below STILL), then fade the torque out; repeat if a joint still moves."""
+        """Brake all joints, `next_joint` below STILL; then fade the command to `base`; repeat if a joint moves."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d

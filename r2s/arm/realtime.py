@@ -1,4 +1,4 @@
-"""Prepare the computer for real time during a motion, and measure whether commands arrive in time."""
+"""Run a motion with real-time priority, and measure whether commands reach the arm in time."""
 
 import ctypes
 import gc
@@ -24,7 +24,7 @@ _warned: set[str] = set()
 
 @contextmanager
 def realtime_section(priority: int | None = PRIORITY) -> Iterator[None]:
-    """Run a motion without garbage collection, with this thread under SCHED_FIFO and memory locked.
+    """Run a motion without garbage collection, with this thread under SCHED_FIFO and with locked memory.
 
     Each missing permission causes one warning per process. At the end all settings are restored.
 
@@ -48,7 +48,7 @@ def realtime_section(priority: int | None = PRIORITY) -> Iterator[None]:
 
 @contextmanager
 def kept_scheduler() -> Iterator[None]:
-    """Restore this thread's scheduler at the end, because libfranka 0.21 sets FIFO 99 permanently on connection."""
+    """Restore this thread's scheduler at the end: on connection, libfranka 0.21 sets SCHED_FIFO 99 permanently."""
     thread = threading.get_native_id()  # the code after `yield` may run in another thread
     before = os.sched_getscheduler(thread), os.sched_getparam(thread)
     try:
@@ -85,8 +85,8 @@ class Timing:
     """Measured durations, s. In lock-step only the durations of r2s's own computations are meaningful.
 
     Attributes:
-        policy: time from a state to the policy's command, once per control step. driver: time of one driver cycle.
-        adapter: time of one update of the adapter; empty without an adapter. period: time between two commands.
+        policy: time from a state to the policy's command, once per control step. driver: computing time of one cycle.
+        adapter: computing time of one adapter update; empty without adapter. period: time between two commands.
         robot: time from one state of the arm to the next by the arm's clock; more than 1 ms means lost cycles.
         success: control_command_success_rate of each cycle, without the first 100 cycles of a motion.
     """
@@ -99,7 +99,7 @@ class Timing:
     success: list[float] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Reset the references for a new motion: times of the last cycle, and index of the first success rate."""
+        """Begin a new motion: forget the times of the last cycle, and store the index of the first success rate."""
         self._begun, self._last = len(self.success), (0.0, 0.0)
 
     def cycle(self, clock: tuple[float, float, float], state: ArmState, adapts: bool = False) -> None:
@@ -120,7 +120,7 @@ class Timing:
             self.success.append(float(rate))
 
     def refusal(self, arm: Arm) -> str | None:
-        """Return the reason to reject a real-time motion (too few commands came in time), or None to accept it."""
+        """Return a reason if a real-time arm got less than 99 % of a motion's commands in time, else None."""
         rates = self.success[self._begun :]
         if not getattr(arm, "realtime", False) or not rates or (rate := float(np.mean(rates))) >= LEAST_SUCCESS:
             return None

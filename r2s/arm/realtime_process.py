@@ -4,9 +4,9 @@ The arm's process continues whatever happens to the policy's process. If no new 
 deadline, the driver damps and stops the arm. A thread would not suffice, because a policy that holds Python's global
 lock blocks all threads. The processes share memory without a lock, because a killed process would not release a lock.
 
-The arm's process runs in its own session, so signals from the terminal do not reach it. Every motion, including the
-approach, is damped and ended if the policy's process receives a signal or ends, or if the arm's process receives a
-signal (r2s/arm/stop_request.py).
+The arm's process runs in its own session, so signals from the terminal do not reach it. If either process receives a
+signal, or the policy's process ends, the arm's process damps and ends every motion, including the motion to a start
+(r2s/arm/stop_request.py).
 """
 
 import multiprocessing
@@ -93,7 +93,7 @@ class Channel(NamedTuple):
 
 
 class RealtimeRunner:
-    """Runs episodes on an arm, with its driver, in a separate process; implements `r2s.tasks.rollout.Arms`.
+    """Runs episodes on an arm; a separate process drives the arm. Implements `r2s.tasks.rollout.Arms`.
 
     `with RealtimeRunner(...) as arms`: the arm's process opens the arm, and stops and closes the arm at the end.
 
@@ -101,7 +101,7 @@ class RealtimeRunner:
         robot: the arm's model. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
-        open_arm: picklable function that the arm's process calls; opens and returns the arm, or its context manager.
+        open_arm: picklable function that returns the opened arm, or a context manager; the arm's process calls it.
         robot: a model with the arm's number of joints. task, friction: see `PolicyRunner`.
         settings: further arguments of `PolicyRunner`; an adapter runs in the arm's process.
 
@@ -174,7 +174,7 @@ class RealtimeRunner:
     def step(self, command: np.ndarray) -> State:
         """Pass the command (1, c) to the arm's process, and return the state when the next control period begins.
 
-        A late command takes effect at once; control periods always begin at multiples of their length.
+        A late command takes effect at once, and does not shift the times at which later control periods begin.
         """
         self.timing.policy.append(time.perf_counter() - self._observed_at)
         self._channel.command.write(command[0])
@@ -222,7 +222,7 @@ class RealtimeRunner:
         return state
 
     def _receive(self, kind: str, timeout_s: float | None = None) -> Any:
-        """Return the next message `kind` from the arm's process; pass the arm's questions on to the operator."""
+        """Return the arm process's next message of the kind `kind`; pass the arm's questions on to the operator."""
         try:
             while True:
                 if timeout_s is not None and not self._line.poll(timeout_s):
@@ -297,7 +297,7 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
-    """Wait for the first command of an episode, then yield a new command or None for each cycle of the episode.
+    """Wait for an episode's first command; then yield, in each cycle, the new command, or None if there is none.
 
     Args:
         last: number of commands that the policy wrote in earlier episodes.

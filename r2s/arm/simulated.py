@@ -18,8 +18,8 @@ class SimulatedArm:
         declared_payload: payload that the arm's gravity compensation assumes.
 
     Args:
-        robot: the arm. dynamics: its true dynamics.
-        position_noise, velocity_noise: standard deviations of white noise on q, rad, and dq, rad/s.
+        robot: nominal model of the arm. dynamics: true dynamics of the arm.
+        position_noise, velocity_noise: rad, rad/s, standard deviations of the white noise on q and on dq.
         seed: random seed of the noise.
         payload: carried body and its attachment times. declared_payload: payload that gravity compensation assumes.
     """

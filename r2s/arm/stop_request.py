@@ -34,7 +34,7 @@ _request = _Request()
 
 
 def requested() -> str | None:
-    """Return the reason of the stop request in this process (the first reason if several), or None: no request."""
+    """Return the reason of the first stop request in this process, or None if no stop was requested."""
     if _request.reason is None:
         for source in _request.sources:
             if (reason := source()) is not None:
@@ -49,7 +49,7 @@ def begin_ending() -> None:
 
 
 def serve() -> None:
-    """Record that no motion runs after the request; from now on, a signal raises KeyboardInterrupt at once."""
+    """Record that no motion runs after the stop request; the next signal raises KeyboardInterrupt at once."""
     _request.ending, _request.served = False, True
 
 
@@ -69,12 +69,12 @@ def parent_ended(parent: int) -> Callable[[], str | None]:
 
 
 def pipeline() -> int | None:
-    """Return the pid in the environment variable PARENT, or None; it may be the pid of a grandparent process."""
+    """Return the pid (of a parent or grandparent process) in the environment variable PARENT, or None."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 
 def _follow(parent: int, over: threading.Event) -> None:
-    """Send SIGTERM to this process once its parent is not `parent`; check until the event `over` is set."""
+    """Send SIGTERM to this process when `parent` is no longer its parent; check until the event `over` is set."""
     while not over.wait(FOLLOW_S):
         if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -82,7 +82,7 @@ def _follow(parent: int, over: threading.Event) -> None:
 
 
 def _leave_terminal() -> None:
-    """Discard output to a terminal that has closed, because writing to it would end the run with an error."""
+    """Discard output to a terminal that has closed, because a write to a closed terminal raises an error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         if stat.S_ISCHR(os.fstat(stream).st_mode):
@@ -98,7 +98,8 @@ def handled_signals(
 
     If no motion has responded GRACE_S after the request, the main thread gets a KeyboardInterrupt, and this context
     raises `Stopped` with the signal's name. The context also raises `Stopped` if its block ends before a motion has
-    responded, as code after the block may move the arm. The context acts only in the main thread, as Python requires.
+    responded, because code after the block may move the arm. Outside the main thread, the context has no effect,
+    because Python handles signals only in the main thread.
 
     Args:
         forward: function that the signal handler calls with each signal's number.

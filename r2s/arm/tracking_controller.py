@@ -30,10 +30,10 @@ class TrackingController:
     """PD control with the nominal model's feedforward torque and an adaptive estimate of friction and offset.
 
     Each joint's estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max): offset, Coulomb and viscous friction.
-    theta adapts during the motion as in Slotine and Li (IJRR 6(3), 1987), within limits. Light wrist joints need
-    the estimate, because the PD torque of their small gains may not overcome friction. The PD gains are the nominal
-    mass matrix times BANDWIDTH^2 and times 2 BANDWIDTH. Such gains suit any arm; separate gains per joint would be
-    unstable on an arm with nearly parallel joint axes.
+    The controller adapts theta during the motion, within limits, as in Slotine and Li (IJRR 6(3), 1987). Light wrist
+    joints need the estimate, because their PD gains are too small to overcome friction. The PD gains are
+    BANDWIDTH^2 M and 2 BANDWIDTH M with the nominal mass matrix M. Gains proportional to M suit any arm; separate
+    gains per joint would be unstable on an arm with nearly parallel joint axes.
 
     Args:
         robot: the nominal model. excitation: the motion to track.
@@ -89,8 +89,8 @@ class TrackingController:
 class LoadedTrackingController(TrackingController):
     """Tracking controller for an arm with an undeclared payload of up to half the mass that the arm can carry.
 
-    The gains assume half of the largest undeclared payload, as otherwise the sag of a strong joint would swing the
-    wrist. Limits of deviation and correction are larger than in `TrackingController`.
+    The gains assume half of the largest undeclared payload; with smaller gains, a strong joint would sag and swing
+    the wrist. The limits of deviation, offset and correction are larger than in `TrackingController`.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):

@@ -23,7 +23,7 @@ RAMP_NM = 0.02  # Nm, largest torque of the ramps; it is so low that each ramp e
 
 
 class _Puppet:
-    """A mock `Arm` that ignores commands; it first rests and then moves each joint sinusoidally by `swing` rad."""
+    """A mock `Arm` that ignores commands; it first rests, then each joint oscillates with amplitude `swing`, rad."""
 
     def __init__(self, robot: Robot, swing: float):
         self.robot, self._swing, self._cycle = robot, swing, 0
@@ -51,7 +51,7 @@ class _Puppet:
 def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = None) -> None:
     """Run the code of the 1 kHz loop on a mock arm, so that numba compiles the code.
 
-    Call this function in the process that will drive the arm, before the arm is opened. The mock arm runs recordings
+    Call this function in the process that will drive the arm, before opening the arm. The mock arm runs recordings
     and ramps and, if there is a task, an episode with a copy of the adapter.
 
     Raises:

@@ -29,8 +29,8 @@ class ComputedTorque(Controller):
     """Computed-torque control along a task's trajectory; for the other attributes see `Controller`.
 
     Attributes:
-        model: the identified arm. ahead_s: s, look-ahead of the feedforward, the sum of half a control period, the
-            low-pass time constant, the identified delay and the identified lag.
+        model: the identified arm. ahead_s: s, look-ahead of the feedforward: control period / 2 + low-pass time
+            constant + identified delay + identified lag.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -38,13 +38,13 @@ class ComputedTorque(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Number of values in a setpoint: n each for feedforward, q_d and dq_d, and n * n for M."""
+        """Number of values in a setpoint, 3 n + n^2: n for each of feedforward, q_d and dq_d, and n^2 for M."""
         n = self.action_dim
         return n * (3 + n)
 
     @property
     def observes_torque(self) -> bool:
-        """Whether the policy observes the computed torque, to which its action is added."""
+        """Whether the policy observes the computed torque, to which the control law adds the policy's action."""
         return True
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def computed_torque(
 
     Args:
         robot, task: the arm and its task. dynamics: the identified arm.
-        residual: share of the task's torque limit that an action of 1 adds.
+        residual: torque that an action of 1 adds, as a fraction of the task's torque limit.
         bandwidth: natural frequency w of the critically damped feedback, rad/s; the loop has the bandwidth 2 w. None:
             w = BANDWIDTH_LATENCY / (2 latency), with latency = control period + low-pass time constant + LATENCY.
         feedback_hz: Hz, update rate of the feedback, at most 1000; None: the policy's rate.

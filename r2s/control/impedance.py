@@ -1,9 +1,9 @@
-"""`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs to a target; actions set target or stiffness.
+"""Impedance control (`joint_impedance`, `cartesian_impedance`, `hybrid`): actions set a spring's target or stiffness.
 
-r2s/physics/impedance_laws.py contains the control laws; this module computes their parameters from arm, task and
-model. Default values scale with the arm: a spring's largest force is a share of the force that the torque limit
-allows in all directions at home. A spring's stiffness is the largest force over a distance, or less if the loop's
-latency requires it.
+r2s/physics/impedance_laws.py contains the control laws; this module computes the laws' parameters from arm, task and
+model. Default values scale with the arm: a spring's largest force is CLIP times the force that the torque limit
+allows in all directions in the home posture. A spring's default stiffness is its largest force divided by a distance,
+or less if the control loop's latency requires a softer spring.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Size of a setpoint: target; if `hybrid`, normal (3), force, measured force, flag; if `slides`, pull (3)."""
+        """Number of values: target; if `hybrid`, normal (3), force, measured force, flag; if `slides`, pull (3)."""
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
@@ -93,12 +93,12 @@ def joint_impedance(
     damping: float = 1.0,
     tank: Sequence[float] = (1.0, 2.0),
 ) -> Impedance:
-    """Return the joint impedance controller about the task's trajectory or, if the task has none, about home.
+    """Return the controller with joint springs to the task's trajectory or, without a trajectory, to q_home.
 
     Args:
         robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
-        action: quantity that an action sets: target, stiffness or both.
-        torque_fraction: torque limit as a share of tau_max. displacement: rad, shift of the target by an action of 1.
+        action: what a policy's action sets: "target", "stiffness" or "both".
+        torque_fraction: torque limit / tau_max. displacement: rad, shift of the target by an action of 1.
         stiffness: Nm/rad, largest stiffness of each joint; None: CLIP * torque limit / displacement, or less if the
             spring's natural frequency would exceed `fastest_spring`. damping: damping ratio of all modes.
         softest: ratio of the smallest to the largest stiffness that an action sets.
@@ -162,7 +162,7 @@ def cartesian_impedance(
     integral_rate: float = 2.0,
     integral_max: float = 0.3,
 ) -> Impedance:
-    """Return the impedance controller of the end effector, or of the tool's tip, about the task's target.
+    """Return the controller with springs between the end effector, or the tool's tip, and the task's target.
 
     Args:
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
@@ -170,12 +170,14 @@ def cartesian_impedance(
         stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less if `fastest_spring` requires less.
         rotational_stiffness: Nm/rad, largest stiffness; 0: only the null-space springs act on the orientation.
         force_clip: N, largest spring force at the largest stiffness, at most the force F that the torque limit allows
-            in all directions in the home posture; None: CLIP F. moment_clip: Nm, the analogous moment limit.
-        null_stiffness: 1/rad, each joint's null-space stiffness towards home as a multiple of its torque limit.
-        hybrid: whether a force acts along a surface normal; the impedance acts along the surface. An action
-            that displaces the target against the normal adds a force stiffness * displacement. If `task.approaches`,
-            the target moves into the surface; the spring limits the force, so the tip is no faster than the target.
-        normal: (3,) out of the surface, base frame. force: N, desired push against `normal`. None: the task's values.
+            in all directions in the home posture; None: CLIP F. moment_clip: Nm, largest spring moment, with the same
+            bound and default as force_clip.
+        null_stiffness: 1/rad, null-space stiffness (Nm/rad, towards q_home) of each joint / the joint's torque limit.
+        hybrid: whether to control the force along a surface normal, and the impedance only along the surface. An
+            action that displaces the target against the normal adds a force stiffness * displacement. If
+            `task.approaches`, the target moves into the surface; its spring limits the force, so that the tip is no
+            faster than the target.
+        normal: (3,) out of the surface, base frame. force: N, push against `normal`. Both None: the task's values.
         integral_rate: 1/s, integral gain on a measured force error. integral_max: integral limit / force_clip.
 
     Raises:
@@ -233,7 +235,7 @@ def cartesian_impedance(
 
 
 def _check(action: str, softest: float, displacement: float) -> None:
-    """Raise UserError if a setting that joint and Cartesian impedance share is out of range."""
+    """Raise UserError if a setting of both joint and Cartesian impedance is out of range."""
     if action not in ACTIONS:
         raise UserError(f"action: '{action}'; {instead_of(action, ACTIONS)}")
     check_number("softest", softest, "(0, 1]")
@@ -264,7 +266,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Check and return a force or moment; None: CLIP times the largest that `limit` allows in all directions."""
+    """Check and return a force or moment; None: return CLIP times the most that `limit` allows in all directions."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most
@@ -291,7 +293,7 @@ def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _action(
     action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an action's scale and offset, and write the action's indices in a command to `parameters`."""
+    """Return an action's scale and offset; write to `parameters` at which indices a command contains the action."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
     parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]
@@ -303,7 +305,7 @@ def _action(
 def _parameters(
     robot: Robot, task: ControlledTask, dynamics: Dynamics, damping: float, tank: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the law's parameters (p,), except springs and action, and a view (n, ROW) of the joints' parameters."""
+    """Return the law's parameters (p,), springs and action not set, and a view (n, ROW) of the joints' parameters."""
     check_number("damping", damping, "(0, 10]")
     if np.shape(tank) != (2,) or not 0 <= tank[0] <= tank[1] < np.inf:
         raise UserError(f"tank: expected first level and size in J, 0 <= level <= size, got {tank}")

@@ -1,4 +1,4 @@
-"""`control=torque`: an action is a joint torque, a share of the task's torque limit."""
+"""`control=torque`: an action is a joint torque as a fraction of the task's torque limit."""
 
 import numpy as np
 

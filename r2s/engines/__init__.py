@@ -1,1 +1,1 @@
-"""Physics engines other than MuJoCo, the training engine, with a common interface."""
+"""Physics engines with a common interface, in addition to MuJoCo, which is the engine of the training."""

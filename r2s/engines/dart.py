@@ -1,7 +1,7 @@
 """Simulate an arm in DART with the settings of Gazebo's physics plugin, for Sim2Sim transfer and the rigid twin.
 
-DART has semi-implicit Euler steps, implicit joint damping, hard position limits and exact Coulomb friction. With
-the plugin's settings, DART agrees with the plugin to round-off, and with MuJoCo to 1e-15 rad over 0.1 s.
+DART has semi-implicit Euler steps, implicit joint damping, hard position limits and exact Coulomb friction. With the
+settings of Gazebo's plugin, DART agrees with the plugin to round-off, and with MuJoCo to 1e-15 rad over 0.1 s.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,8 @@ class DartEngine:
     Args:
         robot: the arm; its MJCF defines kinematics, inertia and limits.
         gravity: whether gravity acts; False: libfranka's convention, in which the arm compensates gravity.
-        masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the center of mass in link
-            axes, of the n moving links; None: the MJCF's values.
+        masses, coms, inertias: of the n moving links, in link axes: (n,) kg, (n, 3) m, (n, 3, 3) kg m^2 about the
+            center of mass; None: the MJCF's values.
         armature: (n,) kg m^2, armature of the joints; None: the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
@@ -105,7 +105,7 @@ class DartEngine:
         return joint, link
 
     def relink(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
-        """Set the last link's mass kg, center (3,) m and tensor (3, 3) kg m^2 about the center, during a motion."""
+        """During a motion, set the last link's mass kg, center (3,) m and tensor (3, 3) kg m^2 about the center."""
         at = self._last
         self._links.mass[at], self._links.com[at], self._links.inertia[at] = mass, com, inertia
         self._tip.setInertia(_dartpy().dynamics.Inertia(*self._links.lumped(at)))

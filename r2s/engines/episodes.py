@@ -1,4 +1,4 @@
-"""Run episodes one by one in an engine other than MuJoCo, with MuJoCo's goals, start states and random arms."""
+"""Run episodes one by one in an engine other than MuJoCo, with the same goals, start states and random arms."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ NONE = np.zeros(1, dtype=bool)  # no arm has stopped
 class EngineArms:
     """The arms of `count` successive episodes, with the interface `Arms` of `r2s.tasks.rollout.rollout`.
 
-    Episode e uses the e-th random draw of `r2s.learning.evaluate.make_evaluation` and the seed e for sensor noise.
+    Episode e uses the e-th random arm of `r2s.learning.evaluate.make_evaluation` and the seed e for sensor noise.
 
     Args:
         make: function that returns the engine of an arm with given dynamics.

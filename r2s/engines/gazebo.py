@@ -28,7 +28,8 @@ class GazeboEngine:
     """An arm in a Gazebo server.
 
     Each command acts for one step of 1 ms. The bindings can set a joint state only within an update, and this update
-    also integrates the state. So `reset` only stores q and dq, and the next `step` starts exactly from q and dq.
+    also integrates the state. Therefore `reset` only stores q and dq, and the next `step` starts exactly from q and
+    dq.
 
     Args:
         robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.
@@ -80,7 +81,7 @@ class GazeboEngine:
             raise self._error
 
     def _guarded(self, update):
-        """Return a callback that runs `update` and stores exceptions, which the bindings ignore, for `_run`."""
+        """Return a callback that runs `update` and stores its exceptions for `_run`; bindings ignore exceptions."""
 
         def call(info, ecm):
             try:

@@ -1,8 +1,9 @@
 """Simulate an arm in Gazebo Classic 11, in a separate process, with ODE (the default) or DART.
 
 `gzserver` loads the world plugin gazebo_classic.cc, which waits for a command over a pipe before each step. Debian 11
-and Ubuntu up to 22.04 have a package of Gazebo Classic. Elsewhere `gzserver` runs from the root directory that
-gazebo_classic_root.sh creates and that the environment variable R2S_GAZEBO_ROOT names. No display is needed.
+and Ubuntu up to 22.04 have a package of Gazebo Classic. On other systems, `gzserver` runs from the root directory
+that gazebo_classic_root.sh creates and that the environment variable R2S_GAZEBO_ROOT names. `gzserver` needs no
+display.
 """
 
 import os
@@ -139,7 +140,7 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 def gzserver() -> list[str]:
     """Return the command that starts `gzserver`.
 
-    The dynamic loader in R2S_GAZEBO_ROOT starts `gzserver` there, because chroot would need root rights.
+    If R2S_GAZEBO_ROOT is set, the dynamic loader in that folder starts `gzserver`, because chroot needs root rights.
 
     Raises:
         UserError: `gzserver` or the plugin is missing.

@@ -8,7 +8,7 @@ from r2s.errors import UserError
 
 
 def installed() -> Iterator[tuple[str, str, str]]:
-    """Yield (`simulator=` value, engine with version, "") if installed, else (value, "missing", how to install)."""
+    """Yield for each engine (`simulator=` value, name and version, ""), or (value, "missing", how to install it)."""
     engines: dict[str, Callable[[], str]] = {
         "mujoco": lambda: f"MuJoCo {_package('mujoco')}",
         "dart": lambda: f"DART {_package('dartpy')}",

@@ -56,7 +56,7 @@ def designed(
         design: criterion that scores motions.
         seconds: total duration of the segments. center: (n,) rad, center posture, see `fourier.checked_center`.
         seed: random seed. effort: number of motions tried per segment.
-        report: function that receives the completed share of the work.
+        report: function that receives the completed fraction (0 to 1) of the work.
 
     Raises:
         UserError: an argument is out of range, or r2s finds no safe series or no safe path between two segments.
@@ -110,7 +110,7 @@ def joined(parts: list[Excitation]) -> Excitation:
 
 
 def trajectory_yaml(motion: Excitation, joints: list[str], rate_hz: float) -> str:
-    """Return a motion as trajectory_msgs/msg/JointTrajectory (ROS 2), with samples at `rate_hz` and the last sample.
+    """Return YAML of a motion as trajectory_msgs/msg/JointTrajectory (ROS 2): samples at `rate_hz` and the last one.
 
     ROS 2 controllers interpolate by quintic polynomials between points with position, velocity and acceleration.
     """

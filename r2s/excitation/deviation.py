@@ -27,13 +27,13 @@ class DeviationLimits:
 
     @classmethod
     def along(cls, space: Space, motion: Motion, most: float) -> "DeviationLimits":
-        """Return limits along a motion; an interval has the stricter `deviation_weights` of its two end postures."""
+        """Return limits along a motion; each interval has the stricter weights of its first and its last posture."""
         rows = geometry_rows(motion)
         weights = deviation_weights(space, motion.q[rows], most)
         return cls(np.maximum(weights[:-1], weights[1:]), int(rows[1] - rows[0]))
 
     def share(self, k: int, deviation: np.ndarray) -> np.ndarray:
-        """Return shares (K, n): how much of each limit each joint uses in cycle k; a row's sum must be at most 1."""
+        """Return the fractions (K, n) of the limits that the joints use in cycle k; a row's sum must be at most 1."""
         return self.weights[min(k // self.every, len(self.weights) - 1)] * np.abs(deviation)
 
 

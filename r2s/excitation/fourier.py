@@ -1,9 +1,10 @@
 """Design an excitation: a finite Fourier series that the arm follows at several speeds.
 
 The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
-T-RA 13(5), 1997. A prior prevents unidentifiable quantities from dominating the determinant. Only motion at several
-speeds determines friction curves and delay, so the motion consists of rungs: sections of the series at 10 % to 100 %
-of full speed, separated by rests. Slow rungs also run backwards, so that joints reverse at low speed.
+T-RA 13(5), 1997. The matrix includes a prior, so that unidentifiable quantities do not dominate its determinant. Only
+motion at several speeds determines friction curves and delay, so the motion consists of rungs: sections of the series
+at 10 % to 100 % of full speed, separated by rests. Slow rungs also run backwards, so that joints reverse at low
+speed.
 """
 
 from collections.abc import Callable
@@ -113,7 +114,7 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions (x, a): coefficients x (2 H, n) of a series, a (n,) as shares of the largest amplitudes.
+    """Candidate motions (x, a): coefficients x (2 H, n) of a series, amplitudes a (n,) / largest amplitudes.
 
     A joint's limits determine the joint's largest amplitude; the coefficients x determine only the motion's shape.
 
@@ -134,7 +135,7 @@ class Candidates:
     def found(
         self, rng: np.random.Generator, effort: int, report: Callable[[float], None] = lambda share: None
     ) -> Excitation:
-        """Return the best motion of `effort` tries; call `report` with the completed share of the tries.
+        """Return the best motion of `effort` tries; call `report` with the completed fraction of the tries.
 
         Raises:
             UserError: no random series is safe.
@@ -171,7 +172,7 @@ class Candidates:
         effort: int,
         report: Callable[[float], None],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the best (x, a) of a local search from `best`; a step changes one joint's motion at random."""
+        """Return the best (x, a) of a local search from `best`; each step changes one joint's motion at random."""
         most, x, a = best
         steps = -(-effort // TRIES)
         for step in range(steps):
@@ -194,7 +195,7 @@ class Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the motion at 1 kHz, with amplitudes reduced until safe at GEOMETRY_HZ; None if one is too small."""
+        """Return the 1 kHz motion, reduced until it is safe at GEOMETRY_HZ; None if an amplitude gets too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))
@@ -255,9 +256,9 @@ class Candidates:
     def _shrink(
         self, a: np.ndarray, moved: Callable[[np.ndarray], Samples], by: float, margin: float, least: float
     ) -> np.ndarray | None:
-        """Return `a`, reduced until `_safety` is at least `margin`; None if an amplitude would be below `least`.
+        """Return amplitudes `a`, reduced until `_safety` is at least `margin`; None if one would be below `least`.
 
-        Each round reduces the amplitude of one joint: the one whose reduction most helps the least safe sample.
+        Each round reduces the amplitude of the joint whose reduction most improves the least safe sample.
         """
         a = a.copy()
         for every in (5, 1):  # first every fifth sample, so that most rounds are fast
@@ -277,7 +278,7 @@ class Candidates:
 
 
 def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return time t, the argument s of the series, its rate ds/dt and d2s/dt2 (T,).
+    """Return the time t, the argument s of the series, ds/dt and d2s/dt2, each (T,).
 
     Between segments of different rates, ds/dt changes along a raised cosine.
     """
@@ -302,7 +303,7 @@ def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def _rungs(duration: float) -> list[list[float]]:
-    """Return the paces of each rung; a ladder's rungs go from slow to fast, and slow rungs also run backwards."""
+    """Return each rung's paces (speed / full speed), which rise along a ladder; slow rungs also run backwards."""
     count = int(duration / RUNG_S + 0.5)
     if count < 2:
         return [list(SHORT)]

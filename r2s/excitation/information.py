@@ -23,11 +23,12 @@ def information(
 ) -> np.ndarray:
     """Return the information (B,), in nats, of motions (B, T, n) at times (T,) s.
 
-    Information is half of log(det posterior precision / det prior precision), with independent normal priors. The
+    Information is log(det posterior precision / det prior precision) / 2, with independent normal priors. The
     unknowns of each joint are offset, Coulomb friction (a tanh with unknown width and shift), viscous friction and
     drag. The unknowns of each link are mass and center of mass; gravity compensation does not remove their errors.
     For commanded torque (`gravity` false), each tensor's scale and one delay are also unknown; for link-side torque,
-    each tensor element. Samples at 10 Hz have a noise of 0.2 % of tau_max; a resting joint's samples are ignored.
+    each tensor element is unknown. Samples at 10 Hz have a noise of 0.2 % of tau_max; a resting joint's samples are
+    ignored.
     """
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)

@@ -124,7 +124,7 @@ def check_derivatives(robot: Robot, motion: Motion) -> None:
 
 
 def check_torque(robot: Robot, motion: Motion) -> None:
-    """Raise UserError if a motion's torque, with nominal model and `friction_margin`, exceeds 80 % of tau_max."""
+    """Raise UserError if a motion's nominal torque plus `friction_margin` exceeds 80 % of tau_max."""
     rows = geometry_rows(motion)
     share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
     bad = np.argwhere(~(share <= TORQUE_SHARE))
@@ -151,7 +151,8 @@ def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -
     """Return (|gravity| + |dynamics| + `friction_margin`) / tau_max (T, n) of the nominal model.
 
     The sum adds magnitudes as a reserve, because a real arm differs from the nominal model. Some arms' torque limits
-    include the torque of gravity compensation and some do not; the sum is an upper bound for both kinds.
+    include the torque of gravity compensation and some do not; the sum of magnitudes is an upper bound for both
+    kinds.
     """
     gravity = gravity_torque(robot, q)
     dynamics = nominal_torque(robot, q, dq, ddq) - gravity
@@ -177,8 +178,8 @@ class Space:
     an arm stops beyond its `DeviationLimits`, which depend on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, smallest required distances: end effector above z_min (only fourier.py uses it, as a scale;
-            `gaps` requires 0 m), then geoms above the table, then the two geoms of each pair.
+        clearance: (K,) m, smallest required distances: of the end effector above z_min (a scale for fourier.py;
+            `gaps` requires 0 m), of geoms above the table, and between the two geoms of each pair.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -289,7 +290,7 @@ class Space:
         return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
 
     def _apart(self) -> np.ndarray:
-        """Return the distance, m, between the geoms of each pair, approximate (by bounding spheres) above FAR_M."""
+        """Return the distances, m, between the geoms of each pair; above FAR_M, distances of the bounding spheres."""
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         radius, place = self.model.geom_rbound, self.data.geom_xpos
         out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]

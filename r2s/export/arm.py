@@ -1,4 +1,4 @@
-"""Check that a bundle was made for the arm that will run it. `r2s export` copies this module into the bundle."""
+"""Check that a bundle was made for the arm on which it will run. `r2s export` copies this module into the bundle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -59,7 +59,7 @@ def write_bundle(
     """Write the bundle of a finished training atomically into the new folder `to`.
 
     Args:
-        to: the new folder. source: run folder of the training. robot, task, policy, config: used in the training.
+        to: the new folder. source: run folder of the training. robot, task, policy, config: those of the training.
         dynamics: dynamics of one arm, at the center of the training's domain randomization.
         places: names of all simulators and arms; the model card lists where the policy has not run.
 
@@ -208,7 +208,7 @@ def one_file(control: Controller) -> str:
 def law_source(law: Any) -> tuple[str, str]:
     """Return the name and the source of a control law as plain Python, without decorators.
 
-    If the law uses functions or numbers of a module, the source is a function that defines these and returns the law.
+    If the law uses a module's functions or numbers, the source is a function that defines them and returns the law.
 
     Raises:
         UserError: the law uses a name that is neither a function, a number, a builtin nor NumPy's `np`.

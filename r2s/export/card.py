@@ -28,8 +28,9 @@ def card(
     """Return the sections of the model card, {title: items}.
 
     Args:
-        source: run folder of the training. config, meta: contents of config.yaml and meta.json in this folder.
-        contract: the bundle's contract. bundle: the bundle folder, unfinished. places: all simulators and arms.
+        source: run folder of the training. config, meta: contents of the training's config.yaml and meta.json.
+        contract: the bundle's contract. bundle: folder of the unfinished bundle. places: names of all simulators and
+            arms.
     """
     best, measures = json.loads((source / "summary.json").read_text())["best"], measures_of(source)
     rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
@@ -149,7 +150,7 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"simulator or arm (run)": measures} of a policy's done or stopped transfers that have `measure`."""
+    """Return {"simulator or arm (run)": measures} of a policy's transfers, done or stopped, that have `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:

@@ -64,7 +64,8 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
     """Return a policy's contract without the keys files, versions, trained and seal, which `write_bundle` adds.
 
     Args:
-        robot, task: those of the training. friction: (n,) Nm, Coulomb friction, see `safety_filter.filter_torque`.
+        robot, task: robot and task of the training. friction: (n,) Nm, Coulomb friction, see
+            `safety_filter.filter_torque`.
         rotors: armatures (n,) kg m^2 for the safety filter; None: the armatures of `robot`.
 
     Raises:
@@ -123,7 +124,7 @@ def kind_of(task: Task) -> str:
 
 
 def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
-    """Return the position (3,) m of the shoulder: joint 2, or a single joint; the region of goals surrounds it."""
+    """Return the position (3,) m of the shoulder (joint 2, or the only joint); the goals lie around the shoulder."""
     arm = Model(model)
     arm.place(robot.q_home)
     return listed(arm.origin[min(1, robot.n - 1)])
@@ -222,14 +223,14 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
 
 
 def width(of: str, joints: int, preview: int) -> int:
-    """Return the number of values in an observation term whose values come from the source named `of`."""
+    """Return the length of an observation term that shows the signal `of` ("q", "ee", ...)."""
     own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
     own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
     return {**own, "above_target": 1}.get(of, joints)
 
 
 def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the entry `goal` for point goals: their format, and the region from which the training drew them."""
+    """Return the entry `goal` for point goals: their format, and the region of the training's goals."""
     out: dict[str, Any] = {"kind": "point", "shape": [3], "unit": "m", "frame": "the arm's base"}
     if hasattr(task, "region"):
         low, high = task.region(robot)
@@ -260,7 +261,7 @@ def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, A
 
 
 def start(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the entry `start`: the start posture, the allowed distance from this posture, the allowed speed."""
+    """Return the entry `start`: the start posture, and the allowed distance and speed at the start of a motion."""
     rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
         return {"words": FIRST_ROW} | rest

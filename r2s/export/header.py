@@ -63,7 +63,7 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
 
 
 def _push(push: Mapping[str, Any] | None) -> list[str]:
-    """Return the C++ constants of push limit (all 0 without push limit) and of a Franka arm's reflex thresholds."""
+    """Return the C++ constants of the push limit (0 if there is none) and of a Franka arm's reflex thresholds."""
     own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
         PUSH_VECTOR, [0.0] * 3
     )

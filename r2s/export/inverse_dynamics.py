@@ -45,7 +45,8 @@ class InverseDynamics:
     def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
         """Return the setpoints (rows, 3 n + n n) for the first `rows` rows of a joint motion (T, n) sampled at `hz`.
 
-        A setpoint contains feedforward, Nm, q_d, dq_d and the flattened mass matrix. Computing one takes over 1 ms.
+        A setpoint contains feedforward, Nm, q_d, dq_d and the flattened mass matrix. Computing a setpoint takes over
+        1 ms.
         """
         n = q.shape[1]
         out = np.empty((rows, 3 * n + n * n))
@@ -61,7 +62,7 @@ class InverseDynamics:
         return out
 
     def equations(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mass matrix (n, n) kg m^2 and torque (n,) Nm, minus the arm's own gravity compensation."""
+        """Return the mass matrix (n, n) kg m^2, and the torque (n,) Nm minus the arm's own gravity compensation."""
         self._own.place(q)
         self._nominal.place(q)
         mass, bias = self._own.equations(dq)

@@ -70,7 +70,8 @@ class Model:
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
 
-        Newton-Euler recursion yields the torque. The mass matrix is the armatures plus sum_k J_k^T (m, I)_k J_k.
+        Newton-Euler recursion yields the torque. The mass matrix is diag(armatures) + sum_k J_k^T M_k J_k, where M_k
+        contains mass and tensor of link k.
         """
         R, p, z, n = self.frame, self.origin, self.axis, self.n
         spin = z * dq[:, None]
@@ -228,7 +229,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the allowed torque (n,) Nm nearest to `effort` plus holding torque, and whether a limit acts."""
+        """Return the allowed torque (n,) Nm nearest to `effort` + holding torque, and whether a limit changes it."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -249,10 +250,10 @@ class Driver:
     def _bounded(
         self, tau: np.ndarray, dq: np.ndarray, ddq: np.ndarray, bounds: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to tau with acceleration in `bounds`, and whether it differs from tau.
+        """Return the torque (n,) Nm nearest to tau that keeps ddq in `bounds`, and whether it differs from tau.
 
-        ddq: (n,) rad/s^2, acceleration from tau. bounds: inverse mass matrix, then lowest and highest ddq (n,), which
-        are widened by the friction that light joints certainly have.
+        ddq: (n,) rad/s^2, acceleration that tau causes. bounds: inverse mass matrix, lowest and highest ddq (n,). The
+        friction that light joints certainly have widens the range of ddq.
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():
@@ -271,7 +272,7 @@ class Driver:
         return self._allowed(self._j["q_high"] - q if up else q - self._j["q_low"])
 
     def _allowed(self, way: np.ndarray) -> np.ndarray:
-        """Return the speeds (n,) rad/s that are allowed at the distances `way` (n,) rad from the position limits."""
+        """Return the allowed speeds (n,) rad/s of joints at distances `way` (n,) rad from their position limits."""
         j, c = self._j, self._number
         speed = np.minimum(self._share * j["most"], c["approach"] * way)
         slows = (way > 0.0) & np.isfinite(j["slowing"])

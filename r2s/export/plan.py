@@ -66,8 +66,9 @@ class Follower:
         After the last step the reference remains at the end of the path.
 
         Args:
-            step: number of the control step, from 0. seen: measured q, dq (n,) rad, rad/s; end effector `ee` (3,) m.
-            limited: share of the last control period in which the safety filter changed the command.
+            step: number of the control step, from 0. seen: measured q, dq (n,) rad, rad/s; end-effector position `ee`
+                (3,) m.
+            limited: fraction of the last control period in which the safety filter changed the command.
         """
         row, at, plan = min(step, self._steps), self._at, self._plan
         now, q, dq, ee = plan[row], seen["q"], seen["dq"], seen["ee"]

@@ -83,9 +83,9 @@ class PushLimit:
         return most - own
 
     def limit(self, effort: np.ndarray, last: np.ndarray, bounded: Callable[..., Any]) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within all bounds nearest to `effort` (n,) Nm, and whether the two differ.
+        """Return the torque (n,) Nm within all bounds that is nearest to `effort`, and whether the two differ.
 
-        bounded: function of torque and bias torque in contact, (n,) Nm each; limits the torque to the joint bounds.
+        bounded: function (torque, bias torque in contact), (n,) Nm each, that limits the torque to the joint bounds.
         """
         bound, p, row = self._bound(last), self._p, self._row
         bias = self._bias + max(self._resisted, 0.0) * row
@@ -111,7 +111,7 @@ class PushLimit:
         return out, True
 
     def stop(self, held: np.ndarray, cycles: int) -> tuple[np.ndarray, float]:
-        """Return a stop's target torque (n,) Nm, and the share of the allowed joint speeds that the stop needs.
+        """Return a stop's target torque (n,) Nm, and the fraction of the allowed joint speeds that the stop needs.
 
         Args:
             held: (n,) Nm, torque that the driver adds to the target torque. cycles: cycles since the stop began.

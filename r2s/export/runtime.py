@@ -139,7 +139,7 @@ class Runtime:
 
     @property
     def done(self) -> bool:
-        """Whether the driver has brought the arm to rest. The reason is `driver.stopping`."""
+        """Whether a stop of the arm has ended, see `Driver.done`; `driver.stopping` is the reason for the stop."""
         return self.driver.done
 
     def __call__(
@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Raise BundleError if start or first goal is outside the training's region; stop if a later goal is."""
+        """Raise BundleError if start or first goal is outside the trained region; stop the arm if a later goal is."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)
@@ -233,8 +233,8 @@ class Runtime:
     def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the plan of the joint motion q, dq, ddq (rows, n) rad, rad/s, rad/s^2; call only between motions.
 
-        The time between two rows is one control step. The motion must begin and end at rest. The path is the
-        first `steps` + 1 rows; further rows follow, one for each row that the policy previews.
+        The time between two rows is one control step. The motion must begin and end at rest. The first `steps` + 1
+        rows are the path; one more row follows for each row that the policy previews.
 
         Raises:
             BundleError: the policy's goals are points or plans on a surface, or the motion has a wrong shape.

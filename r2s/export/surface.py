@@ -94,7 +94,7 @@ class SurfaceFollower:
 
         Args:
             step: number of the control step, from 0. seen: measured q, dq (n,) rad, rad/s, tau_J_d (n,) Nm.
-            limited: share of the last control period in which the safety filter changed the command.
+            limited: fraction of the last control period in which the safety filter changed the command.
         """
         now = self._plan[min(step, self._steps)]
         point, normal, depth, force, velocity = (now[self._at[k]] for k in WIDTHS)

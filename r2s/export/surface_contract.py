@@ -1,4 +1,4 @@
-"""Make the contract's entries for policies that press or wipe: format of plans on a surface, push limit."""
+"""Make the contract's entries for policies that press or wipe: format of plans on a surface, and push limit."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from r2s.tasks.surface_task import REGULAR, START, SurfaceTask
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
-    """Return the plans (k, steps + 1, columns) for the rows of `goals`, k random goals of the task."""
+    """Return plans (k, steps + 1, columns), one for each of k random goals of the task, the rows of `goals`."""
     control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
     none, starts, out = np.zeros((len(t), 3)), np.zeros((len(t), robot.n)), []
     for goal in goals:

@@ -1,8 +1,8 @@
 """Base parameters: the fewest combinations of inertial parameters on which joint torque depends.
 
-Torque is linear in ten standard parameters per link and one per rotor, but many parameters act only in combination.
-A QR decomposition without pivoting, of the regressor at random states, selects the first independent columns (one per
-parameter); the dependent columns are regrouped with these (Gautier, J. Robotic Systems 8(4), 1991).
+Torque is linear in ten standard parameters per link and one per rotor, but many parameters act only in combination. A
+QR decomposition (without pivoting) of the regressor at random states selects independent columns, one per base
+parameter. A dependent column is a combination of independent columns (Gautier, J. Robotic Systems 8(4), 1991).
 """
 
 from typing import NamedTuple
@@ -22,9 +22,9 @@ DEPENDENT, NONE = 1e-9, 1e-9  # relative size below which a column is dependent,
 
 
 class BaseParameters(NamedTuple):
-    """Base parameters: `matrix` (K, 10 n + n) maps standard parameters of links and rotors to K base parameters.
+    """Base parameters: `matrix` (K, 10 n + n) maps 10 n link and n rotor parameters to K base parameters.
 
-    names, units, combinations: (K,), first term, unit and formula, such as "zz[2] + 0.1 my[3]", of each parameter.
+    names, units, combinations: first term, unit and formula (such as "zz[2] + 0.1 my[3]") of each base parameter.
     """
 
     names: list[str]
@@ -43,7 +43,7 @@ class BaseParameters(NamedTuple):
 def base_parameters(robot: Robot, rotors: bool) -> BaseParameters:
     """Return the base parameters of an arm.
 
-    rotors: whether the measured torque includes the torque on the rotors; link-side torque excludes this torque.
+    rotors: whether the measured torque includes the torque that accelerates the rotors; link-side torque does not.
     """
     n, rng = robot.n, np.random.default_rng(0)
     q = rng.uniform(*robot.q_range, (40 * n, n))
@@ -77,7 +77,7 @@ def base_table(space: ParameterSpace, found: ParameterEstimate, rotors: bool) ->
 
 
 def _combination(row: np.ndarray, names: list[str], first: int) -> str:
-    """Return a row of the matrix as text such as "zz[2] + 0.1 my[3]", with the parameter number `first` in front."""
+    """Return a row of the matrix as text such as "zz[2] + 0.1 my[3]", beginning with the parameter number `first`."""
     others = [k for k in np.flatnonzero(row).tolist() if k != first]
     parts = [f"{'-' if row[k] < 0 else '+'} {_factor(abs(row[k]))}{names[k]}" for k in others]
     return " ".join([names[first], *parts])

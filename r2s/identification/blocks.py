@@ -1,8 +1,8 @@
-"""Divide a recording into blocks with independent errors, which are the clusters in the posterior's covariance.
+"""Divide a recording into blocks whose errors are independent, for the posterior's cluster-robust covariance.
 
-Unlike noise, model error is correlated in time: torque ripple at low speed lasts seconds. So each block spans several
-correlation times of the residual. Model error also recurs if the motion is repeated. If residuals recur, repetitions
-belong to the same block.
+Unlike noise, model error is correlated in time: torque ripple at low speed lasts seconds. Each block lasts several
+correlation times of the residual. Model error also recurs if the motion is repeated. If the residual recurs with the
+motion, a block contains all repetitions of a phase.
 """
 
 import numpy as np
@@ -26,8 +26,9 @@ def blocks_of(
     """Return the number (T,) of the block to which each row belongs, from 0 to B - 1.
 
     Args:
-        t: (T,) s, rising within a trajectory. q: (T, n) rad, joint angles. period: s, period of the motion, or None.
-        residual: (T, n), residual of a fit; None: blocks last at least `shortest_s` and join no repetitions.
+        t: (T,) s, times, increasing within a trajectory. q: (T, n) rad, joint angles. period: s, period of the
+            motion, or None.
+        residual: (T, n), residual of a fit; None: blocks last at least `shortest_s` and differ between repetitions.
     """
     run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of the trajectory; the clock restarts in each
     steps = np.diff(t)[np.diff(run) == 0]
@@ -47,7 +48,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return block numbers (T,) that are the same in all repetitions `visit` (T,) unless q (T, n) rad differs."""
+    """Return block numbers (T,) that are equal in all repetitions (`visit`, (T,)) with similar q (T, n) rad."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -59,7 +60,7 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
     """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,) s.
 
-    This time is the integral of the squared autocorrelation, an upper bound also for residual times Jacobian.
+    The correlation time is the integral of the squared autocorrelation, also a bound for residual times Jacobian.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))
@@ -75,7 +76,7 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether residuals (T, n) at equal phases `at` (T,) are similar in different repetitions `visit` (T,)."""
+    """Return whether residuals (T, n) at equal phases (`at`, (T,)) are similar in all repetitions (`visit`, (T,))."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]

@@ -39,7 +39,7 @@ def check_rate(cutoff_hz: float, recording: Recording) -> None:
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if the recording has a wrong number of joints, exceeds position limits or has little motion."""
+    """Raise UserError for a wrong number of joints, exceeded position limits, or a motion too small or too short."""
     _check_joints(robot, recording, "the recording")
     moved = np.ptp(recording.q, axis=0)
     if moved.max() < MOVED or recording.duration < LEAST_S:

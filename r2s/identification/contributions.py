@@ -1,8 +1,8 @@
 """Assess what each of several recordings adds to an identification, and whether one contradicts the others.
 
-Two further fits assess each recording: a fit without the recording, and a fit to the recording alone. Both fits
-start from the fit to all recordings, so that few least-squares steps on torque suffice. The residual of a fit to one
-recording alone sets the recording's weights, because contradicting recordings increase the residual of a common fit.
+Two further fits assess each recording: a fit without the recording, and a fit to the recording alone. Every further
+fit starts from the fit to all recordings, so that few least-squares steps on torque suffice. The residual of a fit to
+one recording alone sets its weights, because contradicting recordings increase the residual of a common fit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,9 +36,10 @@ class Contribution:
         label, torque, seconds: name, kind of torque and length of the recording. use: "training" or "validation".
         rmse: (n,) Nm, error of the fit to all recordings.
         left_out: (n,) Nm, error of a fit without this recording; None for a validation recording.
-        narrower: (P,), ratio of 95 % interval widths without and with this recording; None for validation.
+        narrower: (P,), width of the 95 % intervals without this recording / width with it; None for validation.
         alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio of sums of squares, see
-            CONTRADICTS; 1 for one recording. body_kg: mass on the last link that explains the contradiction, or nan.
+            CONTRADICTS; 1 if there is only one recording. body_kg: mass on the last link that explains the
+            contradiction, or nan.
     """
 
     label: str
@@ -110,7 +111,7 @@ def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the fit (P,) to the residuals in `parts` from start u (P,). prior: residual (B,) at u and Jacobian."""
+    """Return the fit (P,) to the residuals in `parts` from start u (P,). prior: prior rows (B,) at u, Jacobian."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:

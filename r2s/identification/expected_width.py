@@ -1,8 +1,9 @@
 """Predict the widths of the 95 % intervals of an identification before it runs.
 
 A few least-squares steps on torque, with all model terms, estimate the parameters and the noise. `posterior`
-linearizes the model at these estimates and computes the widths. The prediction omits slow parts of an identification,
-namely the choice of friction family and terms, iteration to convergence, replays and breakaway torques.
+linearizes the model at the estimated parameters and computes the widths. The prediction omits slow parts of an
+identification, namely the choice of friction family and terms, iteration to convergence, replays and breakaway
+torques.
 """
 
 from dataclasses import dataclass
@@ -32,10 +33,10 @@ class ExpectedWidths:
     """Expected widths of the 95 % intervals of P parameters.
 
     Attributes:
-        space: parameter space. width: (P,), expected widths, SI units. share: (P,), posterior sigma over prior sigma.
+        space: parameter space. width: (P,), expected widths, SI units. share: (P,), posterior / prior sigma.
         identifiable: (P,), whether the data will determine each parameter, by the rule of `conclude`.
-        late: s, a time shift and its standard deviation. For commanded torque, the motion is later than the torque
-            by this shift; for measured or motor torque, the torque is later than the motion.
+        late: s, time shift between torque and motion, and the shift's standard deviation. For commanded torque, the
+            shift is the delay of motion behind torque; for measured or motor torque, of torque behind motion.
     """
 
     space: ParameterSpace
@@ -46,7 +47,7 @@ class ExpectedWidths:
 
 
 def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> Problem:
-    """Return the torque problem that an identification with these settings solves, with all terms of the settings.
+    """Return the torque problem that an identification with `settings` solves, with all model terms in `settings`.
 
     If the setting `family` is "auto", use the friction family of the nominal arm.
     """
@@ -58,7 +59,7 @@ def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settin
 
 
 def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> ExpectedWidths:
-    """Return the expected widths of an identification from this recording.
+    """Return the expected interval widths of an identification from `recording`.
 
     Raises:
         UserError: each trajectory in the recording is too short, or a setting does not fit the arm.
@@ -84,7 +85,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
 
 
 def _lateness(problem: Problem, u: np.ndarray) -> tuple[float, float]:
-    """Return the time shift, s, between torque and motion that the parameters do not explain, and its sigma, s."""
+    """Return the time shift, s, between torque and motion that no parameter explains, and the shift's sigma, s."""
     data = problem.torque_data
     r, j = data(problem.space.from_unit(u[None]))[0], data.jacobian(u)
     change = (data.motion.command(0.0, 0.0) - data.motion.command(SIM_DT, 0.0)) / SIM_DT

@@ -230,12 +230,13 @@ def prune_terms(s: State) -> State:
 
 
 def draw_full_model(s: State) -> dict[str, np.ndarray]:
-    """Return posterior draws (S, P) of the kept values on the unit cube, from a fit with all terms and wide priors.
+    """Return unit-cube posterior draws (S, P) of the kept values, from a fit with all terms and wide priors.
 
     Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
-    compensates for a removed one, for example a payload for the error of a link's mass. The main fit's priors, chosen
-    for prediction, narrow intervals further if the scatter among arms is wider. For the result's intervals, draws of
-    the full and the selected model have equal weight (Hoeting et al., Statistical Science 14(4), 1999).
+    compensates for a removed one, for example a payload for the error of a link's mass. The main fit's priors are
+    chosen for prediction; where they are narrower than the scatter among arms, they narrow intervals further. For the
+    result's intervals, draws of the full and the selected model have equal weight (Hoeting et al., Statistical
+    Science 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
     u, problem = fit_torque(full.problem.with_usual_prior())
@@ -244,7 +245,7 @@ def draw_full_model(s: State) -> dict[str, np.ndarray]:
 
 
 def formulate(s: State) -> State:
-    """Set up the parameter space, the residuals and the problem."""
+    """Set up the parameter space, the residuals and the least-squares problem."""
     how, memory = s.settings, s.nominal.family.has_memory
     settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # DELAY stays 0, see `settle_lateness`
     space = search_space(s.robot, s.nominal, how.bounds, [*s.terms, *settled], s.recording, how.stated)

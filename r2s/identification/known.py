@@ -1,9 +1,9 @@
 """Represent prior knowledge of an arm's parameters as a normal distribution of named values.
 
-Prior knowledge comes from an earlier identification, of any kind of torque, or from the user (stated.py). Between two
-dates, friction and offsets x drift by w ~ N(0, drift^2), so x_now = x_then + w. The prior covariance is the
-earlier posterior covariance plus diag(drift^2), as in the prediction step of a Kalman filter (Kalman 1960). From the
-recordings of both dates, r2s also estimates w.
+Prior knowledge comes from an earlier identification, with any kind of torque, or from the user (stated.py). After the
+earlier identification, friction and offsets x drift by w ~ N(0, drift^2): x_now = x_then + w. The prior covariance is
+the earlier posterior covariance plus diag(drift^2), as in the prediction step of a Kalman filter (Kalman 1960). r2s
+also estimates the drift w, from the earlier and the present recording.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -60,7 +60,7 @@ class Known:
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return the joint distribution with the independent prior `other`; for common values, use only `other`."""
+        """Return the joint distribution with the independent prior `other`, which alone describes common values."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)
@@ -111,14 +111,15 @@ def coordinates(names: Sequence[str], x: np.ndarray) -> np.ndarray:
 
 
 def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.ndarray) -> pd.DataFrame:
-    """Return a table of values that may drift: then, now, and the difference with its 95 % interval, in SI units.
+    """Return a table of values that may drift: earlier value, present value, difference with 95 % interval, SI units.
 
-    The difference is the drift w in x_now = x_then + w, estimated from the data of both dates. With x_then ~ N(m, P),
-    Q = diag(drift^2), S = P + Q, and x_now ~ N(x, V) after the new data, the Rauch-Tung-Striebel smoother (AIAA
-    Journal 3(8), 1965) yields w ~ N(G (x - m), G V G^T + P - P S^-1 P), where G = Q S^-1.
+    The difference is the drift w in x_now = x_then + w, estimated from the earlier and the present recording. With
+    x_then ~ N(m, P), Q = diag(drift^2), S = P + Q, and x_now ~ N(x, V) after the new data, the Rauch-Tung-Striebel
+    smoother (AIAA Journal 3(8), 1965) yields w ~ N(G (x - m), G V G^T + P - P S^-1 P), where G = Q S^-1.
 
     Args:
-        known: prior from the earlier date. space, x, samples: parameters, values (P,) and posterior draws (S, P) now.
+        known: prior from the earlier identification. space, x, samples: parameters, values (P,) and posterior draws
+            (S, P) of the present identification.
     """
     known = known.where(lambda name: name in space.names and name not in space.fixed)
     at = [space.names.index(name) for name in known.names]

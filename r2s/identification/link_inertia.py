@@ -15,10 +15,11 @@ PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z")
 
 
 def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return [[Sigma, h], [h^T, m]] (..., 4, 4) about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
+    """Return the pseudo-inertia [[Sigma, h], [h^T, m]] (..., 4, 4) of links about their origins.
 
-    Sigma, h and m are second moment, first moment and mass. The second moment about the center of mass is positive
-    definite if principal moments are positive and satisfy the triangle inequality, else its eigenvalues are raised.
+    Sigma, h and m are second moment, first moment and mass (Wensing, Kim and Slotine, RA-L 3(1), 2018). The second
+    moment about the center of mass is positive definite if principal moments are positive and satisfy the triangle
+    inequality; otherwise the function raises its eigenvalues.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)
@@ -71,7 +72,8 @@ def add_point_mass(
 
     Args:
         mass, com, inertia: mass, center of mass and inertia tensor of each link without the point mass.
-        payload: (...) kg, the point mass, at least 0. place: (..., 3) m, its place in the last link's frame.
+        payload: (...) kg, the point mass, at least 0. place: (..., 3) m, the point mass's position in the last link's
+            frame.
     """
     lead = np.broadcast_shapes(mass.shape[:-1], np.shape(payload))
     out = [np.broadcast_to(a, (*lead, *a.shape[k:])).copy() for a, k in ((mass, -1), (com, -2), (inertia, -3))]

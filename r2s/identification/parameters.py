@@ -1,9 +1,9 @@
 """The parameter vector of an identification: blocks, bounds, map to the unit cube, and conversion to dynamics.
 
-A block contains one parameter: a value per joint or link (a friction coefficient, offset, inertia), or one value for
-the whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are mapped
-by their logarithm. Link inertia has two parametrizations: `inertia_scale` is one factor per link (paper, Table III),
-and `link_...` are the ten log-Cholesky parameters of a link (link_inertia.py).
+A block contains the values of one parameter: one per joint or link (friction coefficient, offset, inertia), or one
+for the whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are
+mapped by their logarithm. Link inertia has two parametrizations: `inertia_scale` is one factor per link (paper, Table
+III), and `link_...` are the ten log-Cholesky parameters of a link (link_inertia.py).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,12 +44,12 @@ def logarithmic() -> set[str]:
 
 
 def torque_like() -> set[str]:
-    """Return the parameters per joint that grow with the size of an arm: those in Nm and Nm s/rad, and armature."""
+    """Return the joint parameters that grow with an arm's size: parameters in Nm or Nm s/rad, and armature."""
     return {name for name, unit in units().items() if unit.startswith("Nm")} | {"armature"}
 
 
 def sizes(largest: np.ndarray) -> dict[str, Any]:
-    """Return the scales of torque-like parameters, `largest` (n,) Nm, and of the payload mass, max(largest)."""
+    """Return {parameter: scale}: `largest` (n,) Nm for torque-like parameters, max(largest) for the payload mass."""
     return dict.fromkeys(torque_like(), largest) | {PAYLOAD[0]: largest.max()}
 
 
@@ -62,10 +62,10 @@ class ParameterSpace:
         n: number of joints.
         lower, upper: (P,) bounds in SI units.
         nominal: dynamics at which a search starts; parameters that are not in x have their nominal value.
-        robot: the arm; inertia blocks are relative to its links.
+        robot: the arm; link inertia parameters are relative to the arm's links.
         breakaway_command: (n, 2) Nm, commands in ramps at which resting joints broke away. A breakaway torque is a
             breakaway command plus the offset, or nominal if the command is unknown (NaN or None).
-        fixed: names of values that the user fixed; their bounds are too narrow for a search (stated.py).
+        fixed: names of values that the user fixed, with bounds so narrow that no search changes them (stated.py).
     """
 
     blocks: tuple[str, ...]
@@ -111,7 +111,7 @@ class ParameterSpace:
         return np.arange(at, at + self.size(name))
 
     def expand(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
-        """Return the vector (P,) of `values`, {block: one value or (n,)}, and of `default` for all other blocks."""
+        """Return a vector (P,) with `values`, {block: one value or (n,)}, and with `default` in all other blocks."""
         return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
     @cached_property

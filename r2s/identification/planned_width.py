@@ -1,6 +1,7 @@
 """Predict the 95 % interval widths of an identification from a planned motion, to choose the motion.
 
-The prediction uses the parameters, bounds and prior of the identification, and linearizes at the nominal arm.
+The prediction uses the parameters, bounds and prior of the identification, and linearizes the model of the nominal
+arm.
 """
 
 from collections.abc import Sequence
@@ -28,13 +29,13 @@ class PlannedWidths:
     """Expected 95 % interval widths from planned motions.
 
     Attributes:
-        space: the parameters to identify. information: (P, P), information of all added motions on the unit cube.
+        space: the parameters to identify. information: (P, P), sum over all added motions, on the unit cube.
 
     Args:
         robot, nominal: the arm, and the dynamics at which the identification will start.
         settings: settings of the identification; family=auto stands for the nominal arm's friction family.
         torque: kind of torque that will be recorded.
-        noise: torque noise, standard deviation of independent samples at COARSE_HZ, relative to tau_max.
+        noise: standard deviation of torque noise at COARSE_HZ (independent samples), relative to tau_max.
         chosen: names of the parameters, such as "offset" or "offset[3]", that `score` considers; if empty, all.
 
     Raises:
@@ -99,7 +100,7 @@ class PlannedWidths:
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Score each of B candidates for the next motion by minus the mean log width (B,) of the chosen values."""
+        """Score each of B candidates for the next motion: minus the mean log interval width (B,) of chosen values."""
         some = slice(None, None, 1 + len(t) // MOST_ROWS)
         information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
         return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)

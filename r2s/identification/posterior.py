@@ -38,13 +38,14 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     """Return draws about the fit u (P,) from a normal distribution with a cluster-robust covariance.
 
     Because errors within a block are correlated, the covariance is H^-1 (sum of s s^T + prior) H^-1, with the total
-    information H and a score s per block. The score is the block's part of the gradient (White, Econometrica 48(4),
-    1980; clusters: Liang and Zeger, Biometrika 73(1), 1986) minus the mean score, which is not 0 at a bound. If there
-    are few blocks, the fit makes each block's residual too small; a factor from the block's share of the information
-    corrects the score (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). For few blocks, Student's t widens
-    the draws. If one block alone determines a direction, the scatter of the scores underestimates the variance in
-    this direction, so the covariance is at least that for independent rows. A bootstrap over blocks would yield
-    unrealistic tails if few blocks determine a value, because many bootstrap samples would lack these blocks.
+    information H and a score s per block. A block's score is its part of the gradient (White, Econometrica 48(4),
+    1980; clusters: Liang and Zeger, Biometrika 73(1), 1986) minus the blocks' mean, which is not 0 at a bound. If
+    there are few blocks, the fit makes each block's residual too small; a factor from the block's share of the
+    information corrects the score (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). For few blocks,
+    Student's t widens the draws. If one block alone determines a direction, the scatter of the scores underestimates
+    the variance in this direction, so the covariance is at least that for independent rows. A bootstrap over blocks
+    would yield unrealistic tails if few blocks determine a value, because many bootstrap samples would lack these
+    blocks.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -86,7 +87,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _resolved(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return scale (P,), eigenvalues (P,) and axes (P, P) of matrix / scale / scale^T, with a unit diagonal.
+    """Return scale (P,), eigenvalues (P,) and axes (P, P) of matrix / (scale scale^T), which has a unit diagonal.
 
     Eigenvalues below the rounding error of the largest one are replaced by this error.
     """
@@ -96,9 +97,9 @@ def _resolved(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return K blocks' information (K, P, P) and score (K, P), the prior's information (P, P), and the data's RMS.
+    """Return information (K, P, P) and score (K, P) of K blocks of data, the prior's information (P, P), and an RMS.
 
-    The RMS of the data rows is in standard deviations; the function replaces an RMS below 1 by 1.
+    The RMS of the data's residuals is in standard deviations; the function replaces an RMS below 1 by 1.
     """
     clusters, p = problem.clusters, len(u)
     count, square, seen, row = int(clusters.max()) + 1, 0.0, 0, 0
@@ -120,7 +121,7 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
     """Return a square root (P, P) of a covariance: in each direction the larger of root root^T and least least^T.
 
-    A comparison per value would fail, because data can determine the sum of two values far better than each value.
+    Comparing single values would fail, because data can determine the sum of two values far better than each value.
     """
     axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
     return least @ (axes * np.maximum(seen, 1.0))
@@ -129,9 +130,10 @@ def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
 def inside_cube(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return `steps` (S, P) with values changed so that u + steps lies in the unit cube.
 
-    Values outside the cube are clipped. All other values are adapted to minimize the sum of squares with Hessian
-    2 h (P, P); otherwise sums of correlated values would be biased, such as an offset plus an asymmetry at its bound.
-    The value farthest outside is clipped first, because the adaptation often moves correlated values into the cube.
+    Values outside the cube are clipped. All other values are adapted to minimize the sum of squares with Hessian 2 h
+    (P, P). Without this adaptation, sums of correlated values would be biased, such as an offset plus an asymmetry at
+    its bound. The value farthest outside is clipped first, because the adaptation often moves correlated values into
+    the cube.
     """
     steps = steps.copy()
     for step in steps:

@@ -30,8 +30,8 @@ def prediction_errors(
     """Return the errors of the identified and the nominal arm on a recording, as an entry of summary.json.
 
     The entry of summary.json contains the torque RMSE of each joint. For commanded torque, the entry also contains
-    position_rmse_mrad from replays of `window_s`, and ee_error_mm, the mean end-effector distance after each of the
-    HORIZONS, as far as trajectories are long enough. r2s evaluates a long recording in parts spread over its length.
+    position_rmse_mrad from replays of `window_s` s, and ee_error_mm from `open_loop_error` for each of the HORIZONS
+    that is not longer than the trajectories. r2s evaluates a long recording in parts spread over its length.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}

@@ -100,8 +100,8 @@ class Problem:
     def prior_width(self) -> np.ndarray:
         """(P,) the prior's standard deviation on the unit cube, for comparison with the posterior standard deviation.
 
-        For flat priors, the value is the standard deviation among arms (`ParameterSpace.usual`). No value exceeds
-        UNIFORM, the standard deviation of a uniform distribution over the bounds.
+        For flat priors, `prior_width` is the standard deviation among arms (`ParameterSpace.usual`). `prior_width` is
+        at most UNIFORM, the standard deviation of a uniform distribution over the bounds.
         """
         stated = np.where(np.isinf(self.sigma), self.space.usual, self.sigma)
         return np.minimum(stated / self.space.width, UNIFORM)
@@ -113,7 +113,7 @@ class Problem:
 
     @property
     def is_fixed(self) -> np.ndarray:
-        """(P,) whether `fixed` set a value's prior; tested by equality, as stated priors may be even narrower."""
+        """(P,) whether the method `fixed` set a value's prior, by equality, because stated priors may be narrower."""
         return self.sigma == FIXED * self.space.width
 
     def fixed(self, at: np.ndarray) -> "Problem":
@@ -129,7 +129,7 @@ class Problem:
         return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with flat priors of the values in `names`, whose priors are extra residuals."""
+        """Return the problem with flat priors of the values `names`, because extra residuals contain their priors."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
@@ -198,8 +198,8 @@ Solve = Callable[[Problem, np.ndarray], np.ndarray]  # returns the minimum (P,) 
 class Search(Protocol):
     """A search, which minimizes the sum of squares of `Problem.residual` from `start` (P,).
 
-    After every step or generation, a search calls `report` with a dict of search, evaluations, cost, done and total.
-    A local search (local = True) improves `start`, so a local search can refine the result of an earlier search.
+    After every step or generation, a search calls `report` with {search, evaluations, cost, done, total}. A local
+    search (local = True) improves `start`, so a local search can refine the result of an earlier search.
     """
 
     local: bool
@@ -227,11 +227,11 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
     """Fit torque from `start` (P,) in rounds, reweighting between rounds; return u (P,) and the last round's problem.
 
-    A fit to link-side torque has several minima if values are far outside of narrow priors: with the first weights,
-    which come from the nominal arm, a fit may keep cable torque near zero and distort friction instead. If `start` is
-    nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
-    problem's priors. The second fit replaces the first if it is more likely and clearly lowers the error of a joint.
-    Unmodeled effects may also make the second fit more likely, but they hardly lower its error.
+    If values are far outside of narrow priors, a fit to link-side torque has several minima. With the first weights,
+    from the nominal arm, a fit may keep cable torque near zero and distort friction. If `start` is nominal, a second
+    fit therefore begins with priors at least as wide as the scatter among arms and ends with the problem's priors.
+    r2s uses the second fit if it is more likely than the first and clearly lowers the error of a joint. Unmodeled
+    effects may also make the second fit more likely, but they hardly lower its error.
     """
     u, last = _rounds(problem, start, rounds, solve)
     wide = problem.with_usual_prior() if problem.at_link and np.array_equal(start, problem.start) else problem
@@ -255,8 +255,9 @@ def _rounds(problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple
 def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray) -> bool:
     """Return whether u (P,) has a larger posterior density than v (P,), and a clearly smaller error in some joint.
 
-    Each solution has its own torque noise sigma. A joint's log likelihood is -N log sigma, with N independent rows. A
-    wrong model lengthens the correlation of errors, so N uses the shorter of the two solutions' correlation times.
+    The two solutions u and v have different torque noise sigma. A joint's log likelihood is -N log sigma, with N
+    independent rows. A wrong model lengthens the correlation of errors, so N uses the shorter of the two solutions'
+    correlation times.
     """
     (length, sigma), (longer, larger) = (
         p.torque_data.noise_at(p.space.from_unit(x)) for p, x in ((one, u), (other, v))
@@ -269,8 +270,8 @@ def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     """Return whether values v (P,) explain the torque clearly worse than values u (P,) that were fitted to torque.
 
-    If v is correct, its estimation error still raises the sum of squares by about P. The sum of squares has the
-    relative uncertainty ALIKE, because the number of independent rows is uncertain.
+    Even if v is correct, its estimation error raises the sum of squares by about P, the number of values. The sum of
+    squares has the relative uncertainty ALIKE, because the number of independent rows is uncertain.
     """
     fitted = problem.on_torque.cost(u)
     rise = problem.on_torque.cost(v) - fitted
@@ -281,8 +282,8 @@ def search_lag(at: np.ndarray, search: Search, problem: Problem, start: np.ndarr
     """Return the solution u (P,) of a local search, with the lag u[at] estimated only if the data require a lag.
 
     If torque changes slowly, a short lag acts like a delay. The data require a lag if it lowers the cost by more than
-    the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The comparison omits the block
-    that favors the lag most, because the rows of a block are correlated.
+    the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The comparison of costs omits the
+    block that favors the lag most, because the rows of a block are correlated.
     """
     having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
     u = start.copy()
@@ -300,9 +301,9 @@ def search_lag(at: np.ndarray, search: Search, problem: Problem, start: np.ndarr
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
     """Return whether the recording comes from a simulator with implicit friction, given u (P,) fitted to torque.
 
-    Implicit integration evaluates friction at the velocity half a step ahead; a physical arm does not. The effect of
-    implicit friction must exceed `significant` standard deviations. The effect must also have about the expected
-    size: a rotor inertia missing in the model would have a similar, but a hundred times larger effect.
+    Implicit integration evaluates friction that rises with speed at the velocity half a step ahead; a physical arm
+    does not. The effect of implicit friction must exceed `significant` standard deviations and have about the
+    expected size: a rotor inertia missing in the model would have a similar, but a hundred times larger effect.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]

@@ -30,8 +30,8 @@ class IdentificationResult:
         space: the parameter space. found: estimated values and intervals of the parameters.
         history: one row for each step or generation of a search.
         families: {friction family: error of held-out torque relative to the best family's}; {} if the user chose it.
-        null_directions: parameter combinations with a ratio of posterior to prior sigma above NULL_SHARE, each as a
-            pair (this ratio, {name: component}), largest ratio first.
+        null_directions: pairs (ratio, {name: component}) of parameter combinations whose ratio of posterior to prior
+            sigma exceeds NULL_SHARE, largest ratio first.
         unseen: names of the parameters that r2s left at nominal values, because the data hardly determine them.
         edges: breakaway commands estimated from ramps; None if no ramps were recorded.
         refused: whether r2s discarded the replay fit, which explained torque clearly worse than the torque fit.

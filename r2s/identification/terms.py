@@ -116,8 +116,9 @@ def scaled_prior(
 ) -> dict[str, ArrayLike]:
     """Convert the standard deviations in `prior` to SI units, and omit flat priors (None).
 
-    In `prior`, values for torque-like parameters are relative to the largest torque; values for logarithmic ones have
-    no unit. Viscous friction in the arm's file is a guess, so its standard deviation is at least this guess.
+    In `prior`, values for torque-like parameters are relative to the largest torque; values for logarithmic
+    parameters have no unit. Viscous friction in the arm's file is a guess, so its standard deviation is at least this
+    guess.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():
@@ -131,5 +132,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return the parameters' scales (`sizes`) for each joint's torque limit or largest recorded torque, if larger."""
+    """Return the parameters' `sizes` for the larger of each joint's torque limit and largest recorded torque."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

@@ -3,7 +3,7 @@
 r2s compares dq with the slope of q, the integral of dq with q (r2s/recordings/clock.py), and tau with nominal torque.
 The checks accept nominal torque that is wrong by a factor of 3, an undeclared payload, any friction, and sensor
 offsets. The checks refuse a signal that is wrong by a factor of 1000, 57.3 or -1, and a wrong joint order or
-mounting. Most checks refuse only if correcting one error removes at least three quarters of the misfit.
+mounting. Most checks refuse a recording only if correcting one error removes at least three quarters of the misfit.
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,8 @@ class Judged:
 
     Attributes:
         clock: (n,) ratio of the change of q to the integral of dq. scale: (n,) ratio of dq to the slope of q.
-        misfit: unexplained share of the squared torque. shares: (K,) share of nominal gravity in tau of K joints.
+        misfit: unexplained share of the squared torque. shares: (K,) tau's gravity torque / nominal gravity torque,
+            for K joints.
     """
 
     clock: np.ndarray

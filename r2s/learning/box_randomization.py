@@ -18,13 +18,15 @@ RANGES = "mass", "table", "friction", "damping", "bristle"
 class BoxRandomization(UniformRandomization):
     """Draw random arms from `UniformRandomization` and a random box for each arm.
 
-    Mass and stiffness are log-uniform, all other draws uniform. The initial pose of the box deviates from
-    the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's normal.
+    Mass and stiffness of the box are log-uniform; all other draws are uniform. The initial pose of the box deviates
+    from the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's normal.
 
     Attributes:
-        table, friction: friction coefficients at the work table and at the tip. mass (kg), stiffness (N/m), damping
-            (s/m), bristle (m): see `Surface`. table to bristle: ranges [least, most]. size: (3,) m, edges of the box.
-        spread, yaw: m, degrees, range of the box's pose. point (3,) m, normal (3,): table plane, see `table_frame`.
+        table, friction: ranges [least, most] of the friction coefficient at the work table and at the tip. mass (kg),
+            stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`. size: (3,) m, edges of
+            the box.
+        spread, yaw: m, degrees, largest deviation of the box from its nominal pose. point, normal: (3,) m and (3,),
+            point and normal of the table, see `table_frame`.
 
     Raises:
         UserError: a range is malformed, the box would tilt, or the robot has no tool.

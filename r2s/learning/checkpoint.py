@@ -1,9 +1,10 @@
 """Checkpoints of a training: the state in one file, and the transitions of the replay buffer in files called chunks.
 
-Each checkpoint writes only the new transitions, as one chunk. The state file lists the chunks of the checkpoint, so
-an interrupted write does not damage the previous checkpoint. A chunk is deleted after the replay buffer has
-overwritten all transitions of the chunk. The oldest chunk can contain transitions already overwritten. All
-files contain only tensors, numbers and names, so torch.load(weights_only=True) can read the files.
+Each checkpoint writes one chunk: the transitions added since the previous checkpoint. The state file lists the chunks
+of the checkpoint, so an interrupted write does not damage the previous checkpoint. A chunk is deleted after the
+replay buffer has overwritten all transitions of the chunk. The oldest chunk can contain transitions that the buffer
+has already overwritten. All files contain only tensors, numbers and names, so torch.load(weights_only=True) can read
+the files.
 """
 
 import errno
@@ -47,7 +48,7 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill the empty buffer `replay` with the saved transitions; return the state, or None without a checkpoint.
 
-        Each transition gets its former row, so a resumed training draws the batches of an uninterrupted training.
+        Each transition returns to its row, so a resumed training draws the same batches as an uninterrupted training.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.

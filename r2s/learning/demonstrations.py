@@ -46,7 +46,7 @@ def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstra
     """Return the demonstrator for reaching, pushing or hybrid control; None if no baseline supports the task.
 
     Args:
-        robot, task: the arm and its task. dynamics: model of one arm, the center of the training's randomization.
+        robot, task: the arm and its task. dynamics: model of one arm, at the center of the domain randomization.
     """
     control = task.control(robot)
     if isinstance(task, ReachTask) and control.name == "torque":

@@ -27,14 +27,14 @@ GROUPS = 8  # groups of arms that reset together; a reset of four arms takes har
 class TaskEnv(EnvBase):
     """Simulate `nsim` arms that perform a task, with new goals and dynamics at every reset.
 
-    Keys: `observation` (nsim, d), `action` (nsim, a) in [-1, 1], `reward` (nsim, 1) under `weights`,
+    Keys: `observation` (nsim, d), `action` (nsim, a) in [-1, 1], `reward` (nsim, 1) weighted by `weights`,
     `reward_terms` (nsim, k), `distance` (nsim, 1) m, `truncated`, `terminated`, `done`.
 
     Args:
         robot, task: the arm and its task.
-        draw: domain randomization, called at every reset; type `Pushes` also applies joint torques at every step.
+        draw: domain randomization, called at every reset; a `Pushes` object also applies joint torques at every step.
         nsim: number of arms. nthread: number of threads; 0: all cores.
-        seed: seed of goals, starts and dynamics.
+        seed: seed of goals, start postures and dynamics.
         stagger: whether the first episodes of the GROUPS groups of arms end at different times.
         reward: reward terms and weights; None selects the terms and `paper_weights` of the task.
     """
@@ -84,9 +84,9 @@ class TaskEnv(EnvBase):
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights, for an external training loop; progress: used share of its budget, 0 to 1.
+        """Set the reward weights in an external training loop; progress: share of the budget used so far, 0 to 1.
 
-        As in `train`, `Reward.adapt` computes the factor of the weights from the steps since the last call.
+        As in `train`, `Reward.adapt` adapts the weights to the mean reward terms since the last call.
         """
         if self._seen_steps:
             mean = self._seen / self._seen_steps
@@ -111,7 +111,7 @@ class TaskEnv(EnvBase):
         return self.read()
 
     def _restart(self, ids: np.ndarray) -> State:
-        """Draw dynamics, starts and goals of the arms `ids`; return the state of all arms."""
+        """Draw dynamics, start postures and goals of the arms `ids`; return the state of all arms."""
         self.arms.set_dynamics(self._drawn(len(ids)), ids)
         q = self.task.starts(self.robot, self.rng, len(ids))
         goals = self._pool[self.rng.integers(len(self._pool), size=len(ids))]
@@ -132,7 +132,7 @@ class TaskEnv(EnvBase):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Run one step, reset truncated episodes, and return the step and the initial state of the next step.
 
-        `EnvBase.step_and_maybe_reset` also checks and copies tensors: a fifth of a step's time with 32 arms.
+        `EnvBase.step_and_maybe_reset` also checks and copies tensors, in a fifth of a step's time with 32 arms.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)

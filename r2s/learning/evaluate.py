@@ -1,8 +1,8 @@
 """Evaluation in simulation: 200 deterministic episodes, the same for every policy.
 
-The seed sets the goals, starts and dynamics of the episodes. Episodes of the seed SELECTION determine the best policy
-of a training run. Episodes of the seed REPORT yield the reported results and select no policy. REPORT was used to
-choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
+A seed determines goals, start postures and dynamics of the episodes. Episodes of the seed SELECTION determine the
+best policy of a training run. Episodes of the seed REPORT yield the reported results and select no policy. REPORT was
+used to choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
 """
 
 from collections.abc import Callable
@@ -20,12 +20,12 @@ SELECTION, REPORT = 7_000_000, 2_026_1122  # seeds, larger than those of trainin
 
 
 def generators(seed: int) -> list[np.random.Generator]:
-    """Return independent random generators for starts, goals and dynamics."""
+    """Return independent random generators for start postures, goals and dynamics."""
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)]
 
 
 def fixed_episodes(robot: Robot, task: Task, count: int, seed: int = REPORT) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts (count, n) rad and goals (count, ...), which are the same for every policy, simulator and arm."""
+    """Return start postures (count, n) rad and goals (count, ...), the same for every policy, simulator and arm."""
     starts, goals, _ = generators(seed)
     drawn = task.goals(robot, goals, count)
     return task.begin(task.starts(robot, starts, count), drawn), drawn

@@ -1,6 +1,6 @@
 """A task as Gymnasium environments: `ArmVectorEnv` for a batch of simulated arms, `ArmEnv` for a single arm.
 
-Each arm of a batch has its own random generator, so arm i runs the episodes of a single arm with arm i's seed.
+Each arm of a batch has its own random generator, so arm i runs the same episodes as an `ArmEnv` with arm i's seed.
 Observations are normalized with the scales of the task, as in r2s's policies.
 """
 
@@ -29,7 +29,7 @@ class SeparateArms(VectorArms):
     """`VectorArms` with one random generator per arm, in `streams`, for sensor noise and the torques of `Pushes`."""
 
     def seed(self, seed: int | np.random.SeedSequence) -> None:
-        """Restart the random generators of all arms from this seed."""
+        """Restart the random generators of all arms from `seed`."""
         super().seed(seed)
         self.streams = self._rng.spawn(self.width)
 
@@ -70,7 +70,8 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
         num_envs: number of arms. nthread: number of threads; 0: all cores.
-        reward: reward terms and weights, see `TaskEnv`; weights keep their initial values until `set_progress`.
+        reward: reward terms and weights, see `TaskEnv`; weights keep their initial values until the first call of
+            `set_progress`.
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
@@ -104,17 +105,17 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.observation_space, self.action_space = (gym.vector.utils.batch_space(s, num_envs) for s in spaces)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights; progress: used share of the budget, 0 to 1; see `TaskEnv.set_progress`."""
+        """Set the reward weights; progress: share of the budget used so far, 0 to 1; see `TaskEnv.set_progress`."""
         self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
-        """Normalize observations (m, d) from SI units to the scale of this environment's observations."""
+        """Normalize and clip observations (m, d) in SI units, as `reset` and `step` do."""
         return ((observation - self.mean) / self.std).clip(-CLIP, CLIP).astype(np.float32)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start new episodes of all arms, or of the arms of `options["reset_mask"]` (num_envs,) bool.
+        """Start new episodes of all arms, or of the arms that `options["reset_mask"]` (num_envs,) bool selects.
 
         seed: number (arm i gets seed + i), or list of one seed per arm; None: the random generators continue.
         """
@@ -203,5 +204,5 @@ class ArmEnv(gym.Env):
 
 
 def _single(info: dict[str, Any]) -> dict[str, Any]:
-    """Return the `info` of a batch of one arm as the `info` of this arm."""
+    """Convert the `info` of a batch of one arm to the `info` of a single arm."""
     return {"distance": float(info["distance"][0]), "reward_terms": info["reward_terms"][0]}

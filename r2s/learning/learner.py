@@ -29,10 +29,10 @@ class Learner(nn.Module, ABC):
         critics: (number of critics, number of outputs per critic).
         hidden: number of units in each hidden layer of actor and critics.
         gamma: discount. tau: Polyak step of the target networks. lr: learning rate of Adam.
-        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). In states in
-            which critics hardly distinguish actions, this weight favors small actions over alternating full torque.
-        explore_correlation: correlation of an arm's exploration noise between two steps; 0 means white noise. The
-            noise is a first-order process of constant variance. Correlated noise moves an arm as far as white
+        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
+            critics hardly distinguish actions, `action_l2` favors small actions over full torque of alternating sign.
+        explore_correlation: correlation of an arm's exploration noise between successive steps; 0 means white noise.
+            The noise is a first-order process of constant variance. Correlated noise moves an arm as far as white
             noise with less acceleration (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
 
     Raises:
@@ -92,11 +92,11 @@ class Learner(nn.Module, ABC):
     def losses(self, batch: Mapping[str, Tensor], *noise: Any) -> dict[str, Tensor]:
         """Return the losses of a batch, with names that begin with loss_, and further scalars to log.
 
-        Random draws are arguments, so that tests can compare the losses with the losses of TorchRL.
+        The random numbers are arguments, so that tests can compare the losses with the losses of TorchRL.
 
         Args:
             batch: as for `update`, but with normalized observations.
-            noise: random draws of the algorithm.
+            noise: random numbers that the algorithm uses.
         """
 
     @abstractmethod
@@ -108,7 +108,7 @@ class Learner(nn.Module, ABC):
         """
 
     def gradients(self, batch: Mapping[str, Tensor], *noise: Any) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
-        """Return the `losses` of a batch in SI units, and the gradient of their sum for all `trained` parameters.
+        """Return the `losses` of a batch in SI units, and the gradient of `total` with respect to `trained`.
 
         One function computes losses and gradient, so that torch compiles one graph; `backward` would need two graphs.
         """
@@ -120,12 +120,12 @@ class Learner(nn.Module, ABC):
         return Policy(self.normalizer, self.actor, self.action_scale)
 
     def set_lr(self, share: float) -> None:
-        """Set the learning rate to `share` of its initial value."""
+        """Set the learning rate to `share` times its initial value."""
         for group in self.optimizer.param_groups:
             group["lr"] = share * self.lr
 
     def set_exploration(self, share: float) -> None:
-        """Set the standard deviation of the exploration noise to `share` of its initial value."""
+        """Set the standard deviation of the exploration noise to `share` times its initial value."""
         self.explore_share = share
 
     def noise(self, like: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ class Learner(nn.Module, ABC):
 
     @property
     def trained(self) -> list[Tensor]:
-        """The parameters that the optimizer changes: all except those of the target networks."""
+        """The parameters that the optimizer changes: all except the parameters of the target networks."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def compile(self, batch_size: int) -> bool:  # type: ignore[override]
@@ -244,11 +244,11 @@ class DeterministicLearner(Learner):
 
 
 class EntropyLearner(Learner):
-    """Base class of SAC and TQC: a stochastic policy, and a temperature that controls its entropy.
+    """Base class of SAC and TQC: a stochastic policy, and a temperature that controls the policy's entropy.
 
     Args:
         scale, action_scale, critics, shared: see `Learner`.
-        alpha_init: initial temperature. target_entropy: desired entropy; None: minus the dimension of an action.
+        alpha_init: initial temperature. target_entropy: desired entropy of the policy; None: -(size of an action).
     """
 
     entropy_goal: Tensor
@@ -274,7 +274,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Shift the target entropy by the entropy change of a Gaussian whose standard deviations `share` scales."""
+        """Add n log(share) to the target entropy, as if `share` scaled the n standard deviations of a Gaussian."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -284,7 +284,7 @@ class EntropyLearner(Learner):
 
         Args:
             batch: as for `update`, but with normalized observations.
-            noise: two standard normal draws (B, a): one for the next action, one for the action in the actor's loss.
+            noise: two standard normal samples (B, a), for the next action and for the action in the actor's loss.
         """
 
     @torch.no_grad()
@@ -338,7 +338,7 @@ def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
 
 
 def check_hidden(hidden: object) -> None:
-    """Raise UserError unless the units per hidden layer are a non-empty list of positive integers."""
+    """Raise UserError unless `hidden`, the units per hidden layer, is a non-empty list of positive integers."""
     if not isinstance(hidden, Sequence) or isinstance(hidden, str) or not hidden:
         raise UserError(f"hidden: expected units per layer such as [128, 128], got {hidden!r}")
     for units in hidden:

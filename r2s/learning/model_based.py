@@ -1,6 +1,6 @@
 """Model-based baselines: minimum-jerk joint motion, computed torque, friction compensation.
 
-Baselines have the interface, observations and rate of a policy, and use the model at the center of the randomization.
+A baseline has the interface, observations and rate of a policy. Its model is the center of the domain randomization.
 """
 
 import mujoco
@@ -28,7 +28,7 @@ class Oracle:
 
     Args:
         robot, task: the arm and its task with control=torque. dynamics: dynamics of one arm, for computed torque.
-        move_s: s, duration of a motion; r2s prolongs it if a joint would exceed the share FAST of its speed limit.
+        move_s: s, duration of a motion; r2s prolongs a motion in which a joint would exceed FAST x its speed limit.
     """
 
     def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
@@ -46,7 +46,7 @@ class Oracle:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d); a new motion starts if the effort is 0."""
+        """Return actions (B, n) in [-1, 1] for observations (B, d); an effort of 0 marks a new episode."""
         rows, n = observation.numpy().astype(np.float64), self.robot.n
         out = np.empty((len(rows), n))
         for i, row in enumerate(rows):
@@ -71,7 +71,7 @@ class Oracle:
         return rigid + self.dynamics.friction(dto) - self.dynamics.offset
 
     def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
-        """Return q (n,) near `start`, within limits, that brings the end effector to `goal` (3,) m.
+        """Return joint angles (n,) rad near `start`, within limits, that bring the end effector to `goal` (3,) m.
 
         Damped least squares solves the kinematics. Joints whose friction exceeds the torque limit do not move.
         """
@@ -126,7 +126,7 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     """Return the baseline `algo=hybrid_force`: zero actions under control=hybrid.
 
-    Without a policy, the controller exerts a force f on the surface in open loop: J^T f plus modeled friction torque.
+    With zero actions, the controller exerts force f on the surface in open loop: J^T f plus modeled friction torque.
 
     Raises:
         UserError: the controller is not control=hybrid, or the task has no contact.

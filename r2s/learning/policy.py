@@ -26,7 +26,7 @@ def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
 
 
 def normalization(robot: Robot, task: Task) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return mean and standard deviation (d,) of the observations of a task and its controller."""
+    """Return mean and standard deviation (d,) that normalize the observations of a task and its controller."""
     mean, std = observation_scale(task, robot)
     return torch.from_numpy(mean), torch.from_numpy(std)
 

@@ -2,9 +2,9 @@
 
 The pusher's model is quasi-static and independent of the box's mass and friction. In this model, a frictionless push
 at a face point p along the inward normal n by a length s moves the box by s n / (1 + h^2) and turns it by
-s h / (r (1 + h^2)), where h = (p x n) / r (limit surface of r2s/physics/sliding.py). The error counts position and
-yaw in units of their tolerances. In every control period, the pusher plans anew: it selects the face point whose best
-push, with the tip's travel to this point, reduces the error fastest.
+s h / (r (1 + h^2)), where h = (p x n) / r (limit surface of r2s/physics/sliding.py). The pusher divides the errors of
+position and yaw by their tolerances. In every control period, the pusher selects the face point whose best push
+reduces the error fastest, including the time of the tip's travel to the face point.
 """
 
 import numpy as np
@@ -91,7 +91,7 @@ class Pusher:
         return np.einsum("bnk,bn->bk", inverse, torque)
 
     def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip velocity (3,) m/s along the table, and the unit push direction (2,), or 0 for no push."""
+        """Return the tip velocity (3,) m/s along the table, and the unit vector (2,) of a push, 0 without a push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
         at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), error[2]]) / TOLERANCE
@@ -113,9 +113,9 @@ class Pusher:
     def _best_push(self, at: np.ndarray, e: np.ndarray) -> tuple[int, float]:
         """Return the face point and the length, m, of the push that reduces the error e (3,) fastest.
 
-        The error is in tolerances and in the box's frame, as the tip's position `at` (2,) m. The push from a face
-        point of the twist w has the length s >= 0 that minimizes |e - s w|. Its time is that of the travel from `at`
-        around the box and of the push, without acceleration.
+        The error e, in tolerances, and the tip's position `at` (2,) m are in the box's frame. A push of length s
+        changes the error to e - s w with the twist w of the face point; the best s >= 0 minimizes |e - s w|. The time
+        of a push includes the tip's travel from `at` around the box, but neglects acceleration.
         """
         lengths = (self._twists @ e / self._squares).clip(0.0)
         remaining = np.linalg.norm(e - lengths[:, None] * self._twists, axis=1)
@@ -127,7 +127,7 @@ class Pusher:
         return k, float(lengths[k])
 
     def _along(self, at: np.ndarray) -> np.ndarray:
-        """Return coordinates (k,) m of points (k, 2) m, moved onto the way around the box; counterclockwise."""
+        """Project points (k, 2) m onto the path around the box; return their arc lengths (k,) m, counterclockwise."""
         a, b = self._clear
         nearest, rows = np.clip(at, -self._clear, self._clear), np.arange(len(at))
         side = np.argmin(self._clear - np.abs(nearest), axis=1)  # 0: left or right, 1: above or below
@@ -137,7 +137,7 @@ class Pusher:
         return np.select(sides, [b + y, 2 * b + a - x, 3 * b + 2 * a - y], 4 * b + 3 * a + x)
 
     def _around(self, at: np.ndarray, to: np.ndarray) -> np.ndarray:
-        """Return the first waypoint (2,) m, in the box's frame, from `at` around the box to `to`."""
+        """Return the first waypoint (2,) m of the tip's path from `at` around the box to `to`, in the box's frame."""
         clear, edge = self._clear, self._clear - CLEAR
         corners = clear * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         if not _crosses(at, to, edge + 0.2 * CLEAR):
@@ -153,7 +153,7 @@ class Pusher:
         return corners[seen[int(np.argmin(ways))]]
 
     def _way_left(self, corners: np.ndarray, first: int, to: np.ndarray, edge: np.ndarray) -> float:
-        """Return the length, m, of the shortest way from the corner `first` past other corners to the point `to`."""
+        """Return the length, m, of the shortest path from the corner `first` past other corners to the point `to`."""
         lengths = []
         for step in (1, -1):
             k, length = first, 0.0

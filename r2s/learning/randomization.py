@@ -29,11 +29,12 @@ class UniformRandomization:
     """Draw friction parameters and inertia tensors uniformly around a center, as the paper does.
 
     Each friction parameter phi is center * U(1 - phi_relative, 1 + phi_relative); the paper uses phi_relative = 0.10.
-    Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws
-    are independent, so some tensors, mainly of slender links, belong to no body (see `physical`); r2s draws these
-    again. With inertia_relative = 0.05, the share of valid draws is 100 % for the Panda's links 4 and 7, 47 to 63 %
-    for links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate I_xx and I_yy of
-    link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Even with redraws, each element spans its full +-5 %.
+    Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws are
+    independent, so some tensors, mainly of slender links, are physically impossible (see `physical`). r2s draws
+    impossible tensors again. With inertia_relative = 0.05, the share of valid draws is 100 % for the Panda's links 4
+    and 7, 47 to 63 % for links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate
+    I_xx and I_yy of link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Even with redraws, each element
+    varies over its full range of +-5 %.
 
     Attributes:
         robot: the arm.
@@ -77,10 +78,10 @@ class UniformRandomization:
 
 @dataclass(frozen=True)
 class PosteriorRandomization:
-    """Draw from an identification's posterior: each arm has a random row of `samples` (S, P) in `space`.
+    """Draw dynamics from an identification's posterior: a random row of `samples` (S, P) in `space` per arm.
 
-    Whole rows preserve correlations between parameters. Every row is physically valid: tensor scales are positive,
-    and the full inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
+    Drawing whole rows preserves correlations. Every row is physically valid: tensor scales are positive, and the full
+    inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
     """
 
     space: ParameterSpace
@@ -150,17 +151,17 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
 class ContactRandomization(UniformRandomization):
     """Draw arms as `UniformRandomization` does, and for each arm a random surface near a nominal plane.
 
-    The exponent is the lower or the upper end of its range. Stiffness is log-uniform; damping, friction and bristle
-    are uniform. U(-place, place) shifts the plane along its normal, U(0, tilt) tilts the plane about a random axis.
+    The exponent is randomly one end of its range. Stiffness is log-uniform; damping, friction and bristle are
+    uniform. U(-place, place) shifts the plane along its normal, U(0, tilt) tilts the plane about a random axis.
 
     Attributes:
-        point, normal: (3,) m and (3,), of the nominal plane; None: a work table below the home posture's tip.
+        point, normal: (3,) m and (3,), of the nominal plane; None: a work table below the tip in home posture.
         stiffness (N/m), exponent, damping (s/m), friction, bristle (m): ranges [least, most], see `Surface`.
         place: m, largest displacement of the plane along its normal. tilt: degrees, largest tilt of the plane.
         surface: run folder of an identified surface, whose posterior replaces the ranges; None: use the ranges.
 
     Raises:
-        UserError: a range is malformed or outside what a surface allows, or the robot has no tool.
+        UserError: a range is malformed or contains values that a surface cannot have, or the robot has no tool.
     """
 
     stiffness: Sequence[float]
@@ -247,7 +248,7 @@ def with_payloads(
     """Return the dynamics of m arms, each with a random payload of [least, most] kg; payload=None: no payload.
 
     The mass of a payload is uniform. The center of mass is uniform in a ball about the end effector, with half the
-    radius that `payload_max` allows. The tensor is that of a ball of water. Gravity compensation ignores the payload.
+    radius that `payload_max` allows. The tensor describes a ball of water. Gravity compensation ignores the payload.
     """
     if payload is None:
         return dynamics
@@ -259,6 +260,6 @@ def with_payloads(
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:
-    """Return whether each tensor (..., 3, 3) is positive definite and obeys the triangle inequality, (...) bool."""
+    """Return (...) bool, whether each tensor (..., 3, 3) is positive definite and obeys the triangle inequality."""
     moments = np.linalg.eigvalsh(tensor)
     return (moments[..., 0] > 0) & (moments[..., 0] + moments[..., 1] >= moments[..., 2])

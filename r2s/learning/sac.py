@@ -1,7 +1,7 @@
 """Soft Actor-Critic (Haarnoja et al. 2018, arXiv:1801.01290) with the automatic temperature of arXiv:1812.05905.
 
-The losses equal those of `torchrl.objectives.SACLoss` without a value network and with squared errors, as in the
-papers. Tests compare both implementations.
+The losses equal those of `torchrl.objectives.SACLoss` without a value network and with squared errors, as in both SAC
+papers. Tests compare the losses of r2s and torchrl.
 """
 
 from collections.abc import Mapping

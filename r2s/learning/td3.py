@@ -1,8 +1,8 @@
 """Twin Delayed Deep Deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477).
 
-TD3 differs from DDPG in three ways: the target uses the smaller value of two critics, the target's action has noise,
-and only every other update changes the actor and the target networks. The losses equal those of
-`torchrl.objectives.TD3Loss` with the paper's squared error; tests compare both implementations.
+TD3 differs from DDPG in three ways: the target uses the smaller value of two critics, the action in the target has
+noise, and only every other update changes the actor and the target networks. The losses equal those of
+`torchrl.objectives.TD3Loss` with the squared error of Fujimoto et al.; tests compare r2s and torchrl.
 """
 
 from collections.abc import Mapping

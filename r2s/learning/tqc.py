@@ -1,7 +1,7 @@
 """Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
 
-The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). For speed, one
-batched network represents all critics, instead of a vmap over networks.
+The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (tolerance 1e-5). For
+speed, one batched network represents all critics, instead of a vmap over networks.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class TQC(EntropyLearner):
-    """Learn a stochastic policy with quantile critics; the target omits the highest atoms.
+    """Learn a stochastic policy with quantile critics; the target omits the highest quantiles (atoms).
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.
@@ -57,8 +57,8 @@ class TQC(EntropyLearner):
 def quantile_huber(quantiles: Tensor, target: Tensor) -> Tensor:
     """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): the sum of the critics' mean losses.
 
-    A quantile and a target atom have the loss |tau - [delta < 0]| huber(delta). Here delta is target minus quantile,
-    and tau is the quantile's probability. huber(delta) is delta^2 / 2 for |delta| <= 1, otherwise |delta| - 1/2.
+    The loss of a quantile and a target atom is |tau - [delta < 0]| huber(delta), where delta = atom - quantile, and
+    tau is the quantile's probability. huber(delta) is delta^2 / 2 for |delta| <= 1, otherwise |delta| - 1/2.
 
     Args:
         quantiles: (C, B, N), N quantiles of C critics. target: (B, M), M target atoms.

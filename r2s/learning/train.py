@@ -5,8 +5,8 @@ only env_steps is limited, runs with equal seeds and equal numbers of threads ag
 resumption. If minutes are limited, the curriculum depends on the clock.
 
 The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
-one core, steps and updates alternate; the result equals that of parallel steps. Physics and updates do not share
-OpenMP threads, because shared threads would slow down physics and updates: after an update, the threads spin for
+one core, steps and updates alternate, with the same result as in parallel. Physics and updates do not share OpenMP
+threads, because shared threads would slow down physics and updates: after an update, the threads spin for
 milliseconds on cores that the physics needs, and on a busy machine, each barrier waits for a suspended thread.
 """
 
@@ -71,9 +71,10 @@ class Loop:
         replay_size: capacity of the replay buffer in transitions.
         lr_decay, lr_end: after the share lr_decay of the budget, the learning rate falls linearly to lr_end times its
             initial value.
-        explore_end: ratio of final to initial exploration noise, which falls geometrically over the budget.
+        explore_end: final / initial exploration noise; the noise falls geometrically over the budget.
         eval_env_steps: env steps between two evaluations; a training ends with one more evaluation.
-        compile: whether to compile losses first, within budget.minutes. concurrent: whether arms step during updates.
+        compile: whether to compile the losses first; budget.minutes includes the compilation. concurrent: whether
+            arms step during updates.
         matmul: precision of float32 matrix products in updates, for torch.set_float32_matmul_precision: "medium"
             allows bfloat16 factors; "auto" selects the result of `fastest_matmul`.
 
@@ -108,7 +109,7 @@ class Loop:
             raise UserError(f"matmul: expected auto, medium, high or highest, got {self.matmul!r}")
 
     def lr_share(self, spent: float) -> float:
-        """Return the learning rate, relative to its initial value, after the share `spent` of the budget."""
+        """Return learning rate / initial learning rate after the share `spent` of the budget."""
         return 1.0 - (1.0 - self.lr_end) * max(0.0, spent - self.lr_decay) / max(1.0 - self.lr_decay, 1e-9)
 
 
@@ -118,7 +119,7 @@ class Callbacks:
 
     Attributes:
         log: called with each row of metrics.csv. evaluated: called with each row of evaluations.csv.
-        progress: called after every step, with the spent share of the budget and the numbers to show.
+        progress: called after every step with an update; receives the used share of the budget and numbers to show.
     """
 
     log: Callable[[dict], None] = lambda row: None
@@ -145,7 +146,8 @@ def train(
         evaluate: function that runs a policy and returns `Episodes`, see r2s/learning/evaluate.py.
         loop, budget: settings of the training loop, and length of the training.
         demonstrator: source of the actions in the first loop.learning_starts env steps; None: uniform random actions.
-        checkpoint: saves the training after every evaluation but the last; a saved training resumes. None: no saving.
+        checkpoint: saves the training after every evaluation but the last. A training with a saved checkpoint resumes
+            from the checkpoint. None: no saving.
         callbacks: functions that receive logs and progress.
 
     Raises:
@@ -178,10 +180,10 @@ def train(
 
 
 class Training:
-    """State of a training: arms, learner, replay buffer and counters; the arguments are those of `train`.
+    """State of a training: arms, learner, replay buffer and counters; for the arguments, see `train`.
 
     Attributes:
-        env_steps, updates: counts so far. next_eval: env_steps from which the next evaluation is due.
+        env_steps, updates: numbers so far. next_eval: number of env steps from which the next evaluation is due.
         factor: last result of `Reward.adapt`, initially `Reward.factor`. evaluation: last row of evaluations.csv.
     """
 
@@ -218,7 +220,7 @@ class Training:
 
     @contextmanager
     def step(self, spent: float) -> Iterator[None]:
-        """Step all arms while the `with` block runs, then store the transitions. spent: used share of the budget."""
+        """Step all arms while the `with` block runs, then store the transitions. spent: share of the budget used."""
         env, state = self._env, self._state
         state["action"] = self._action(state["observation"])
         with self._dated_errors():
@@ -314,7 +316,7 @@ def generators(device: torch.device) -> dict[str, torch.Tensor]:
 
 
 def set_generators(states: Mapping[str, Any], device: torch.device) -> None:
-    """Restore the states that `generators` returned, for the generators that this device uses."""
+    """Restore the states that `generators` returned, for the torch generators of `device`."""
     torch.set_rng_state(states["torch"])
     if device.type == "cuda" and "cuda" in states:
         torch.cuda.set_rng_state(states["cuda"], device)

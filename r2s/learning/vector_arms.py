@@ -19,7 +19,8 @@ class VectorArms:
     """Simulate `width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
     Each ms of a control period has these stages: control law, soft start, low-pass, clip, rate limit, safety filter,
-    delay and lag, physics. Kinematics are computed once per period. `State` separates true speeds and sensor noise.
+    delay and lag, physics. The simulator computes kinematics once per control period. `State` stores true speeds and
+    sensor noise separately.
 
     Attributes:
         speeds: None, because simulated speeds are exact and need no smoothing.
@@ -28,7 +29,7 @@ class VectorArms:
         robot, task: the arm, and the task with its controller.
         dynamics: dynamics of `width` arms, or of one arm for all arms.
         nthread: number of threads; 0: all cores.
-        soft_start_s: s, time over which the torque of an episode fades in.
+        soft_start_s: s, time after the start of an episode in which the torque fades in from 0.
         seed: seed of the sensor noise; the noise restarts when `place` resets all arms.
     """
 
@@ -139,7 +140,7 @@ class VectorArms:
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:
-    """Raise FloatingPointError, with arm and episode step from `steps` (m,), unless `rows` (m, k) are finite."""
+    """Raise FloatingPointError that names arm and step, `steps` (m,), unless all `rows` (m, k) are finite."""
     finite = np.isfinite(rows)
     if not finite.all():
         arm = int((~finite.all(-1)).argmax())

@@ -24,7 +24,7 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
 
     Args:
         target: Nm, target torque. filtered, effort: Nm, low-pass state and effort of the previous cycle.
-        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: cycles of the soft start.
+        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: length of soft start, cycles.
         tau_max: Nm, largest effort. step_max: Nm, largest change of the effort per cycle.
     """
     faded = target
@@ -41,7 +41,8 @@ def condition(target, state, settings, nstep, out):
     """Apply `condition_joint` to m arms; write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`.
 
     Args:
-        target: (m, n) Nm, target torques. state, updated: low-pass states and efforts (m, n) Nm, cycle numbers (m,).
+        target: (m, n) Nm, target torques.
+        state: low-pass states and efforts (m, n) Nm, and cycle numbers (m,), all updated in place.
         settings: arguments of `condition_joint`: factor, fade, tau_max (n,) Nm and step_max (n,) Nm per cycle.
     """
     filtered, effort, cycle = state
@@ -100,12 +101,12 @@ SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    If a command arrives within a step, the previous command acts first. The motor torque m lags the command u: dm/dt
-    = (u - m) / lag. From an initial m0, the mean of m over a time s is u + (m0 - u) (1 - exp(-s / lag)) lag / s.
+    If a command arrives within a step, the previous command acts first. Motor torque m lags command u by dm/dt = (u -
+    m) / lag. From m(0) = m0, the mean of m over s steps is u + (m0 - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
         line: (SLOTS, n) Nm, recent commands; row k % SLOTS is the command of cycle k. motor: (n,) Nm, motor torques.
-        cycle: cycle of the newest command, at least SLOTS. delay, lag: pure delay and lag in steps.
+        cycle: cycle of the newest command, at least SLOTS. delay: pure delay, steps. lag: time constant, steps.
     """
     whole = int(delay)
     late = delay - whole
@@ -122,7 +123,7 @@ def motor_torque(line, motor, cycle, delay, lag, out):
 
 @njit(cache=True)
 def delayed(tau, delay, lag, steps, line, motor, cycle, out):
-    """Write into `out` the mean motor torques in each step after a delay and a lag, both in steps."""
+    """Write the motors' mean torques in each step into `out`; delay, lag: delay and lag of the motors, in steps."""
     for i in range(tau.shape[0]):
         for k in range(steps):
             line[i, cycle[i] % SLOTS] = tau[i, k]
@@ -150,7 +151,7 @@ class Motors:
         self.set(delay, lag)
 
     def set(self, delay: np.ndarray | float, lag: np.ndarray | float, ids: np.ndarray | None = None) -> None:
-        """Set delay and lag, s, of the arms `ids` (all by default), each as one value or as one per arm (m,)."""
+        """Set delay and lag, s, of the arms `ids` (all by default); delay, lag: a scalar, or (m,) for m arms."""
         at = slice(None) if ids is None else ids
         self._delay[at], self._lag[at] = steps_late(delay, lag)
 

@@ -26,7 +26,7 @@ class TableFrame:
     """Coordinate frame on a table, at the nominal position of a box.
 
     Attributes:
-        origin: (3,) m, in the base frame. axes: (3, 3), unit vectors as rows: ahead (away from the base), left, up.
+        origin: (3,) m, in the base frame. axes: (3, 3), rows: unit vectors ahead (away from the base), left, up.
     """
 
     origin: np.ndarray
@@ -53,7 +53,7 @@ class TableFrame:
         return np.concatenate([centre, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1) @ self.axes], axis=-1)
 
     def moved(self, pose: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Return poses (m, 6) of boxes, displaced in the table frame by `by` (m, 3): x m, y m and yaw rad."""
+        """Return poses (m, 6) of boxes after a displacement `by` (m, 3) in the table frame: x m, y m and yaw rad."""
         c, s = np.cos(by[:, 2:]), np.sin(by[:, 2:])
         first, up = pose[:, 3:], self.axes[2]
         turned = c * first + s * np.cross(up, first)  # `first` is perpendicular to `up`
@@ -61,7 +61,7 @@ class TableFrame:
 
 
 def table_frame(robot: Robot, point: Any = None, normal: Any = None) -> TableFrame:
-    """Return a table's frame from point (3,) m and normal (3,); point=None: below and ahead of the tip at home."""
+    """Return a table's frame at `point` (3,) m with `normal` (3,); point=None: below and ahead of the tip at home."""
     place, up = nominal_plane(robot, point, normal)
     across = place - (place @ up) * up
     size = float(np.linalg.norm(across))
@@ -86,7 +86,7 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
 
 
 def check_size(name: str, size: Any, table: float) -> np.ndarray:
-    """Return a box's edges (3,) m; raise UserError if a push at PUSHED_AT times the box's height would tilt it.
+    """Return a box's edges (3,) m; raise UserError if a push at PUSHED_AT times the height would tilt the box.
 
     A push must overcome the table friction mu m g, so a push at height h tilts a box with half edge a if mu h > a.
     """

@@ -2,11 +2,11 @@
 
 r2s checks the geoms of the robot's file, except planes and height fields. If the file enables collision only for some
 geoms, r2s checks only these geoms. Convex hulls replace meshes, as in MuJoCo, and bounding spheres replace signed
-distance fields. The check omits these pairs:
+distance fields. The check omits some pairs:
 
-- A geom and the table, if the geom's height is constant, because no joint or only vertical joint axes move the geom.
-- Two geoms of neighboring links, which touch at their joint, and two geoms closer than HOUSING_M at q_home. Such
-  geoms can belong to one joint's housing although their links are two joints apart, as in the Panda's shoulder.
+- The check ignores the table for a geom of constant height, which no joint or only vertical joint axes move.
+- The check omits pairs of geoms of neighboring links, which touch at their joint, and pairs closer than HOUSING_M at
+  q_home: geoms of one joint's housing can have links two joints apart, as in the Panda's shoulder.
 """
 
 from collections.abc import Collection
@@ -35,7 +35,8 @@ class CollisionPairs:
     """Pairs of geoms whose distance the collision check computes.
 
     Attributes:
-        above: geoms to compare with the table. pairs: pairs of geoms, beginning with pairs that contain an obstacle.
+        above: ids of geoms to check with the table. pairs: pairs of ids, beginning with pairs that contain an
+            obstacle.
         link: (ngeom,) number of each geom's link, from 1; 0: the base.
     """
 
@@ -49,7 +50,7 @@ def collision_pairs(
 ) -> CollisionPairs:
     """Return the pairs of geoms to check; table: whether to check for collisions with the table.
 
-    may_touch: pairs that the check omits: two body names, or a body name and "table".
+    may_touch: pairs that the check omits, each of two body names or of a body name and "table".
     """
     link = np.searchsorted(model.jnt_bodyid, model.body_weldid[model.geom_bodyid], side="right")
     box = np.array([model.geom(g).name.startswith(PREFIX) for g in range(model.ngeom)], dtype=bool)
@@ -86,7 +87,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Geometry: bodies (G, WIDTH), hull vertices (V, 3) m, body indices above (A,), pairs (P, 2), table height m."""
+    """Bodies (G, WIDTH), hull vertices (V, 3) m, bodies above the table (A,), body pairs (P, 2), table height m."""
 
     bodies: np.ndarray
     vertices: np.ndarray
@@ -104,9 +105,9 @@ class CollisionCheck:
 
     Args:
         robot: the arm, whose file contains the geoms.
-        table: m, height of the table in the base frame; -inf: no table. None: a table at TABLE_M or, if the arm
-            reaches below TABLE_M at q_home, as a hanging arm does, no table.
-        may_touch: pairs that the check omits: two body names, or a body name and "table".
+        table: m, height of the table in the base frame; -inf: no table. table=None: a table at TABLE_M, or no table
+            if the arm reaches below TABLE_M at q_home, as a hanging arm does.
+        may_touch: pairs that the check omits, each of two body names or of a body name and "table".
 
     Raises:
         UserError: a checked pair touches at q_home.
@@ -231,7 +232,7 @@ def body_poses(links, bodies, q, frames, poses):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
-    """Return the distance, m, of pair k, or a lower bound above `enough` m; `work` (10, 3) is a scratch array."""
+    """Return the distance, m, of pair k, or a lower bound that exceeds `enough` m; work: (10, 3), scratch array."""
     bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]

@@ -1,19 +1,21 @@
 """Solve a 1 ms step of a tip's contact with a surface, by a method implicit in stiffness, damping and friction.
 
 The normal force is the mean of Hunt and Crossley's force (surface.py) over the step. The mean of K d^e from depth d0
-to depth d1 is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of its potential V (Gonzalez, J. Nonlinear Science 6,
-1996). A discrete gradient conserves the energy of a bounce at any stiffness, even if contact begins or ends within
-the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions, so d0 = d - h rate
-/ 2 and d1 = d0 + h (rate + rate1) / 2 for penetration rates rate and rate1 before and after the step.
+to depth d1 is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of the potential V of K d^e (Gonzalez, J. Nonlinear
+Science 6, 1996). A discrete gradient conserves the energy of a bounce at any stiffness, even if contact begins or
+ends within the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions. With
+the penetration rates rate before and rate1 after the step, d0 = d - h rate / 2 and d1 = d0 + h (rate + rate1) / 2.
 
 The stiffness of tangential bristles is proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
 1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with z_s = `bristle`. The friction
--mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; sliding friction: mu F.
+-mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; a sliding tip has the
+friction mu F.
 
-The unknowns are the joint velocities at the end of the step. Normal force and friction are linearized about a guess
-of the unknowns; the constant part adds to the driving torque, the linear part to the mass matrix. stick_slip.py
-adds joint stiction, so contact can move resting joints. `start_guess` writes the first guess. `add_contact`,
-`coming_velocity` and `next_guess` run until the guess is accurate, usually once. `finish_contact` ends the step.
+The unknowns of a contact step are the joint velocities at its end. Normal force and friction are linearized about a
+guess of the unknowns: the constant part adds to the driving torque, the linear part adds to the mass matrix.
+stick_slip.py solves stiction together with contact, so contact can move a resting joint. `start_guess` writes the
+first guess. `add_contact`, `coming_velocity` and `next_guess` repeat until the guess is accurate, usually in one
+round. `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -74,7 +76,7 @@ SHORT = 1e-6  # ratio |d1 - d0| / depth below which V(d1) - V(d0) is round-off; 
 def mean_force(contact, begin, rate, coming, h):
     """Return a step's mean normal force, N, and its derivative with respect to `coming`, N s/m.
 
-    begin: m, penetration depth at the beginning. rate, coming: m/s, penetration rates at the beginning and end.
+    begin: m, depth at the step's beginning. rate, coming: m/s, penetration rates at the step's beginning and end.
     """
     middle = 0.5 * (rate + coming)
     span = h * middle
@@ -130,7 +132,7 @@ def _from_box(contact, x, y, z):
 
 @njit(cache=True, error_model="numpy")
 def near(contact, place, anchor, axis, dq, h, jacobian):
-    """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch in this step.
+    """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch the surface.
 
     Call `near` only once per step: if the tip cannot touch the box, `near` also moves a sliding box by one step.
 
@@ -181,7 +183,7 @@ def near(contact, place, anchor, axis, dq, h, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def _box_rate(contact):
-    """Return the part of the penetration rate, m/s, that the box's motion causes."""
+    """Return the contribution of the box's motion to the penetration rate, m/s."""
     point, rate = np.empty(3), 0.0
     contact_point_velocity(contact, contact[VELOCITY : VELOCITY + 4], point)
     for k in range(3):
@@ -216,7 +218,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Return penetration rate and sliding speed, m/s, relative to a box velocity `point` (3,) m/s; update `slide`."""
+    """Return penetration rate and sliding speed, m/s, on a box that moves at `point` (3,) m/s; update `slide`."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]
@@ -320,7 +322,7 @@ def finish_contact(contact, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _deflect(contact, slide, speed, h, terms):
-    """Write force, and deflection after h s at `slide` (3,) m/s; terms: normal force N, spring N/m, damper N s/m."""
+    """Write contact force and new deflection; slide: (3,) m/s, velocity. terms: force N, spring N/m, damper N s/m."""
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0
     z = contact[DEFLECTION : DEFLECTION + 3]
@@ -359,7 +361,7 @@ def contact_torque(contact, jacobian, out):
 
 @njit(cache=True, error_model="numpy")
 def contact_velocity(touch, mass, damping, h, forces, dq_min, work, coming):
-    """Solve a step in contact: write final joint velocities (n,) rad/s to `coming`, contact results to `contact`.
+    """Solve a step in contact: write final joint velocities (n,) rad/s to `coming` and results to `contact`.
 
     Args:
         touch: arrays `contact` (COLUMNS,) and `jacobian` (ROWS, n) of `near`. work: (2 n + 6, n), scratch array.

@@ -1,14 +1,15 @@
 """Stop an arm whose tip presses on a surface: hold the contact force, release the tip, or retreat.
 
-If a stop only removed the command, the surface's elastic energy F^2 / 2k would push the tip off by up to F / k, or
-joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver has three kinds of stop:
+Without a command, the elastic energy F^2 / 2k of a surface with stiffness k would push the tip off by up to F / k, or
+joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver therefore has three stops:
 
-- hold: the target torque is J^T R with the push limit's estimate R of the force at the stop's start. The arm rests.
-- release: the tip moves outward at the speed LEAVE until the contact force F is gone. A velocity loop tracks the
-  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains the present R and the modeled
-  friction force h; for an arm with more friction, an integral adds at most h. Joint friction pushes an outward moving
-  tip inward with h, so R = F - h. The motion ends when R falls to RELEASED - SLIDES h. The remaining contact force is
-  at most RELEASED + (1 - SLIDES) h for a true friction of at most h, and RELEASED for a true friction of SLIDES h.
+- hold: the target torque is J^T R, where R is the push limit's estimate of the initial contact force. The arm rests.
+- release: the tip moves outward at the speed LEAVE until the contact force F vanishes. A velocity loop tracks the
+  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains the present R and the force h of
+  modeled joint friction at the tip; for an arm with more friction, an integral adds at most h. On a tip that moves
+  outward, joint friction exerts the inward force h, so R = F - h. The release ends when R falls to RELEASED - SLIDES
+  h. If true friction is at most h, the remaining contact force is at most RELEASED + (1 - SLIDES) h; if true friction
+  is SLIDES h, at most RELEASED.
 - retreat: the arm releases the tip, then moves the tip RETREAT_M farther outward.
 
 Every stop obeys the limits of push, speed and acceleration, and every outward motion ends after LEAVES_S.
@@ -33,11 +34,11 @@ BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
 @njit(cache=True, error_model="numpy")
 def stop_torque(limit, arm, kinematics, friction, limits, held, target):
-    """Write a stop's target torque (n,) Nm for a cycle; return the largest requested share of an allowed joint speed.
+    """Write a stop's target torque (n,) Nm for a cycle; return the largest ratio of requested to allowed joint speed.
 
     Args:
         limit, arm, kinematics, friction: see `push_bound`. limits: see `filter_limits`.
-        held: (n,) Nm, an adapter's torque against a load; this function subtracts the load's force from R.
+        held: (n,) Nm, adapter torque that holds a load; `stop_torque` subtracts the load's force from R.
     """
     n = len(target)
     root, row, lever, ddq = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

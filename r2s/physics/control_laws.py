@@ -10,7 +10,7 @@ A control law is a compiled function `law(q, dq, command, parameters, memory, ou
 
 Training runs a control law in MuJoCo's callback (mujoco_callback.py), and every arm runs the same law in the driver
 (r2s/arm/driver.py) or in an exported bundle. The package r2s/control selects the control law and its parameters.
-The laws share the folder r2s/physics with MuJoCo's callback, because numba caches compiled code per folder.
+Control laws share the folder r2s/physics with MuJoCo's callback, because numba caches compiled code per folder.
 """
 
 from collections.abc import Callable
@@ -24,10 +24,10 @@ from r2s.physics.user_laws import call_control, control_address
 
 
 class ControlLaw(Protocol):
-    """Interface of a control law with parameters, which `Controller` in r2s/control/controller.py implements.
+    """Interface of a control law and its parameters; `Controller` (r2s/control/controller.py) implements it.
 
     Attributes:
-        law: compiled function. parameters: (p,), of the law. command_size, memory_size: sizes of command and memory.
+        law: compiled function. parameters: (p,). command_size, memory_size: numbers of values in command and memory.
     """
 
     @property
@@ -42,7 +42,7 @@ class ControlLaw(Protocol):
 
 @njit(cache=True, error_model="numpy")
 def torque_law(q, dq, command, parameters, memory, out):
-    """Write the command as the torque: `control=torque`."""
+    """Write the command to `out` as target torque, for `control=torque`."""
     for j in range(len(q)):
         out[j] = command[j]
 
@@ -51,7 +51,7 @@ def torque_law(q, dq, command, parameters, memory, out):
 def computed_torque_law(q, dq, command, parameters, memory, out):
     """Write the computed torque: feedforward plus a critically damped PD law, weighted with the mass matrix.
 
-    Every `hold` cycles, tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)).
+    Every `hold` cycles, the law computes tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)).
 
     command: command torque (n) and feedforward (n) Nm, q_d (n) rad, dq_d (n) rad/s, mass matrix M (n n) kg m^2.
     parameters: bandwidth w, rad/s, and number `hold` of cycles between two updates of tau.

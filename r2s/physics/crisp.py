@@ -1,7 +1,8 @@
 """Export friction parameters to a YAML file for crisp_controllers (ROS 2), in the form of the paper's eq. (5).
 
-The controllers (github.com/utiasDSL/crisp_controllers) add fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
-fp3)) to each joint's torque. r2s fits this law to an arm's friction; a sigmoid without viscous term needs no fit.
+crisp_controllers (github.com/utiasDSL/crisp_controllers) adds fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
+fp3)) to each joint's torque. r2s fits fp1, fp2, fp3 to an arm's friction; a sigmoid without viscous term needs no
+fit.
 """
 
 from pathlib import Path

@@ -2,7 +2,7 @@
 
 Masses, centers of mass, inertia tensors, rotor inertias and friction come from `dynamics`, all other values from
 `robot`. In the URDF and SDF files, a link's frame is the joint's frame at angle zero, so inertia tensors need no
-rotated inertial frame, which ignition-physics 5.1 of Gazebo Fortress misreads.
+rotated inertial frame. Ignition-physics 5.1 of Gazebo Fortress misreads rotated inertial frames.
 """
 
 from dataclasses import dataclass
@@ -31,8 +31,8 @@ class Link:
         origin: (4, 4) pose of the joint in the parent link's frame, at angle zero.
         axis: (3,) joint axis, in the joint's frame.
         mass: kg, of the link. com: (3,) m, center of mass, link frame. inertia: (3, 3) kg m^2 about `com`, link axes.
-        damping, stiffness: (3,) polynomial coefficients, the linear one first, in Nm s/rad and Nm/rad. friction: Nm,
-            Coulomb friction. armature: kg m^2, rotor inertia. springref: rad, joint angle without spring torque.
+        damping, stiffness: (3,) polynomial coefficients, the linear coefficient first, Nm s/rad and Nm/rad. friction:
+            Nm, Coulomb friction. armature: kg m^2, rotor inertia. springref: rad, joint angle without spring torque.
     """
 
     name: str
@@ -143,7 +143,7 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as URDF, with a link `ee` at the end effector and armature in Drake's rotor_inertia element.
 
-    URDF itself has no element for armature. r2s and Drake read Drake's element, which other readers ignore.
+    URDF itself has no element for armature. r2s and Drake read the element rotor_inertia; other readers ignore it.
 
     Raises:
         UserError: a joint has a spring or nonlinear damping, which URDF cannot represent.
@@ -221,11 +221,11 @@ def write_world(
 
     The physics step is 1 ms; simulated time runs as fast as possible. The world has no gravity (libfranka's
     convention), no limits of velocity or torque (r2s enforces both), and no friction (r2s applies friction torque).
-    Joint damping of armature / 1 ms replaces rotors (SDF has none); r2s/engines cancels the damping torque.
+    SDF has no rotors: the joint damping armature / 1 ms replaces them, and r2s/engines cancels the damping torque.
 
     Args:
         path: file to write. robot, dynamics: the arm. plugin: the world's plugin element. version: SDF version.
-        physics: type of the physics engine; gz-sim ignores it.
+        physics: type of the physics engine; gz-sim ignores this type.
     """
     links, tip = chain(robot, dynamics, friction=False)
     root = ET.Element("sdf", version=version)
@@ -275,7 +275,7 @@ def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarr
 
 
 def _polynomial(coefficients: np.ndarray) -> str:
-    """Return a polynomial's three coefficients as text, or only the first if the others are 0."""
+    """Return a polynomial's three coefficients as text, or only the first one if the other two are 0."""
     return words(coefficients if coefficients[1:].any() else coefficients[:1])
 
 

@@ -34,18 +34,18 @@ class Dynamics:
         drag: (..., n, 2) Nm, coefficients of sin q and cos q in an angle-dependent offset, such as a cable's torque.
         gain: (..., n), relative error of the link-side torque sensor or of the motor's torque constant; this error
             changes the recorded torque, but not the arm's motion.
-        signal_delay: (...) s, time by which a recording's torque (measured or motor) is later than its joint angles.
-        late_alike: whether a recording's measured torque and dq are treated as equally late, so that identification
+        signal_delay: (...) s, delay of a recording's torque (measured or motor torque) behind its joint angles.
+        late_alike: whether identification treats a recording's measured torque and dq as equally late, and therefore
             uses dq as logged.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: the friction law.
         stiction_model: "command" (eq. (6) of the paper): on a joint at rest, command and offset have no effect while
-            their sum is between the breakaway torques. "net": a joint sticks while the sum of all torques on it,
-            including the coupling to other joints, is between the breakaway torques (r2s/physics/stick_slip.py).
+            their sum is between the breakaway torques. "net": a joint sticks while the sum of all torques except its
+            friction, with the coupling to other joints, is between the breakaway torques (r2s/physics/stick_slip.py).
         delay, lag: (...) s, pure delay and first-order lag of the actuation. After `Simulator.drive`, the simulator
             applies delay and lag; otherwise, `Motors` (r2s/physics/actuation.py) applies them.
-        declared_payload: (..., 4), mass, kg, and first moment, kg m, in the last link's frame, of the payload that is
-            declared to gravity compensation (r2s/physics/payload.py). The real payload is part of the last link.
+        declared_payload: (..., 4), the payload that is declared to gravity compensation (r2s/physics/payload.py):
+            mass, kg, and first moment (3), kg m, in the last link's frame. The real payload is part of the last link.
         surface: surface that `Robot.tool` may touch (r2s/physics/contact.py), one or a batch; None: no surface.
     """
 
@@ -144,9 +144,9 @@ def nominal_dynamics(
     """Return the dynamics that `conf/friction` and `conf/inertia` describe; a scalar value applies to all joints.
 
     phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). With phi1=None, frictionloss and damping in
-    the robot's file are Coulomb and viscous friction; for a joint with neither, phi1 is PHI1 tau_max. family="auto"
-    keeps the sigmoid or Coulomb law; any other family has parameters with the same friction at 1 rad/s. A breakaway
-    torque that is None equals the file's frictionloss.
+    the robot's file are Coulomb and viscous friction; for a joint without frictionloss and damping, phi1 is PHI1
+    tau_max. family="auto" keeps the sigmoid law or, with friction from the file, the Coulomb law; any other family
+    gets the same friction at 1 rad/s. A breakaway torque of None means the file's frictionloss.
 
     Raises:
         UserError: a list has the wrong length, or a value is out of its physical range.

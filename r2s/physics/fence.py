@@ -1,13 +1,14 @@
 """Stop an arm in the driver before it touches itself or the table; the compiled check takes microseconds.
 
 The fence predicts the posture in which the arm would rest if it braked now. In the predicted posture, the bodies of
-each pair of `CollisionCheck` must be FENCE_M apart. At full speed, the bodies must be FENCE_M (1 + SPREAD) apart,
-because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and joints lag
-the ramp by LAG_S. A joint that uses a smaller share of its allowed speed than the fastest joint brakes only when the
-ramp has fallen to this share. As the predicted posture moves continuously, it skips no obstacle.
+each pair of `CollisionCheck` must be at least FENCE_M apart. At full speed, the required distance is FENCE_M (1 +
+SPREAD), because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and
+joints lag the ramp by LAG_S. A joint at a smaller share of its allowed speed than the fastest joint begins to brake
+when the ramp has fallen to its share. The predicted posture moves continuously, so it skips no body.
 
-If two bodies start closer than FENCE_M, the required distance is half of their largest distance in the motion so far,
-at most FENCE_M, so the arm may move them apart. The fence ignores bodies that overlap at first until they separate.
+If two bodies start a motion closer than FENCE_M, the arm may move them apart: the required distance is half of their
+largest distance in the motion so far, but at most FENCE_M. The fence ignores initially overlapping bodies until they
+separate.
 """
 
 from typing import NamedTuple
@@ -32,7 +33,7 @@ class Fence(NamedTuple):
 
 
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return the index (E,) of the pair at which the driver would stop each motion q, dq (E, T, n); -1: no stop.
+    """Return the indices (E,) of the pairs at which the driver would stop the motions q, dq (E, T, n); -1: no stop.
 
     limits: (n, COLUMNS), limits of the joints from `filter_limits`.
     """

@@ -30,15 +30,15 @@ class Family:
         names, units: names and units of the K parameters.
         logarithmic: names of positive parameters that span decades; their search space is logarithmic.
         bounds: search ranges (low, high) of the parameters; `identify.bounds` overrides these ranges.
-        optional: last entries of `names`, parameters that are 0 and not estimated unless `identify.terms` lists them.
+        optional: last entries of `names`; these parameters stay 0 unless `identify.terms` lists them.
         formula: text of the law in one line.
         law: function (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n).
-            `sign` is tanh(dq / 0.01), or the bristle deflection of a law with a memory, in [-1, 1].
+            `sign` is tanh(dq / 0.01) or, for a law with a memory, the bristle deflection, in [-1, 1].
         native: law of a joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
             torque and its derivative at v. `memory` is the state of the joint's friction, 0 after a reset.
         sharp: version of `native` whose torque is discontinuous at v = 0, for stiction_model="net"; None: the law is
             continuous at rest.
-        start: function that maps friction (..., n) Nm at 1 rad/s to start values (a list) of the required parameters.
+        start: function that maps friction (..., n) Nm at 1 rad/s to a list of the required parameters' start values.
         held: function that maps phi (..., n, K) to negative and positive breakaway torques (..., n, 2) Nm of a law
             with memory; None: the law has no stiction, so that eq. (6) or stick_slip.py adds stiction.
 
@@ -73,7 +73,7 @@ class Family:
 
     @property
     def has_memory(self) -> bool:
-        """Whether the law has a memory; such a law contains stiction."""
+        """Whether the law has a memory; a law with memory contains stiction."""
         return self.held is not None
 
     def at_rest(self, phi: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ class Family:
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
         """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of the family `other`.
 
-        The value of a viscous parameter in `phi` is copied if the parameter is not optional in this family.
+        If this family requires a viscous parameter and `phi` contains one, the parameter keeps its value.
         """
         if other == self:
             return phi
@@ -257,7 +257,7 @@ STRIBECK = Family(
 
 @njit(cache=True)
 def _bristle_native(p, v, h, memory):
-    """Return Stribeck friction, LuGre damping; z with dz/dt = (v - |v| z) / presliding (Dahl) replaces sign(v)."""
+    """Return Stribeck friction with LuGre damping; z, dz/dt = (v - |v| z) / presliding (Dahl), replaces sign(v)."""
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
@@ -297,7 +297,7 @@ _imported: dict[str, Family] = {}  # by dotted path
 
 
 def known_families() -> tuple[Family, ...]:
-    """Return the built-in friction families and all those that the function `family` has imported."""
+    """Return the built-in friction families and all families that the function `family` has imported."""
     return (*FAMILIES, *_imported.values())
 
 
@@ -305,7 +305,7 @@ def family(name: str) -> Family:
     """Return a built-in friction family by name, or import a family by dotted path.
 
     Raises:
-        UserError: the family is unknown, or another family uses a parameter's name with another unit or scale.
+        UserError: the family is unknown, or has a parameter of another family with another unit or scale.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:
@@ -337,7 +337,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if `family` would import `name`, which `file` contains, from a module not in `trust`."""
+    """Raise UserError if the friction family `name`, given in `file`, is in a module that `trust` does not list."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(

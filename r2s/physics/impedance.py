@@ -3,14 +3,14 @@
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
 With the damping D = 2 zeta (M # K_q), every mode has the damping ratio zeta. Here M is the mass matrix, K_q = J^T K J
-+ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. D equals the damping of the
-double diagonalization of Albu-Schaeffer et al. (ICRA 2003), without eigenvectors. The null-space projector N is
-dynamically consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a
-potential. When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the
-springs; damping refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich
-et al., RA-L 2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured
-angle, other friction at the reference speed dq_r. A feedforward above the true friction would drive the arm.
-Canceling a bristle stiffness k with a delay d adds damping k sin(w d) / w, positive for frequencies w < pi / d.
++ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. The double diagonalization of
+Albu-Schaeffer et al. (ICRA 2003) yields the same D from eigenvectors. The null-space projector N is dynamically
+consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a potential.
+When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs; damping
+refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al., RA-L
+2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured angle, other
+friction at the reference speed dq_r. A feedforward above the true friction would drive the arm. A feedforward that
+cancels a bristle stiffness k after a delay d adds damping k sin(w d) / w > 0 at frequencies w < pi / d.
 """
 
 import numpy as np
@@ -174,7 +174,8 @@ def spring(s, limit):
     """Return the energy U, J, of a saturating spring for s = e^T K e / 2, J, and the factor on its force K e.
 
     The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. As U depends on s alone, U is a potential of the
-    force for every K, and U rises with K. The force is at most sqrt(2 K limit), so limit = clip^2 / (2 K_high).
+    force for every K, and U rises with K. The force is at most sqrt(2 K limit), and at most clip for limit = clip^2 /
+    (2 K_high).
     """
     if s <= limit:
         return s, 1.0
@@ -208,7 +209,7 @@ def refill(q, n, parameters, memory, at):
 def friction_at(v, row, load):
     """Return a joint's friction, Nm, at v rad/s, including load-dependent friction of `load` Nm.
 
-    `row` contains friction at the speeds FIRST_DQ 4^k; this function interpolates and extrapolates linearly.
+    `row` contains friction at the speeds FIRST_DQ 4^k; `friction_at` interpolates and extrapolates linearly.
     """
     side, k = FRICTION if v >= 0.0 else FRICTION + NODES, 0
     sign = 1.0 if v >= 0.0 else -1.0
@@ -223,10 +224,11 @@ def friction_at(v, row, load):
 def friction_ahead(v, q, j, load, parameters, memory, at):
     """Return the friction feedforward, Nm, of joint j at q rad; v: reference speed of the joint, rad/s.
 
-    With bristles, the feedforward is the deflection z times the smaller of the frictions at reference and at measured
-    speed; the measured dq drives dz/dt = (dq - |dq| z) / presliding (Dahl 1968). Without bristles, the feedforward is
-    the friction at v if APPROACH is 1. Otherwise, the feedforward has the sign of v; for |v| >> DIRECTION_DQ, a joint
-    at rest receives at least the breakaway torque. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
+    With bristles, the feedforward is the deflection z times the smaller of two frictions, at reference and at
+    measured speed. The measured dq drives z: dz/dt = (dq - |dq| z) / presliding (Dahl 1968). Without bristles, the
+    feedforward is the friction at v if APPROACH is 1. Without bristles and with another APPROACH, the feedforward has
+    the sign of v, and a joint at rest receives at least the breakaway torque if |v| >> DIRECTION_DQ. load: Nm,
+    load-dependent friction. at: index of dq_r in `memory`.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j

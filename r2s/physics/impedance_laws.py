@@ -138,7 +138,7 @@ def rotation_error(R, command, parameters, error):
     """Write the rotation error (3,), axis times sine of the angle to the target; return 1 - cosine of this angle.
 
     The sum of the action's and the task's rotation vectors rotates the home orientation to the target orientation.
-    Luh, Walker and Paul define this rotation error (IEEE TAC 1980, eq. 22).
+    Luh, Walker and Paul define the rotation error (IEEE TAC 1980, eq. 22).
     """
     x, y, z = 0.0, 0.0, 0.0
     if parameters[DISPLACED] >= 0.0:
@@ -271,11 +271,12 @@ def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
 def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     """Write the torque of `control=cartesian_impedance` or, with a force along the normal, of `control=hybrid`.
 
-    The command begins with optional parts of the action: target displacement (3) m and, for six axes, (3) rad;
-    stiffness (3) N/m and, for six axes, (1) Nm/rad. The task's target is next: position (3) m, optionally velocity
-    (3) m/s and rotation vector from home (3) rad. `normal_force` describes the next entries, for hybrid control only.
-    If APPROACH > 0, stiffness times the depth of the target below the tip bounds the normal force. If APPROACH is
-    SLIDES, the target is valid for the middle of the control period, and a feedforward force (3) N ends the command.
+    The command begins with the optional action: target displacement (3) m and, for six axes, (3) rad; stiffness (3)
+    N/m and, for six axes, (1) Nm/rad. The task's target follows the action: position (3) m, optionally velocity (3)
+    m/s and rotation vector from home (3) rad. For hybrid control, the entries that `normal_force` describes follow
+    the target. If APPROACH > 0, stiffness times the depth of the target below the tip bounds the normal force. If
+    APPROACH is SLIDES, the target is valid for the middle of the control period, and the command ends with a
+    feedforward force (3) N.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     frames, jacobian, place, velocity = np.empty((n, POSE)), np.empty((6, n)), np.empty(3), np.zeros(3)

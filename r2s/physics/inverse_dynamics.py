@@ -58,7 +58,7 @@ class InverseDynamics:
         return out
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n) Nm by which the joints hold the links at rest at q (m, n) rad."""
+        """Return the torque (m, n) Nm with which the joints hold the links at rest at q (m, n) rad."""
         return self._at_rest(self._links[0], q)
 
     def load_friction(self, q: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ class InverseDynamics:
 
 @njit(cache=True, error_model="numpy")
 def _rigid(links, nominal, gravity, armature, motion, out, full_gravity):
-    """Write the torque (m, n) Nm for a motion (q, dq, ddq); full_gravity: whether to include all gravity torque."""
+    """Write the torque (m, n) Nm for (q, dq, ddq); full_gravity: include the gravity that the arm compensates."""
     q, dq, ddq = motion
     m, n = q.shape
     mass, bias, compensated, at_rest = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

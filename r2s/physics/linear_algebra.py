@@ -1,9 +1,9 @@
 """Factor and solve small symmetric positive definite systems by Cholesky's method, in compiled code.
 
-For 7 joints, compiled loops are faster than a LAPACK call. Here, the root of a matrix A = L L^T is L with 1 / L[i, i]
-on the diagonal, so `solve` multiplies instead of divides (Golub and Van Loan, Matrix Computations, 4th ed. 2013,
-section 4.2). A packed matrix is an array (n (n + 1) / 2,) of the lower triangle, row by row, as MuJoCo stores the
-mass matrix of a serial arm.
+For 7 joints, compiled loops are faster than a LAPACK call. In this module, the root of a matrix A = L L^T is L with 1
+/ L[i, i] on the diagonal, so `solve` multiplies instead of divides (Golub and Van Loan, Matrix Computations, 4th ed.
+2013, section 4.2). A packed matrix is an array (n (n + 1) / 2,) of the lower triangle, row by row, as MuJoCo stores
+the mass matrix of a serial arm.
 """
 
 import numpy as np

@@ -1,14 +1,15 @@
 """Add friction, control law, safety filter and motors to MuJoCo's physics step, by a compiled callback.
 
 `install()` registers a native control callback. The callback reads each arm's parameters from `jnt_user`, so a batch
-of different arms runs at full speed. The callback computes friction (friction.py) and, after `Simulator.drive`,
-control law (control_laws.py), safety filter (safety_filter.py) and motor delay (actuation.py), which act every
-millisecond. Stiction (stick_slip.py) and contact (contact.py) need the sum of all other forces, so r2s uses the
-control callback: MuJoCo calls this callback last before MuJoCo computes accelerations.
+of different arms runs at full speed. In each physics step, the callback computes friction (friction.py) and, after a
+call of `Simulator.drive`, control law (control_laws.py), safety filter (safety_filter.py) and motor delay
+(actuation.py). MuJoCo calls the control callback last before it computes accelerations, so the callback knows the sum
+of all other forces, which stiction (stick_slip.py) and contact (contact.py) need.
 
 A linearly implicit method integrates the friction torque tau_f. With D = d tau_f / dv >= 0 at the current velocity v,
-the callback adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. A step
-is accurate to first order, and stable even for real wrist joints: slopes of 3-10 Nm s/rad, 0.004-0.012 kg m^2.
+the callback adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. The
+method is accurate to first order, and stable even for real wrist joints with D = 3-10 Nm s/rad and 0.004-0.012 kg
+m^2.
 """
 
 from collections.abc import Callable
@@ -124,7 +125,7 @@ def install() -> Any:
     """Register the callback, once per process; the callback ignores models without MARKER in `jnt_user`.
 
     Returns:
-        The compiled function. The cache keeps it alive, because MuJoCo holds only the address.
+        The compiled function. The cache keeps the function alive, because MuJoCo holds only the function's address.
     """
     signature = types.void(types.CPointer(types.int64), types.CPointer(types.int64))
     compiled = cfunc(signature, error_model="numpy", cache=True)(_force_at(struct_offsets(WIDTH, KEPT)))
@@ -179,7 +180,8 @@ def _friction(sizes, user, q, dq, forces, places):
 
     Args:
         sizes: numbers of joints and of bodies. user: (n, WIDTH), columns of `jnt_user`.
-        forces: addresses of damping, applied, passive, bias, M, userdata. places: of xpos, xmat, xanchor, xaxis.
+        forces: addresses of damping, applied, passive, bias, M, userdata.
+        places: addresses of xpos, xmat, xanchor, xaxis.
     """
     n, nbody = sizes
     q, dq = carray(as_doubles(q), (n,)), carray(as_doubles(dq), (n,))  # type: ignore[call-arg]
@@ -243,7 +245,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by the control law's torques; a constant n would add a minute of compiling."""
+    """Replace the applied torques by the control law's torques; compiling for a constant n takes a minute longer."""
     user = carray(as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(as_doubles(fields[0]), (n,)), carray(as_doubles(fields[1]), (n,))
     applied, kept = carray(as_doubles(fields[2]), (n,)), carray(as_doubles(fields[5]), (KEPT, n))

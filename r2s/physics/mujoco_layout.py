@@ -16,7 +16,8 @@ DATA_FIELDS = (  # in the order of mujoco_callback.py
 def struct_offsets(width: int, kept: int) -> dict[str, int]:
     """Return the byte offsets of MODEL_FIELDS in mjModel and DATA_FIELDS in mjData, found in a live model.
 
-    An array's pointer equals the address of its NumPy view; MuJoCo's introspection lists the sizes in order.
+    A field that contains the address of an array's NumPy view is the array's pointer. MuJoCo's introspection lists
+    the size fields in the order of the struct.
 
     Args:
         width: number of columns of `jnt_user` in the live model. kept: number of rows of `userdata` (kept, n).

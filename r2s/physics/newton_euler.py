@@ -21,7 +21,7 @@ WORK = 22  # columns of the work array of `equations`
 
 
 def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return `links` (n, LINK) from masses (n,) kg, centers of mass (n, 3) m and central tensors (n, 3, 3) kg m^2."""
+    """Return `links` (n, LINK) from masses (n,) kg, mass centers (n, 3) m and tensors (n, 3, 3) kg m^2 about them."""
     own = replace(Dynamics.of(robot, np.zeros((robot.n, 3))), mass=mass, com=com, inertia=inertia)
     rows = [
         [*link.origin[:3, 3], *link.origin[:3, :3].flat, *link.axis, link.mass, *link.com, *link.inertia.flat]

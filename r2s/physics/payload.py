@@ -1,8 +1,8 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A payload changes mass, center and inertia tensor of the last link, an exact model in every simulator. An
-external force could not represent a payload, because the force would depend on the acceleration that it causes. The
-payload's frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
+r2s adds a payload to mass, center and inertia tensor of the last link, which is exact in every simulator. An external
+force could not represent a payload, because the force would depend on the acceleration that it causes. The payload's
+frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload")
     `on_s` and `off_s`. A string is the path of an identification's payload.yaml or run folder.
 
     Args:
-        value: the setting. name: its name in error messages. most: kg and m, as `Robot.payload_max`.
+        value: the setting. name: the setting's name in error messages. most: kg and m, as `Robot.payload_max`.
 
     Raises:
         UserError: mass, centre, tensor or time is out of range, or a file is missing; the message begins with `name`.
@@ -214,7 +214,7 @@ class LoadTorque:
         """Return the joint torque (n,) Nm that holds the body at q (n,) rad.
 
         Args:
-            load: (4,) kg, kg m, from `mass_and_moment`. gravity: (3,) m/s^2, base frame; None: `Robot.gravity`.
+            load: (4,) kg, kg m, result of `mass_and_moment`. gravity: (3,) m/s^2, base frame; None: `Robot.gravity`.
         """
         if not load.any():
             return np.zeros(len(q))

@@ -5,25 +5,25 @@ m = 1 / (J M^-1 J^T) along this normal (Khatib, IEEE J. Robotics and Automation 
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
-Here P is the push of the command, F >= 0 the contact force, and P_f the push of joint friction, with |P_f| <=
+P is the push of the command, F >= 0 is the contact force, and P_f is the push of joint friction, with |P_f| <=
 `hidden` = m |J M^-1| friction. Every millisecond, the push limit enforces two rules:
 
 - Force: P + hidden <= force_max.
-- Speed: dv/dt <= RATE (v_max - v). With an estimate R of the force against the push, the rule reads P <= R + m RATE
-  (v_max - v). The allowed speed v_max is `speed_near` / OVERSHOOT at the surface and grows with the tip's height.
+- Speed: dv/dt <= RATE (v_max - v). With an estimate R of F - P_f, the speed rule is P <= R + m RATE (v_max - v). The
+  allowed speed v_max is `speed_near` / OVERSHOOT at the surface and grows with the tip's height.
 
 The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. In
 free motion, R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, R is P, so the speed rule
 allows P to rise. If the tip is faster than v_max or leaves the surface, the push limit caps R at 0.
 
-On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m): when F
-exceeds force_max, the tip's speed is at most speed_near, and from then on P + P_f - F < 0 brakes the tip. Surface
-friction mu F pushes a sliding tip inward with up to mu c F, where c = m |T J M^-1 J^T n| with the full Jacobian J and
-the projection T across the normal n. Therefore, (1 - mu c) F replaces F in the bound for a surface with friction.
+On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). When F
+exceeds force_max, the tip's speed is at most speed_near, and P + P_f - F < 0 brakes the tip. Surface friction mu F
+pushes a sliding tip inward with up to mu c F, where c = m |T J M^-1 J^T n| with the full Jacobian J and the
+projection T across the normal n. In the bound for a surface with friction, (1 - mu c) F therefore replaces F.
 
 The force rule and the speed rule restrict the torque to two half-spaces with the same normal J M^-1. Of all torques
-in both half-spaces, Gauss' principle selects the one nearest to the target: the target minus J^T f with a force f.
-Regula falsi finds the f whose torque also satisfies the acceleration bounds (safety_filter.py).
+in both half-spaces, Gauss' principle selects the one nearest to the target torque: the target torque minus J^T f.
+Regula falsi finds the force f whose torque also satisfies the acceleration bounds (safety_filter.py).
 """
 
 from dataclasses import dataclass
@@ -119,7 +119,8 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None: at home, at most 2 force_max on 1e5 N/m.
+        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None: the speed at which contact at home, with
+            1e5 N/m, causes at most 2 force_max.
         plane: point and normal; None: a work table below the home posture's tip. asked: N, a task's largest force.
         stop: a key of STOPS (contact_stop.py); None: "release".
 
@@ -149,9 +150,9 @@ def push_limit(
 
 @njit(cache=True, error_model="numpy")
 def tip_motion(limit, kinematics, dq, row):
-    """Write the Jacobian J (n,) m/rad into `row`; return height, m, normal and lateral speed, m/s, dJ/dt dq, m/s^2.
+    """Write the Jacobian J (n,) m/rad into `row`; return the tip's height, m, two speeds, m/s, and dJ/dt dq, m/s^2.
 
-    The height is above the highest possible true plane. The normal speed is inward, the lateral one along the plane.
+    The height is above the highest possible true plane. The speeds are inward and along the plane.
     """
     position, R, anchor, axis = kinematics
     a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
@@ -231,7 +232,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit push and joint accelerations of the torques `out` (n,) Nm, with the contact force as a load.
+    """Limit push and joint accelerations due to the torques `out` (n,) Nm and the contact force.
 
     Return whether `out` changed. `push_bound` explains the arguments, `filter_torque` explains `share` and `limits`.
     """

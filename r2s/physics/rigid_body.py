@@ -62,7 +62,7 @@ def regressor(
     a = np.zeros((samples, 3)) - (0.0 if gravity is None else np.asarray(gravity))  # gravity as a base acceleration
 
     def at(a, omega, alpha, arm):
-        """Return the acceleration, m/s^2, of the point at `arm`, m, from a point with the acceleration `a`."""
+        """Return the acceleration, m/s^2, of a point at the offset `arm`, m, from a point with acceleration `a`."""
         return a + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
 
     basis = np.zeros((6, 3, 3))
@@ -167,7 +167,7 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def set_links(
     model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
 ) -> None:
-    """Set a model's masses (n,) kg, centers of mass (n, 3) m, tensors about these (n, 3, 3), armature (n,) kg m^2."""
+    """Set a model's masses (n,) kg, centers (n, 3) m, tensors (n, 3, 3) about the centers, armature (n,), kg m^2."""
     at = model.jnt_bodyid
     model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com
@@ -192,7 +192,7 @@ class Kinematics:
 
 
 class InverseInertia:
-    """Inverse mass matrices of m nominal arms; 1 / element (j, j) is joint j's inertia if all joints can move."""
+    """Inverse mass matrices H of m nominal arms; if all joints can move, the inertia at joint j is 1 / H[j, j]."""
 
     def __init__(self, robot: Robot, m: int = 1):
         model = robot.model(gravity=False)

@@ -3,7 +3,7 @@
 r2s commands joint torques, so `Robot.model` has the file's joints and links, but no actuators, sensors, keyframes,
 free objects, gravity compensation or contacts. The file's damping and frictionloss are nominal values of the friction
 law (dynamics.py), so `Robot.model` sets both to 0, but keeps nonlinear damping. The file's armature is the nominal
-rotor inertia. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
+rotor inertia. `robot.mjcf=FILE` loads any serial arm of hinge joints.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +44,7 @@ class Robot:
         q_min, q_max: (n,) rad, position limits; -inf and inf for a continuous joint.
         dq_max, ddq_max: (n,) rad/s and rad/s^2, velocity and acceleration limits.
         tau_max, dtau_max: (n,) Nm and Nm/s, limits of torque and torque rate.
-        q_home: (n,) rad, start of episodes and excitations.
+        q_home: (n,) rad, home posture, in which episodes and excitations start.
         ee_site: the site of `model` that is the end effector.
         gravity: (3,) m/s^2 in the base frame.
         mass, com: (n,) kg and (n, 3) m, nominal mass and center of mass of each moving link, link frame.
@@ -92,7 +92,7 @@ class Robot:
 
     @property
     def q_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """(low, high), (n,) rad: position limits; a range above 2 pi is cut to at most pi on either side of home."""
+        """Position limits (low, high), (n,) rad; a range above 2 pi is cut to at most pi on either side of home."""
         more = self.q_max - self.q_min > 2 * np.pi
         low = np.where(more, np.maximum(self.q_min, self.q_home - np.pi), self.q_min)
         return low, np.where(more, np.minimum(self.q_max, self.q_home + np.pi), self.q_max)
@@ -171,14 +171,14 @@ def load_robot(
 ) -> Robot:
     """Read an arm from an MJCF or URDF file; arguments except `mjcf` override values of the file.
 
-    The file has position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
-    its motor) and q_home, as a keyframe named home; a URDF also has velocity limits. MJCF and URDF have no limits of
+    r2s reads position limits, torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
+    its motor), q_home (a keyframe named home) and, from a URDF, velocity limits. MJCF and URDF have no limits of
     acceleration or torque rate. r2s ignores `gravcomp`, disabled gravity and objects on free joints in the file.
 
     Args:
         mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; None: the Panda.
         ee: site, body or link of the end effector; None: the only site, or the last link of a URDF.
-        q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; None: from the file or a default.
+        q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; None: the file's value or a default.
         gravity: (3,) m/s^2 in the base frame; None: the file's gravity or, for a URDF, gravity of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's armature.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
@@ -246,7 +246,7 @@ def _limits(
     q_home: list[float] | None,
     tau_max: list[float] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return checked q_min, q_max, q_home (n,) rad and tau_max (n,) Nm; an argument None becomes the file's value."""
+    """Return checked q_min, q_max, q_home (n,) rad and tau_max (n,) Nm; None: the file's value."""
     limited = model.jnt_limited.astype(bool)
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
     high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))

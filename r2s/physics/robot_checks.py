@@ -103,7 +103,7 @@ def check_limits(
     """Raise UserError unless position and torque limits are complete and q_home lies within them.
 
     Args:
-        model, path: arm and file. low, high, home: (n,) rad, limits and q_home. torque: (n,) Nm, torque limits.
+        model, path: arm and file. low, high, home: (n,) rad, position limits, q_home. torque: (n,) Nm, torque limits.
         unset: names of joints with a range of 0 to 0 in the file.
     """
     if unset:
@@ -180,7 +180,7 @@ def check_masses(
 
 
 def _weight(model: mujoco.MjModel, gravity: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """Return the largest gravity torque (n,) Nm in POSTURES random postures within pi of home."""
+    """Return each joint's largest gravity torque (n,) Nm in POSTURES random postures within pi rad of home."""
     data, out, most = mujoco.MjData(model), np.empty(model.nv), np.zeros(model.njnt)
     before = model.opt.gravity.copy(), model.opt.disableflags
     model.opt.gravity[:], model.opt.disableflags = gravity, 0

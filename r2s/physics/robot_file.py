@@ -1,4 +1,4 @@
-"""Read the arm in an MJCF or URDF file, without elements of the simulation and with locked joints welded.
+"""Read the arm in an MJCF or URDF file, weld locked joints, and remove elements of the simulation.
 
 The reader removes loose objects of MJCF scenes: bodies with free or ball joints only. A gripper's fingers are welded
 at the positions in `robot.lock`, so the fingers become part of the link that carries the gripper.
@@ -50,7 +50,8 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
 def strip(spec: mujoco.MjSpec) -> None:
     """Remove elements that describe the simulation, not the arm: motors, sensors, keyframes, physics switches.
 
-    Each joint receives the damping of its motor; `rotors` returns the rotor inertia. Call `check_arm` before `strip`.
+    `strip` adds each motor's damping to its joint; `rotors` returns the rotor inertia. Call `check_arm` before
+    `strip`.
     """
     for actuator in spec.actuators:
         joint = spec.joint(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT else None

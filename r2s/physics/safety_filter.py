@@ -5,12 +5,13 @@ the low-pass (r2s/physics/actuation.py). The safety filter consists of three lim
 
 - Fading: the policy's torque fades out as a joint approaches its velocity limit or a position limit.
 - Acceleration limit: each joint's acceleration a = M^-1 (tau - Coriolis torque) satisfies -RATE (v + dq) <= a <= RATE
-  (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within this limit, the filter selects
-  the torque nearest to the effort by Gauss' principle of least constraint: the filter adds torques of fictitious
-  joint stops. Joint friction only widens the limit, so an overestimated friction never accelerates a joint.
-- Rate limit: the filter clips the torque, and limits the torque rate by one factor for all joints. The command
-  therefore moves straight from the last command to the new torque, within the convex set of the acceleration limit.
-  With a separate factor for each joint, the command could leave the convex set if two joint axes are almost parallel.
+  (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within the acceleration limit, Gauss'
+  principle of least constraint selects the one nearest to the effort: the effort plus torques of fictitious joint
+  stops. Joint friction only widens the acceleration limit, so overestimated friction never accelerates a joint.
+- Rate limit: the filter clips the torque, and limits the torque rate by one factor for all joints. With one factor
+  for all joints, the command moves straight from the last command to the new torque, within the convex set of the
+  acceleration limit. With a separate factor for each joint, the command could violate the acceleration limit if two
+  joint axes are almost parallel.
 
 The acceleration limit is a control barrier function (Ames et al., European Control Conference 2019). The command is
 continuous in state and effort, so the filter causes no chattering. RATE is low enough for the latency of an arm.
@@ -68,8 +69,9 @@ class JointDynamics(NamedTuple):
 def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
-    The filter adds to light joints just enough inertia (column ADDED) that the largest target torque of any joint is
-    within the acceleration limit at rest. DELAY_PHASE bounds the added inertia, because it speeds up the loop.
+    For light joints, the filter's mass matrix has just enough added inertia (column ADDED) that the largest target
+    torque of any joint is within the acceleration limit at rest. DELAY_PHASE bounds the added inertia, because added
+    inertia makes the loop faster.
 
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
@@ -168,7 +170,7 @@ def joint_bounds(arm, share, limits, work):
 def bounded(arm, friction, limits, work, desk, out):
     """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether `out` exceeded a bound.
 
-    desk: (n, n), scratch array; if it is `work[:n]`, the bounds can be used only once (the root is overwritten).
+    desk: (n, n), scratch array; if it is `work[:n]`, `bounded` overwrites the root, so the bounds serve only once.
     """
     n, dq = len(out), arm.dq
     ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]

@@ -129,7 +129,7 @@ class Simulator:
         Args:
             limits: (n, COLUMNS), limits of the safety filter, see `r2s.physics.safety_filter.filter_limits`.
             torque_limit: (n,) Nm, largest target torque. cutoff_hz: Hz, cutoff of the torque low-pass.
-            soft_start_s: s, fade-in of the torque in an episode. push_limit: push limit of a tool; None: no limit.
+            soft_start_s: s, time over which torque fades in. push_limit: push limit of a tool; None: no limit.
         """
         u = native
         self._user[:, :, u.LIMITS : u.LIMITS + limits.shape[1]] = limits

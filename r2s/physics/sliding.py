@@ -79,7 +79,7 @@ def contact_point_velocity(contact, motion, out):
 
 @njit(cache=True, error_model="numpy")
 def _grip(contact, speed, h):
-    """Return spring k, N/m, and damper c, N s/m: table friction is -(k z + c u), with z before and u after a step."""
+    """Return k, N/m, and c, N s/m, of table friction -(k z + c u), with z before and velocity u after a step."""
     stiff = contact[LOAD] / RIGID / (1.0 + h * speed / RIGID)
     return stiff, h * stiff
 

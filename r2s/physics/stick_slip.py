@@ -2,10 +2,10 @@
 
 A joint at rest sticks while its net torque lies between its edges, the breakaway torques in the negative and positive
 direction. The net torque includes the coupling to other joints, but not the joint's own friction. If the net torque
-exceeds an edge, the joint slides in the torque's direction. Torques are constant in a step, and accelerations are
+is beyond an edge, the joint slides in the torque's direction. Torques are constant in a step, and accelerations are
 constant between events, so each event is located exactly (event-driven integration: Pfeiffer and Glocker, Multibody
-Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at the end of a step to the whole
-step, so that at each reversal the impulse would have an error of up to the friction times the step h.
+Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at a step's end to the whole step. At
+each reversal, the impulse would then have an error of up to the friction times the step h.
 
 MuJoCo itself adds the forces of the joints' position limits.
 """

@@ -39,9 +39,9 @@ class Surface:
     """A compliant plane or box in the base frame; fields may have batch axes, for many arms at once.
 
     Attributes:
-        point: (3,) m, on the plane, or the center of the box.
+        point: (3,) m, a point on the plane, or the center of the box.
         normal: (3,), unit vector out of the material; for a box, the box's third axis.
-        stiffness: k, N/m, force per depth at a depth of 1 mm. exponent: e, 1 (linear) to 2; 1.5: Hertz's contact.
+        stiffness: k, N/m, force per depth at a depth of 1 mm. exponent: e, from 1 (linear) to 2; 1.5: Hertz.
         damping: c, s/m. friction: mu. bristle: m, tangential deflection at which friction is mu F (0: no deflection).
         half: (3,) m, half edges of a box; None: the surface is a plane. axes: (3, 3), the box's axes as columns.
         mass: kg, mass of a box that slides on a table when pushed (sliding.py); None: the surface is fixed.

@@ -14,7 +14,7 @@ ROUNDS = 60
 
 
 class Tip:
-    """Kinematics of the center of a robot's tip in the nominal geometry.
+    """Kinematics of the center of a tool's spherical tip, with nominal link geometry.
 
     Raises:
         UserError: the robot has no tool.
@@ -51,7 +51,7 @@ class Tip:
 
 
 def tilted(normal: np.ndarray, about: np.ndarray | float, tilt: np.ndarray | float) -> np.ndarray:
-    """Return a normal (3,), or (m, 3) for angles (m, 1), tilted by `tilt` rad in the direction `about` rad."""
+    """Return `normal` (3,) tilted by `tilt` rad in the direction `about` rad: (3,), or (m, 3) for angles (m, 1)."""
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     across /= np.linalg.norm(across)
     aside = np.cos(about) * across + np.sin(about) * np.cross(normal, across)

@@ -38,7 +38,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
     The spec has the file's body and joint names, joint damping and friction. Joints in `lock` ({name: rad or m})
-    become fixed at these positions, and a joint that mimics one of them at the resulting position.
+    become fixed at the given positions, and joints that mimic a locked joint at the resulting positions.
 
     Raises:
         UserError: the file is not XML, not URDF, or not an arm of revolute (or continuous) joints.
@@ -108,7 +108,7 @@ class _Reader:
         return out
 
     def _lock(self, at: dict[str, float]) -> None:
-        """Fix joints at positions `at` ({name: rad or m}), and each joint that mimics one accordingly."""
+        """Fix the joints in `at` ({name: position, rad or m}) and the joints that mimic one of these joints."""
         for name in at:
             if name not in self.joints:
                 joints = choices(self.joints)
@@ -169,7 +169,7 @@ class _Reader:
         return "" if joint is None else joint.get("name", ""), inertia
 
     def _end(self, joint: ET.Element, which: str) -> str:
-        """Return the name of the joint's link that `which` selects: "parent" or "child"."""
+        """Return the name of a joint's parent or child link; which: "parent" or "child"."""
         element = joint.find(which)
         name = element.get("link", "") if element is not None else ""
         if name not in self.links:
@@ -272,7 +272,7 @@ class _Reader:
         return mass, com, axes @ x @ axes.T
 
     def _shapes(self, body: mujoco.MjsBody, link: str) -> None:
-        """Add boxes, cylinders and spheres of a link to its body; only those in <collision> have contact flags."""
+        """Add boxes, cylinders and spheres of a link to its body; only shapes in <collision> have contact flags."""
         kinds = mujoco.mjtGeom
         for tag in ("visual", "collision"):
             for element in self.links[link].findall(tag):

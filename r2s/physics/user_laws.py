@@ -1,8 +1,8 @@
 """Call a user's control or friction law from the cached compiled code of r2s.
 
-Compiling the code of r2s for a new law would take half a minute in every process. So r2s compiles only the law, and
-calls the law by address. A law of r2s has a small number instead of an address. Addresses are below 2^53,
-so that a float64 represents them exactly.
+Compiling the code of r2s for a new law would take half a minute in every process. So r2s compiles only a user's law,
+and calls the law by address. A built-in law has a small number instead of an address. A float64 represents every
+address exactly, because addresses are below 2^53.
 """
 
 from collections.abc import Callable
@@ -112,7 +112,7 @@ def friction_address(law: Callable) -> int:
 
 
 def _address(law: Callable, signature: Any, function: Callable) -> int:
-    """Return the address of the C function with this signature that calls `law`."""
+    """Compile `function`, which calls `law`, as a C function, once per law; return the C function's address."""
     if law not in _compiled:
         try:
             _compiled[law] = cfunc(signature, error_model="numpy")(function)

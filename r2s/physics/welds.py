@@ -62,7 +62,7 @@ def about(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
-    """Return the pose (4, 4) of a position, None for zero, and a rotation, None for the identity."""
+    """Return the pose (4, 4) with a position (3,), None: zero, and a rotation (3, 3), None: identity."""
     pose = np.eye(4)
     if position is not None:
         pose[:3, 3] = position

@@ -12,7 +12,7 @@ ALIKE = 0.05  # if the joints' speed factors spread less than this (relative), t
 
 
 def speed_factors(recording: Recording) -> np.ndarray:
-    """Return each joint's speed factor (n,), change of q over integral of dq; nan if motion does not determine it.
+    """Return speed factors (n,) = change of q / integral of dq; nan for a joint whose motion does not determine it.
 
     In each trajectory, linear trends of q and of the integral of dq are removed, so that a bias of dq has no effect.
     """

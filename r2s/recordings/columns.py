@@ -44,7 +44,7 @@ def _bare(spec: Spec) -> Spec:
 
 
 def _is_current(name: str) -> bool:
-    """Return whether a column name denotes a current, which must not be read as torque."""
+    """Return whether a column name denotes a motor current, which must not be read as torque."""
     base = name.rsplit("/", 1)[-1].lower()
     return "current" in base or re.fullmatch(r"i(_?(\d+|\{[ij]\})|\[\d+\])?", base) is not None
 
@@ -104,7 +104,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
-    """Return the index of the joint in a column name (-1: no joint), and the rest of the name in lower case."""
+    """Return the index of the joint in a column name (-1: no joint), and the remaining name in lower case."""
     lower = column.lower()
     cores = [re.sub(r"^joint_|_joint$", "", joint.lower()) for joint in robot_joints]
     for k in sorted(range(len(cores)), key=lambda k: -len(cores[k])):
@@ -115,7 +115,7 @@ def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
 
 
 def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -> list[str]:
-    """Return each joint's column, whose name has the joint and one of `words`; [] if a joint has no column."""
+    """Return one column per joint, named by the joint and one of `words`; [] if a column is missing."""
     found: dict[str, dict[int, str]] = {}
     for column in table:
         joint, rest = _joint_of(column, robot_joints)
@@ -181,7 +181,7 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Return the error for a missing column; a hint names a similar column or a kind of torque that the file has."""
+    """Return the error for a missing column, with the name of a similar column or of another torque as a hint."""
     if field == "tau" and _match(table, "q", "ddq"):
         return UserError(
             "no torque, but ddq: this is a planned motion; let the arm follow it, and give the arm's own log"

@@ -1,4 +1,4 @@
-"""Read CSV files of spreadsheets, NumPy, ROS and vendors, with their separators, comments, units, decimal commas."""
+"""Read CSV files with the separators, comments, units and decimal commas of spreadsheets, NumPy, ROS and vendors."""
 
 import csv
 import re
@@ -26,7 +26,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     The header is the line above the first numeric line and may begin with `#` or `%`; earlier lines are skipped.
 
     Raises:
-        UserError: the file has no header, or header and rows differ in length.
+        UserError: the file has no header, or header and rows have different numbers of cells.
     """
     head = path.read_bytes()[:HEAD]
     encoding = _encoding(head)

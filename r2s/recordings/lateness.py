@@ -36,7 +36,7 @@ class Lateness:
 
     @property
     def as_logged(self) -> "Lateness":
-        """Copy of this lateness with 0 for finite values of `s`, so that dq stays as logged; nan remains nan."""
+        """Copy of this lateness with 0 for finite values of `s`, so that dq is not corrected; nan remains nan."""
         return replace(self, s=0.0 * self.s)
 
     def corrected(self, smooth: Recording) -> np.ndarray:

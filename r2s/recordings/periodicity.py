@@ -41,7 +41,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return tracks of at least OVERLAP_S: one per stretch (`each`) or per part without restart and long pause."""
+    """Return tracks of at least OVERLAP_S s: one per stretch if `each`, else one between restarts or long pauses."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -75,7 +75,7 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 
 
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
-    """Return the share (0 to 1) of the motion in `other` that occurs in `training`, in all joints at the same time.
+    """Return the share (0 to 1) of the motion in `other` that all joints together also perform in `training`.
 
     A piece of motion occurs in `training` if each joint's RMS distance is below the joint's `_tolerance` in `other`.
     """
@@ -100,7 +100,8 @@ def _deviation(tracks: Sequence[Track]) -> np.ndarray:
 def _tolerance(tracks: Sequence[Track]) -> np.ndarray:
     """Return the RMS distance (n,) rad, per joint, below which two pieces of motion in `tracks` are treated as equal.
 
-    The distance is TRACKING, clipped to the range SIMILAR times the joint's standard deviation (lower bound: STILL).
+    The distance is TRACKING, clipped to the range SIMILAR x s, where s is the joint's standard deviation or, if
+    larger, STILL x the largest standard deviation of all joints.
     """
     deviation = _deviation(tracks)
     return np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -149,7 +150,7 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest ratio (L,), over joints, of RMS distance between a and b to tolerance (n,) rad, at L lags.
+    """Return (L,), at each lag the largest ratio over joints of RMS distance between a and b / `tolerance` (n,) rad.
 
     Also return the number of common rows (L,). The ratio is inf at a lag if the common rows last less than OVERLAP_S,
     or if no joint moves by MIN_MOTION.
@@ -172,7 +173,7 @@ def _own_lag(track: Track, tolerance: np.ndarray) -> int | None:
 
 
 def _lag(a: Track, b: Track, tolerance: np.ndarray) -> int | None:
-    """Return the lag, in rows, at which b repeats a (None: no lag); of several, that with the most common rows."""
+    """Return the lag, in rows, at which b repeats a (None: no lag); of several, the lag with the longest overlap."""
     error, count = _errors(a.q, b.q, tolerance)
     runs = _runs(error < 1.0)
     if not runs:

@@ -93,7 +93,7 @@ def read_ramps(
 
 
 def _saved(table: Table) -> Ramps:
-    """Return the ramps that `Ramps.save` wrote."""
+    """Return the ramps in the table of a file that `Ramps.save` wrote."""
     t, q, dq, tau, trajectory = (table[k] for k in FIELDS)
     motion = Recording(t, q, dq, tau, str(table["torque"]), trajectory, name=str(table["name"]))
     return Ramps(motion, table["joint"], table["sign"], table["pose"])

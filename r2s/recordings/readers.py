@@ -63,12 +63,12 @@ def read(
     Args:
         path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
             LeRobotDataset.
-        torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); None: the file declares it.
-        columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. Default names
-            are in DEFAULT_COLUMNS; for tau, the name in TAU has priority. For q, dq and tau, a name stands for one
-            array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... In a name,
-            `{j}` (from 1) or `{i}` (from 0) stands for the joint number. A list of names has one column name per
-            joint. In HDF5 a column name is the path of a dataset, such as robot/q.
+        torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); None: as the file declares.
+        columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The default names
+            are in DEFAULT_COLUMNS; as a default name of tau, the name in TAU has priority. For q, dq and tau, a name
+            stands for one array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ...
+            In a name, `{j}` (from 1) or `{i}` (from 0) stands for the joint number. A list of names has one column
+            name per joint. In HDF5 a column name is the path of a dataset, such as robot/q.
         n_joints: expected number of joints.
         max_gap_s: s, longest time step within a trajectory; None: see `longest_step`; inf: gaps end no trajectory.
         period: s, period of the motion, see `Recording`.
@@ -85,7 +85,7 @@ def read(
     `Recording.save` wrote is restored unchanged.
 
     Raises:
-        UserError: the file or a column is missing or damaged, or the values are no valid recording.
+        UserError: the file or a column is missing or damaged, or the values do not form a valid recording.
     """
     constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
@@ -150,7 +150,7 @@ def from_table(table: Table, how: Options) -> Recording:
 
 
 def _without_holds(recording: Recording) -> Recording:
-    """Drop rows that repeat earlier values, if the log has more rows per second than new values (see `held`)."""
+    """Drop rows that repeat the values of the previous row, if the log repeats most values (see `held`)."""
     rows = held(recording.t, recording.q, recording.dq, recording.stretches)
     if rows is None:
         return recording
@@ -300,7 +300,7 @@ def _load_npz(path: Path) -> Table:
 
 
 def _load_hdf5(path: Path) -> Table:
-    """Return {path: dataset} for all datasets of at most two dimensions."""
+    """Return {path: dataset} for all datasets of an HDF5 file with at most two dimensions."""
     h5py = optional_import("h5py", "reading this file", "recordings")
     table: Table = {}
 

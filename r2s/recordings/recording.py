@@ -36,7 +36,7 @@ class Recording:
         torque: kind of `tau`: "measured" (by a link-side sensor, with gravity), "commanded" (without gravity) or
             "motor" (motor torque times gear ratio; it contains gravity, all friction and rotor inertia).
         signals: {name from `SIGNALS`: (T,) or (T, k)}, further values that the arm reported; None becomes {}.
-        trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses; None: all 0.
+        trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses; None: zeros.
         period: s, period of the motion on the clock `t` (see `split`); None: no known period.
         notes: remarks of the file reader, such as one line per repair.
         command_period: s, time for which the arm applies each command; None: until the next row.
@@ -247,8 +247,9 @@ class Recording:
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        A repetition lasts at least 0.5 s; the RMS difference of each joint is below a tolerance (about 0.03 rad), and
-        a joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a clock restart.
+        In a repetition, which lasts at least 0.5 s, the RMS difference of each joint is below a tolerance (about 0.03
+        rad), and a joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a clock
+        restart.
         """
         return self._period_and_clock()[0]
 
@@ -278,7 +279,7 @@ class Recording:
     def overlap(self, training: "Recording") -> float:
         """Return the share (0 to 1) of this recording's motion that occurs in `training` (see `periodicity.overlap`).
 
-        Pieces of this recording with too little motion are ignored. The time at which a motion occurs has no effect.
+        Pieces of this recording with too little motion are ignored. The time of a motion does not affect the share.
         """
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
@@ -286,12 +287,12 @@ class Recording:
         """Return (train, validation) without common motion; validation has about `validation_fraction` of the rows.
 
         1. If the motion has a period (argument or attribute), validation is the end of each period: the rows with the
-           largest phase, `t` modulo period. A chronological split could put the same motion in both parts; for
-           example, the recording gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
+           largest phase, `t` modulo period. A chronological split could put the same motion in training and
+           validation; for example, gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
         2. Without a period, but with several trajectories, validation consists of the last trajectories.
         3. Without a period and with one trajectory, validation is the end of the recording.
 
-        Unless whole trajectories are separated (case 2), training has no rows within 0.1 s of a validation row.
+        Except in case 2, which separates whole trajectories, training has no rows within 0.1 s of a validation row.
         Trajectories of a single row are dropped from training and validation.
         """
         if not 0 < validation_fraction < 1:

@@ -77,7 +77,8 @@ def _order(arrays: Arrays) -> np.ndarray | None:
 def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Arrays, list[str]]:
     """Remove jumps of q by a full revolution within a trajectory; return the arrays and a note on each repair.
 
-    limits: (low, high) joint limits, (n,) rad each; shift angles outside by revolutions if this moves them inside.
+    limits: (low, high) joint limits, (n,) rad each; angles outside of the limits are shifted inside by revolutions,
+    if possible.
     """
     q, index = arrays["q"], arrays.get("trajectory")
     if q.ndim != 2 or q.dtype.kind not in "iuf" or len(q) != len(arrays["t"]):

@@ -72,7 +72,7 @@ def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
     """Shift the logged tau_J_d (T, n) Nm by one cycle, so that each state is paired with the next command.
 
     A Franka state at t (T,) s contains the command of the previous cycle, but a `Recording` (`r2s.arm.recorder`)
-    pairs a state with the next command. If the log is slower than the control cycle, shifted commands are
+    pairs a state with the next command. If the log has a longer time step than a control cycle, shifted commands are
     interpolated. The last command is not shifted, because the log contains no later command.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
@@ -99,7 +99,8 @@ def bag_table(
 
     t starts at 0 and comes from the header stamps, or from bag time if all stamps are 0. Messages that lack joints of
     the robot, such as a gripper's, are ignored. Messages are sorted by time, and repeated messages are dropped. The
-    entry `reader_note` counts omitted messages: those with stamp 0, and those before the first complete message.
+    entry `reader_note` counts the omitted messages: messages with stamp 0 and messages before the first complete
+    message.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap file, or the folder of a ROS 2 bag.

@@ -48,14 +48,15 @@ def write_mcap(
     dynamics: Dynamics,
     reference: Mapping[str, np.ndarray] | None = None,
 ) -> list[str]:
-    """Write a bag `path` (.mcap) and a Foxglove layout; return a line for each topic that was left out.
+    """Write a bag `path` (.mcap) and a Foxglove layout; return one line of text for each omitted topic.
 
     The topics are /joint_states (effort is tau), /external_wrench (if the recording has O_F_ext_hat_K), /reference
     (if given), /tf (link poses at 50 Hz or less) and /robot_description (the URDF, latched).
 
     Args:
         robot, dynamics: arm and parameters for the URDF. recording: motion of this arm.
-        reference: planned motion {"t": (T,) s, "q", "dq", "ddq": (T, n)}, which starts with the recording.
+        reference: planned motion {"t": (T,) s, "q", "dq", "ddq": (T, n)}, which starts at the same time as the
+            recording.
 
     Raises:
         UserError: rosbags is not installed, or robot and recording differ in their number of joints.
@@ -121,7 +122,7 @@ class _Messages:
         ]
 
     def wrenches(self, wrench: np.ndarray, ns: np.ndarray) -> list[Message]:
-        """Return messages of `O_F_ext_hat_K` (libfranka): wrench (T, 6) N, Nm that the arm exerts, in base axes."""
+        """Return messages of `O_F_ext_hat_K`: force N and moment Nm (T, 6) that the arm exerts, in base axes."""
         of, stamped = (self._types[f"geometry_msgs/msg/{kind}"] for kind in ("Wrench", "WrenchStamped"))
         return [
             (at, "/external_wrench", stamped(self._header(at), of(force=self._xyz(x[:3]), torque=self._xyz(x[3:]))))

@@ -1,1 +1,1 @@
-"""Report runs: tables, pages, figures, rerun recordings, comparison of runs, trackers."""
+"""Report on runs: tables, pages, figures, rerun recordings, comparisons of runs, and experiment trackers."""

@@ -18,7 +18,7 @@ def doubtful(cell: str) -> bool:
 
 
 def report_markdown(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
-    """Write report.md from {heading: items}; the first heading is the title; links to figures are relative paths."""
+    """Write report.md from {heading: items}, with the first heading as the title and relative links to figures."""
     lines: list[str] = []
     for i, (heading, items) in enumerate(sections.items()):
         lines += [f"{'#' if i == 0 else '##'} {heading}", ""]
@@ -41,7 +41,7 @@ def _markdown(item: Item, folder: Path) -> str:
 
 
 def _rows(table: pd.DataFrame) -> list[list[str]]:
-    """Return the cells of a table, header and index included."""
+    """Return the cells of a table, including its header and its index."""
     head = [str(table.index.name or ""), *map(str, table.columns)]
     return [head, *([str(k), *map(str, row)] for k, row in zip(table.index, table.to_numpy(), strict=True))]
 

@@ -21,7 +21,7 @@ from r2s.runs import Run
 def excitation_page(
     console: Console, run: Run, robot: Robot, motion: Excitation, design: PlannedWidths
 ) -> dict[str, Any]:
-    """Print the expected interval widths of parameters, write report.md, figure and recording; return a summary."""
+    """Print the expected widths of parameter intervals; write report.md, figure and recording; return a summary."""
     table = width_table(design, robot.n)
     print_table(console, table, f"{WIDTHS}, of {design.torque} torque", LEGEND)
     share = {"velocity": np.abs(motion.dq) / robot.dq_max, "acceleration": np.abs(motion.ddq) / robot.ddq_max}

@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Return a page without table rows, so that a table that is not computed again has only a head."""
+    """Remove all table rows of a page, so that a table that no command computes again keeps only its header."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -40,9 +40,10 @@ def without_rows(page: str) -> str:
 def compare_pages(before: str, now: str) -> pd.DataFrame:
     """Compare all cells of two pages; return a row per cell: section, row, column, committed, now, verdict, change.
 
-    `verdict` is one of VERDICTS: with "last digit", numbers differ by at most one unit of their last digits; with
-    "beyond intervals", an interval of the old cell does not overlap with its counterpart in the new cell. `change` is
-    the largest relative change of a number in the cell; NaN without numbers or if the count of numbers changes.
+    `verdict` is one of VERDICTS. The verdict "last digit" means that numbers differ by at most one unit of their last
+    digits. The verdict "beyond intervals" means that an interval in the old cell and its counterpart in the new cell
+    do not overlap. `change` is the largest relative change of a number in the cell, or NaN if the cell has no numbers
+    or if the count of numbers changes.
     """
     old, new = table_cells(before), table_cells(now)
     rows = []

@@ -1,4 +1,4 @@
-"""Write figures and recording.rrd of a training, a transfer or a pipeline, and report.md of the last two."""
+"""Write figures and recording.rrd of a training, transfer or pipeline; write report.md of a transfer or pipeline."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -44,7 +44,7 @@ def transfer(
     stops: Sequence[Stop] = (),
     halted: str | None = None,
 ) -> None:
-    """Save all episodes and the last second before each stop; draw four episodes; write the report.
+    """Save the episodes of a transfer and the last second before each stop, draw four episodes, and write the report.
 
     Args:
         run, robot: the run and its arm. episodes: {simulator or arm: episodes}. rows: {simulator or arm: measures}.

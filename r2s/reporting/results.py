@@ -18,7 +18,7 @@ NOTE = "without interval: the figure has changed, and the page states no interva
 
 
 def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.DataFrame) -> dict[str, Any]:
-    """Print the differing cells; write differences.csv, report.md and a report of all pages; return a summary.
+    """Print the cells that differ; write differences.csv, report.md and a report of all pages; return a summary.
 
     Args:
         run: run folder to write to. page: page name. commit: commit of the new page. cells: table of `compare_pages`.
@@ -38,7 +38,7 @@ def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.Da
 
 
 def all_pages(folder: Path, last: dict[str, Any]) -> None:
-    """Write report.md in `folder` with a row per page, from `last`, the summary of this run, and other summaries."""
+    """Write report.md in `folder` with a row per page, from this run's summary `last` and other runs' summaries."""
     done = {last["page"]: last}
     for path in sorted(folder.glob("*/summary.json")):
         other = json.loads(path.read_text())
@@ -53,7 +53,7 @@ def all_pages(folder: Path, last: dict[str, Any]) -> None:
 
 
 def _shown(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return cells as strings, by verdict (beyond intervals, without interval, others), then by falling change."""
+    """Return cells as strings, by verdict (beyond intervals, without interval, others), then by decreasing change."""
     order = cells.assign(rank=cells["verdict"].map({"beyond intervals": 0, "without interval": 1}).fillna(2))
     order = order.sort_values(["rank", "change"], ascending=[True, False])
     change = order["change"].map(lambda x: "" if pd.isna(x) else f"{100 * x:.0f} %")

@@ -84,9 +84,9 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 
 
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
-    """Return the 95 % cone of the force's direction as lines: the cone's edge, and four lines from tip to edge.
+    """Return the 95 % cone of the force's direction as lines: the edge of the cone, and four lines from tip to edge.
 
-    In each direction normal to the force, half the force's 95 % interval separates the edge from the arrow's end.
+    Normal to the force, the edge is half the width of the force's 95 % interval away from the end of the arrow.
     """
     size = max(float(np.linalg.norm(force)), 1e-9)
     across = np.linalg.svd(force[None] / size)[2][1:]

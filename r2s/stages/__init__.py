@@ -1,1 +1,1 @@
-"""Stages, one file each; only the stages and the command line read the config."""
+"""Stages of r2s, one module each; only stages and the command line read the config."""

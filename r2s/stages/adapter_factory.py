@@ -29,7 +29,7 @@ def calibrated(calibration, robot, trust=()):
 
 
 def free_recordings(calibration):
-    """Return the recordings without contact from which the arm was identified, if their files still exist.
+    """Return the recordings from which the arm was identified, without contact, if their files still exist.
 
     If the recordings do not suffice to compute a contact threshold, print the reason and return [].
     """
@@ -52,7 +52,7 @@ def free_recordings(calibration):
 
 
 def _given_recordings(folder):
-    """Return the user's recordings with commanded torque and without payload in a run of stage=identify.
+    """Return a stage=identify run's recordings from user files, with commanded torque and without payload.
 
     Raises:
         UserError: a file cannot be read with the settings of the run's config.
@@ -113,7 +113,7 @@ def make_adapter(cfg, robot, source):
 def calibration_of(cfg, source):
     """Return the run folder with the adapter's model: adapt.calibration, or the calibration of the policy's training.
 
-    Prefer the identification's folder to the training's copy, because only an identification has recordings.
+    Prefer the identification's folder to its copy in the training, because only an identification has recordings.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)

@@ -57,7 +57,7 @@ def make_robot(cfg):
 def make_dynamics(cfg, robot, announce=False):
     """Return the dynamics of `base_dynamics`, prepared for contact if the task of conf/task touches a surface.
 
-    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. If
+    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. With
     `announce`, print a line if contact changes the stiction model.
     """
     dynamics = base_dynamics(cfg, robot)
@@ -146,7 +146,7 @@ def _arm_settings(cfg, robot, task=None):
 
 @contextmanager
 def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
-    """Yield the arm of conf/arm; close it afterwards if it is a context manager.
+    """Yield the arm of conf/arm; close the arm afterwards if its class is a context manager.
 
     Ctrl-C and similar signals stop the motion of the arm, unless the arm is a twin.
 
@@ -177,7 +177,7 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
 def ends_sweep(cfg):
     """End the whole sweep, not only this job, if the `with` block raises an error and the arm is not a twin.
 
-    In a sweep that continues, the next job could move the arm before the operator knows the cause of the error.
+    If the sweep continued, the next job could move the arm before the operator knows the cause of the error.
     """
     try:
         yield
@@ -233,7 +233,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
 
 @contextmanager
 def opened_source(cfg, robot, noise):
-    """Yield the arm to record: with data=simulated a simulated arm with known parameters, else the arm of conf/arm.
+    """Yield the arm to record: a simulated arm with known parameters for data=simulated, else the arm of conf/arm.
 
     noise: index of the random stream for sensor noise; successive recordings of a run use 0, 1, 2, ...
     """
@@ -256,7 +256,7 @@ def within_speed_share(cfg, robot):
 
 
 def check_source(cfg, robot):
-    """Raise UserError if a simulated arm for a recording cannot be made; do not connect to a physical arm."""
+    """Raise UserError if r2s cannot make the simulated arm for a recording; do not connect to a physical arm."""
     if cfg.data.kind == "simulated" or is_simulated(cfg):
         with opened_source(cfg, robot, 0):
             pass
@@ -343,7 +343,7 @@ def all_threads(cfg):
 
 
 def set_threads(cfg, threads=None):
-    """Set torch's seed and torch's number of threads (default: all); the physics has its own threads."""
+    """Set the seed and the number of threads of torch (default: all threads); the physics has its own threads."""
     import torch
 
     torch.set_num_threads(threads or all_threads(cfg))

@@ -35,7 +35,7 @@ def check_data(cfg, to):
 
 
 def judged(cfg, robot, file, validation):
-    """Return the verdict on the recording that `file` (`FileData`) describes, and this recording."""
+    """Return the verdict on the recording that `file` (`FileData`) describes, and the recording."""
     from r2s.identification.checks import check_recording
     from r2s.identification.verdict import judge, with_validation
 

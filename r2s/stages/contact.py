@@ -25,7 +25,7 @@ class ContactData:
 def contact_data(cfg, robot, file):
     """Return the `ContactData` from data.contact and data.contact_validation; None without data.contact.
 
-    file: `FileData` of the config, which names the columns of the files.
+    file: `FileData` of the config, with the column names of the files.
 
     Raises:
         UserError: the tool, commanded torque or data.contact is missing, or a file is invalid.
@@ -48,7 +48,7 @@ def contact_data(cfg, robot, file):
 
 
 def stated_stiffness(cfg, robot):
-    """Return the prior of gear stiffness from identify.gears.stiffness and .accuracy; None if unset.
+    """Return the prior of gear stiffness from identify.gears.stiffness and identify.gears.accuracy; None if unset.
 
     Raises:
         UserError: a value is invalid.

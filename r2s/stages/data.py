@@ -26,7 +26,7 @@ class ArmData:
         excitation: file of the training motion; None: r2s optimizes this motion.
         ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
         presses: number of contact motions (press and slide), which replace all motions without contact; 0: none.
-        press_point, press_normal: (3,) m and (3,), nominal plane; None: work table below the tip in the home posture.
+        press_point, press_normal: nominal plane, point (3,) m and normal (3,); None: table below the tip at q_home.
 
     Raises:
         UserError: a value is outside its range.
@@ -114,7 +114,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with the hold from data.command_hz; if unset, print an assumed hold above SLOW_MS."""
+        """Return the recording with the hold of data.command_hz; without it, print an assumed hold above SLOW_MS."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -240,7 +240,7 @@ def check_cutoff(cutoff_hz, recordings):
 
 
 def read_user_ramps(robot, file):
-    """Return the ramps in `file.ramps`, or None if unset; the columns of ramps and recording have equal names."""
+    """Return the ramps in `file.ramps`, or None if unset; `file.columns` also names the columns of the ramps."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
 
@@ -272,7 +272,7 @@ def ramp_poses(cfg, robot):
 def record_motion(cfg, robot, motion, k, label, timing):
     """Record a motion on the arm; return the motion and the recording. If `motion` is None, optimize a motion.
 
-    k: index of the recording in the run. timing: object that stores the durations of the control cycles.
+    k: number of this recording (0, 1, ...). timing: object that stores the durations of the control cycles.
     """
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier

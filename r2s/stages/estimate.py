@@ -110,7 +110,7 @@ def identified_surface(cfg, robot):
 
 
 def wrench_observer(cfg, robot, dynamics, surface):
-    """Return the wrench observer, and what determines its contact thresholds: "recordings" or "noise"."""
+    """Return the wrench observer, and the source of its contact thresholds: "recordings" or "noise"."""
     from r2s.adaptation.wrench import WrenchObserver, contact_thresholds
     from r2s.adaptation.wrench_fusion import FusedWrench
 
@@ -152,7 +152,7 @@ def given_recording(cfg, robot):
 
 
 def record_arm(cfg, robot):
-    """Record data.excitation, or a motion of data.seconds; return the recording, and the reason of a stop or None.
+    """Record data.excitation, or a motion of data.seconds; return the recording, and the reason of a stop (or None).
 
     Raises:
         Stopped: a signal stopped the arm, or the arm stopped before the recording began.

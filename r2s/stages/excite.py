@@ -63,7 +63,7 @@ class Excite:
 
 
 def make_design(cfg, robot, how):
-    """Return the `PlannedWidths`, which predict the interval widths that the design minimizes."""
+    """Return the `PlannedWidths`: predicted widths of the parameters' intervals, which the design minimizes."""
     from r2s.identification.planned_width import PlannedWidths
     from r2s.stages.prior import make_settings
 

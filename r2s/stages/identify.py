@@ -40,7 +40,8 @@ def reads(cfg):
 class Parts:
     """Inputs of an identification, checked before a run folder is made.
 
-    groups, ramps: recorded later unless data=recording. motion: from data.excitation. earlier: from identify.from.
+    groups, ramps: recordings and ramps; unless data=recording, r2s makes them later. motion: from data.excitation.
+    earlier: from identify.from.
     """
 
     robot: Any

@@ -32,7 +32,7 @@ def parents_of(cfg) -> list[str]:
 
 
 def files_of(cfg, parents: Iterable[str]) -> list[Path]:
-    """Return the robot files that a config names, and the READ files of `parents` (run folders, parameter files)."""
+    """Return the robot files that a config names, and all READ files in `parents` (run folders, parameter files)."""
     from omegaconf import OmegaConf
 
     named = [str(value) for key in FILES if (value := OmegaConf.select(cfg, key))]

@@ -1,4 +1,4 @@
-"""Make the objects that config nodes describe by `_target_`; error messages name settings as the user types them."""
+"""Make the objects that config nodes name in `_target_`; error messages name settings as the user types them."""
 
 import inspect
 import logging

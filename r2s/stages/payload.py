@@ -12,7 +12,7 @@ from r2s.stages.data import check_cutoff, read_file
 
 @dataclass(frozen=True)
 class LoadedData:
-    """Recording of the loaded arm, payload (or None) that the gravity compensation includes, and files read."""
+    """Recording of the loaded arm, payload (or None) in the arm's gravity compensation, and the recording's files."""
 
     recording: Any
     declared: Any

@@ -36,7 +36,7 @@ ROWS = {
     REFERENCE: "hybrid control, identified model",
 }
 PATHS = 6  # number of contact motions on the surface, 8 s each; the last is for validation
-CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # only for transfers
+CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # adapt=: transfers
 WHY = {
     "calibration": "it identifies the arm itself",
     "policy": "it trains its policies itself",
@@ -52,13 +52,13 @@ def reads(cfg):
 
 
 def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
-    """Return those of the user's overrides that the command with the config `step` reads."""
+    """Return the user's overrides that the command with the config `step` reads."""
     own = ("stage=", "name=", "root=", "threads=", "pipeline.")
     return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
 
 
 def run_step(words: dict[str, list[str]]) -> None:
-    """Run the commands {label: words} in parallel; print each command's progress and, at its end, its tables.
+    """Run the commands {label: words} in parallel; print each command's progress and finally its tables.
 
     Raises:
         UserError: a command failed; the remaining commands are terminated.
@@ -107,7 +107,7 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Group the commands of a step that run in parallel: all in one group; if an arm `moves`, one per group."""
+    """Split a step into groups of parallel commands: one group or, if an arm `moves`, one group per command."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
@@ -169,11 +169,11 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     """Return the commands {label: words} of each step: identify the arm, identify a surface, train, transfer.
 
     The trainings on the identified and the nominal model differ only in the model: settings, time and computer are
-    the same. With an adapter, only the transfers run with changed payload, friction and delay of the arm (CHANGES).
+    the same. With an adapter, arm and surface are identified without changes of payload, friction and delay.
 
     Args:
-        cfg: config of the pipeline. name: name of the pipeline's run folder; all other folder names begin with it.
-        overrides: overrides that the user typed; each command receives only those that it reads.
+        cfg: config of the pipeline. name: name of the pipeline's run folder, with which all other folder names begin.
+        overrides: overrides that the user typed; each command receives only the overrides that its stage reads.
     """
     root, choice = Path(cfg.root), chosen(overrides, cfg)
     both, adapts = cfg.threads or os.cpu_count() or 2, cfg.adapt.name != "none"
@@ -215,11 +215,12 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     for label in labels(cfg)[1]:
         policy = f"policy={root / 'train' / f'{name}_{MODELS[0] if label == ADAPTED else label}'}"
         transferred[label] = step("transfer", label, policy, *table, typed=overrides if label == ADAPTED else bare)
-    unchanged = without(*(CHANGES if adapts else ()), *(["arm.surface"] if table or touched else []))
+    changes = CHANGES if adapts else ()
+    unchanged = without(*changes, *(["arm.surface"] if table or touched else []))
     steps = [{"identify": step("identify", "identify", typed=unchanged)}, trained, transferred]
     if touched:
         words = [known, f"data.presses={PATHS}", *tool_words(cfg), *table]
-        pressed = step("identify", SURFACE, *words, calibration=known, typed=without("adapt", "data"))
+        pressed = step("identify", SURFACE, *words, calibration=known, typed=without("adapt", "data", *changes))
         steps.insert(1, {SURFACE: pressed})
     return steps
 
@@ -261,7 +262,7 @@ def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
 
 
 def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
-    """Return overrides for a training on the nominal model from which the identification starts."""
+    """Return overrides that give a training the nominal model with which the identification starts."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices

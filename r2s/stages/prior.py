@@ -63,8 +63,9 @@ def make_settings(cfg, torque, earlier=(), last=True):
 
     Args:
         earlier: list of `Earlier`, whose links and payload enter the prior. An `Earlier` with the same kind of torque
-            also provides all other values, friction family and terms, so that old and new model have equal form.
-        last: whether r2s fits this kind of torque last; earlier fits use only the stated values of links and payload.
+            also provides all other values, the friction family and the terms, so that the old and the new model have
+            equal form.
+        last: whether this kind of torque is fitted last; other fits use only the stated values of links and payload.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings
@@ -117,7 +118,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the start of a fit: `earlier.arm`; if the kinds of torque differ, `nominal` with the earlier links."""
+    """Return the start of a fit: `earlier.arm`, or `nominal` with its links if the kinds of torque differ."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -72,7 +72,7 @@ def _matching(where: str, path: str) -> Iterator[str]:
 
 
 def of_one_reader(files):
-    """Return the files; if the first file is a bag, unset `topic` and `joints` of all files that are no bags."""
+    """Return the files; if the first file is a bag, unset `topic` and `joints` of each file that is not a bag."""
     from r2s.recordings.readers import is_bag
 
     if not is_bag(Path(files[0].path)):
@@ -81,7 +81,7 @@ def of_one_reader(files):
 
 
 def labels_of(files):
-    """Return a label for each file: the stem of its name, or its path if several files have that stem."""
+    """Return a label for each file: the stem of the file name, or the path if several files have the same stem."""
     stems = [Path(f.path).stem for f in files]
     return [stem if stems.count(stem) == 1 else f.path for f, stem in zip(files, stems, strict=True)]
 
@@ -90,8 +90,8 @@ def read_groups(robot, files, validation, share, cutoff_hz):
     """Read the recordings; return one `Group` per kind of torque, in the order in which r2s fits the groups.
 
     Args:
-        files, validation: `FileData` of each file. share: share of each recording, or of every period, that r2s holds
-            out at the end if `validation` is empty. cutoff_hz: Hz, cut-off frequency for `without_payload`.
+        files, validation: `FileData` of each file. share: fraction at the end of each recording, or of each period,
+            that r2s holds out if `validation` is empty. cutoff_hz: Hz, cut-off frequency for `without_payload`.
     """
     made: dict[str, Group] = {}
 

@@ -1,4 +1,4 @@
-"""stage=results: reproduce a page of benchmarks/results in a clean clone of this commit; compare new and old page.
+"""stage=results: reproduce a page of benchmarks/results in a clean clone of this commit; compare it with the old one.
 
 `python run.py -m +experiment=results` reproduces all pages that docs/results.md cites.
 """
@@ -21,14 +21,14 @@ CLONE = "checkout"  # name of the clone in the run folder
 
 
 def reads(cfg):
-    """Return the config keys that stage=results reads: of `results.pages`, only the commands of one page."""
+    """Return the config keys that stage=results reads, such as the commands of one page in `results.pages`."""
     return {"results.page", "results.data", f"results.pages.{cfg.results.page}"}
 
 
 def commands_of(settings):
     """Return the commands, as lists of words, that produce `results.page`; {data} becomes the folder `results.data`.
 
-    A command begins with `make`, or consists of arguments for python.
+    A command begins with `make`, or else contains the arguments for python.
 
     Raises:
         UserError: the page does not exist, r2s is not a checkout, or the data for the page are missing.
@@ -100,7 +100,7 @@ def cloned(clone, paths):
 
 
 def execute(words, clone, log):
-    """Run `python WORDS`, or WORDS that begin with make, in the clone with its own r2s; append the output to `log`.
+    """Run `make ...` or `python WORDS` in the clone, with the clone's r2s; append the output to the file `log`.
 
     Raises:
         UserError: the command fails; the message quotes the last line of output.

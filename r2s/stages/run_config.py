@@ -66,8 +66,9 @@ def replayed(cfg):
 def checked(cfg, where, trust=None):
     """Return a run folder's config with resolved interpolations; raise UserError for untrusted code.
 
-    r2s calls every part (`_target_`) that a config names. This function refuses a part unless conf/ names it in the
-    same group or a module in `trust` defines it. Resolvers such as ${oc.env:X} need `oc` in `trust`.
+    r2s calls each class or function that a config names as `_target_`. A target is allowed only if conf/ names the
+    target in the same group or a module in `trust` defines the target. Resolvers such as ${oc.env:X} need `oc` in
+    `trust`.
 
     Args:
         where: file name for error messages. trust: value of `trust=`, see `modules`; replaces the config's `trust`.
@@ -102,7 +103,7 @@ def checked(cfg, where, trust=None):
 
 
 def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield (keys, value) for each leaf of nested settings."""
+    """Yield (keys, value) for each value in nested settings."""
     if not isinstance(node, dict | list):
         yield path, node
         return
@@ -111,7 +112,7 @@ def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...],
 
 
 def _is_own(key, value) -> bool:
-    """Return whether a setting names no code, or only a part that conf/ names in the same group."""
+    """Return whether a setting names no code, or names a `_target_` that conf/ also names in the same group."""
     if key == ("friction", "family"):
         return "." not in str(value)
     if key[-1:] != ("_target_",):
@@ -121,7 +122,7 @@ def _is_own(key, value) -> bool:
 
 
 def _is_defined_in(key, value, trusted) -> bool:
-    """Return whether a trusted module defines the part at a dotted path, rather than only importing it."""
+    """Return whether a trusted module defines, rather than only imports, the object at a dotted path."""
     head = str(value).split(".")[0]
     if head not in trusted or key[-1] != "_target_":
         return head in trusted

@@ -124,7 +124,7 @@ def check_length(budget, loop, n_envs, key):
 
 
 class Selection:
-    """The best and the last evaluation of a training; of equal scores, the latest is the best."""
+    """The best and the last evaluation of a training; of equally good evaluations, the latest counts as the best."""
 
     def __init__(self, task):
         self._task, self.best, self.last = task, {}, {}
@@ -178,7 +178,7 @@ def train(cfg, overrides):
 
 
 def conclude(cfg, run, parts, selection):
-    """Evaluate best and last policy on goals not used for selection; write policy.onnx, summary.json and the page."""
+    """Evaluate the best and last policy on goals not used for selection; write policy.onnx, summary.json and page."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.learning.policy import export_onnx, load_policy
     from r2s.reporting import pages
@@ -202,7 +202,7 @@ def share_threads(cfg):
 
 
 def split_algo(cfg):
-    """Return number of arms, env steps of demonstrations, residual_l2, `Loop`, other settings (dict) of conf/algo."""
+    """Return conf/algo as number of arms, env steps of demonstrations, residual_l2, `Loop`, and other settings."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
@@ -220,7 +220,7 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config; a resumed training reads its own copies of the models, because the originals may be gone."""
+    """Return the config; a resumed training reads the models' copies in its folder, as the originals may be gone."""
     if not cfg.resume:
         return cfg
     model = cfg.copy()
@@ -234,7 +234,7 @@ def with_own_calibration(cfg):
 
 
 def keep_calibration(cfg, folder):
-    """Copy identified parameters and surface into the run folder, so that a transfer needs only this folder."""
+    """Copy the identified parameters and surface into the run folder, so that a transfer needs no other folder."""
     import shutil
 
     from r2s.files import atomic_write

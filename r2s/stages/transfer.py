@@ -43,7 +43,7 @@ def reads(cfg):
 def trained_config(cfg, option="policy"):
     """Return the run folder that `policy=` names, and the run's config; error messages begin with `option`.
 
-    The config names the copies of calibration and surface in this run folder, so that no other folder is needed.
+    The config names the run folder's copies of calibration and surface, so that a transfer needs no other folder.
 
     Raises:
         UserError: the folder contains no finished training.
@@ -66,12 +66,12 @@ def trained_config(cfg, option="policy"):
 
 @dataclass(frozen=True)
 class Request:
-    """A policy, and the start postures and goals of its episodes in every simulator and on the arm.
+    """A policy, and the start postures and goals of its episodes: the same in every simulator and on the arm.
 
     Attributes:
-        robot, task: robot and task of the training. center: center of the training's randomization.
+        robot, task: robot and task of the training. center: model at the center of the randomization.
         source: run folder of the training. policy: trained policy or controller. starts, goals: one per episode.
-        draw: randomization of the training; None for simulator=none. soft_start_s: s, duration of the soft start.
+        draw: domain randomization; None for simulator=none. soft_start_s: s, duration of the soft start.
     """
 
     robot: Any
@@ -166,7 +166,7 @@ class ArmResult:
         tried: (k,) indices of the goals whose episodes began. episodes: the k episodes that began; None if k = 0.
         stops: stops that ended episodes early. timing: durations of the 1 kHz cycles; None if unknown.
         halted: reason why the remaining episodes did not run; None: all episodes ran.
-        blocked: reason of the last episode's stop if the operator has to confirm this stop, else None.
+        blocked: reason of the last episode's stop if the operator must confirm this stop; None: nothing to confirm.
     """
 
     tried: Any = ()

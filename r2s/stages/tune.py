@@ -40,8 +40,8 @@ class Tune:
         trials: total number of trials. workers: number of parallel trainings with one thread each; None: `threads`.
         startup: number of random trials before TPE and the pruner start.
         measure: key of the task's measure to optimize, in the last evaluation of each training.
-        space: {option: list of values, or a range for `parse_range`}.
-        against: pattern of the run folders of trainings to compare with, such as a grid; None: no comparison.
+        space: {option: list of values, or text of a range; see `parse_range`}.
+        against: glob pattern of run folders of trainings to compare with, such as a grid; None: no comparison.
 
     Raises:
         UserError: a number is outside its range, the space is invalid, or the pattern matches nothing.
@@ -109,7 +109,7 @@ def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
-    """Return a line of text for each of the best trial's settings at an edge of its range or list of numbers."""
+    """Return a line for each setting of the best trial that is at an edge of its range or of its list of numbers."""
     from r2s.reporting.comparison.scores import edge, is_number
 
     lines = []
@@ -147,7 +147,7 @@ def check_trainings(cfg, overrides, space):
 
 
 def logged_measures(parts):
-    """Return {key: Measure} for the measures that a training logs, found by a short evaluation."""
+    """Return {key: Measure} of the measures that a training logs; a short evaluation reveals the keys."""
     import torch
 
     from r2s.learning.evaluate import make_evaluation
@@ -196,7 +196,7 @@ class TrialRun:
                 continue
 
     def status(self) -> str:
-        """Return started (by this process), left (by an earlier stage=tune), none, or the status in meta.json."""
+        """Return "started" (by this process), "left" (by an earlier process), "none", or the status in meta.json."""
         from r2s.runs import is_locked, read_meta
 
         if self._process is not None and self._process.poll() is None:

@@ -4,7 +4,8 @@ A training maximizes the mean reward r subject to mean costs c_k <= d_k (constra
 1999). The policy maximizes r - sum_k lambda_k c_k / d_k, where the rate of the multiplier lambda_k is proportional to
 c_k / d_k - 1, and lambda_k is never negative (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization,
 ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies by the current -lambda_k / d_k. A
-stored cost thus stays valid, and costs need no separate critic. Means are over all training steps, with exploration.
+stored cost thus stays valid, and costs need no separate critic. Mean reward and mean costs are means over all
+training steps, including exploration.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,7 +25,7 @@ MOST = 50.0  # largest multiplier; if unlimited, a cost limit that no policy can
 
 
 def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
-    """Return (m,) N, the force on the surface minus the requested force, at least 0."""
+    """Return (m,) N, max(0, force on the surface - requested force)."""
     exerted = task.forces(state, goals)
     return (exerted[:, 0] - exerted[:, 1]).clip(0.0)
 
@@ -36,7 +37,7 @@ def impact_speed(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np
 
 
 def limit_margin(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
-    """Return (m,) rad, MARGIN_RAD minus the smallest distance of a joint from its position limits, at least 0."""
+    """Return (m,) rad, max(0, MARGIN_RAD - smallest distance of a joint from its position limits)."""
     low, high = robot.q_range
     return (MARGIN_RAD - np.minimum(state.q - low, high - state.q).min(1)).clip(0.0)
 
@@ -49,7 +50,7 @@ COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {
 
 
 class ConstrainedReward(Reward):
-    """A reward whose terms are the terms of `reward`, then costs with the weights -lambda / limit.
+    """A reward whose terms are the terms of `reward`, followed by costs with the weights -lambda / limit.
 
     Args:
         reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost in the cost's unit}.

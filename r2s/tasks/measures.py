@@ -81,14 +81,16 @@ class MeasureTable:
 
     Attributes:
         measures: the task's own measures, to which r2s adds the measures COMMON.
-        selection: measures that compare trainings: every row must contain the first; the last ranks trainings.
+        selection: measures that compare trainings: every row must contain the first measure; the last measure ranks
+            the trainings.
         rows: columns of the table that has a row for each simulator and arm; by default all `measures`.
         comparison: columns of the table of trainings. curves: panels of the figure of learning curves.
         scores: panels of the figure that compares the scores of trainings.
         transfer: measures that compare adapters episode by episode in transfers to an arm.
         diagnostics: columns of a transfer's second table; by default COMMON.
         corner: heading of the column of row labels. description: sentence that describes what a policy does.
-        error: name, unit and scale of `Episodes.distance`. error_levels: lines in the figure of this error.
+        error: name, unit and scale of `Episodes.distance`. error_levels: errors that the figure of `error` marks with
+            lines.
         reward: name of `Episodes.reward`.
 
     By default, `comparison`, `curves`, `scores` and `transfer` contain the measures that `selection` lists.

@@ -53,7 +53,7 @@ class PressTask(SurfaceTask):
         return replace(task, creep=FIRST_DQ / float(np.abs(moves).max()))
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
-        """Return one point (1, 3) m, uniformly distributed in a disc of radius `spread` on the plane."""
+        """Return one point (1, 3) m, uniformly distributed in a disc of radius `spread` on the nominal plane."""
         about, away = rng.uniform(0, 2 * np.pi), self.spread * np.sqrt(rng.uniform())
         return away * np.array([[np.cos(about), np.sin(about)]]) @ axes
 
@@ -81,9 +81,9 @@ class PressTask(SurfaceTask):
         """Return the target (m, 6) of impedance control: position, m, and velocity, m/s.
 
         The target position moves through the nominal plane, against the normal, until the spring would exert the
-        larger of the two forces even on a surface at the lowest allowed position. The target velocity only gives the
-        friction feedforward the expected direction of motion, which is along the normal after a decrease of the
-        force, and against the normal otherwise.
+        larger of the two forces even on a surface at the lowest allowed position. The target velocity only tells the
+        friction feedforward in which direction the tip moves: along the normal after a decrease of the force,
+        otherwise against the normal.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = self.at(t, goals) - self.depth(t, goals)[:, None] * goals[:, NORMAL]
@@ -112,6 +112,6 @@ class PressTask(SurfaceTask):
         return press_measures(episodes, round(self.step_s * self.ctrl_hz), self.ctrl_hz)
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return 10 times the success, minus the RMSE in N, minus 1 for every percent of stopped episodes."""
+        """Return 10 success - force RMSE in N - 100 stopped; `success` and `stopped` are shares of the episodes."""
         rmse = row["force_rmse_N"] if np.isfinite(row["force_rmse_N"]) else 1e3
         return 10 * row["success"] - rmse - 100 * row["stopped"]

@@ -65,12 +65,12 @@ class ReachTask(BaseTask):
         torque_fraction: share of tau_max that an action of 1 commands: a number for all joints, or one per joint.
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         start_spread: rad, largest random deviation of a joint from q_home in a start posture.
-        reach: (low, high) m, distance of goals from the shoulder (the second joint, or a single joint); None: the
-            quantiles MIDDLE of the end effector's distance in random postures.
-        height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
+        reach: (low, high) m, range of the distance of goals from the shoulder (the second joint, or the only joint);
+            None: quantiles MIDDLE of the end effector's distance from the shoulder in random postures.
+        height: lowest goal, m. azimuth: rad, largest angle between a goal's direction and straight ahead.
         speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise does not react to noise, and so does not excite oscillations of
-            elastic gears; rigid models have no such oscillations (benchmarks/results/transfer.md).
+            else 0. A policy trained with noise does not react to noise, and thus does not excite oscillations of
+            elastic gears. Rigid models have no elastic oscillations (benchmarks/results/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -102,7 +102,7 @@ class ReachTask(BaseTask):
         return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the controller's torque limit; if unset, the torque that an action of 1 commands."""
+        """Return (n,) Nm, the controller's torque limit; without a limit, the torque that an action of 1 commands."""
         if self.controller is not None and self.controller.torque_limit is not None:
             return self.controller.torque_limit
         share = np.array(self.torque_fraction, dtype=float)
@@ -183,7 +183,7 @@ class ReachTask(BaseTask):
         return observation_terms(self.torque_limit(robot))
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, the initial distance from each goal, or CLOSE_M if that distance is smaller."""
+        """Return (m,) m, max(initial distance from the goal, CLOSE_M)."""
         return np.maximum(np.linalg.norm(goals - state.ee, axis=-1), CLOSE_M)
 
     def judge(
@@ -242,8 +242,9 @@ def observe(
     """Return the observation (m, 6 n + 12) float32 in SI units; arms and simulators share this function.
 
     Terms: q; dq; ee; goal; error; effort / torque; tanh(error / 2 cm); J^T error; tanh(J^T error / 1.5 cm);
-    tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector toward the goal; otherwise a network
-    would have to learn the Jacobian. The effort is part of the state, because torque changes by at most 1 Nm per ms.
+    tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector toward the goal; without J^T error, a
+    network would have to learn the Jacobian. The observation contains the effort, because torque changes by at most 1
+    Nm per ms.
 
     Args:
         q, dq: (m, n) rad, rad/s, joint angles and speeds.

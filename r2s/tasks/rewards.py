@@ -101,18 +101,20 @@ class Reward:
 class Curriculum(Reward):
     """A reward whose weights change during a training.
 
-    Eq. (2) alone makes exploration difficult, because its acceleration terms reward early stopping. Trainings with
-    a curriculum start with a small smoothness weight and a bonus for precision, and the weights then change linearly
-    toward eq. (2). With reward=paper, the weights are constant: 1 for distance and smoothness, 0 for other terms.
+    Eq. (2) of the paper alone makes exploration difficult, because its acceleration terms reward early stopping.
+    Trainings with a curriculum start with a small smoothness weight and a bonus for precision, and the weights then
+    change linearly toward eq. (2). With reward=paper, the weights are constant: 1 for distance and smoothness, 0 for
+    other terms.
 
     Attributes:
         smoothness, precision, stillness, filter_penalty: (before, after), weight of the term before and after the
-            change. anneal: fractions of the budget at which this change of weights starts and ends.
-        max_filter_rate: largest filter rate in a training, exploration included; None: no limit. Once the weights
-            change, a filter rate above `max_filter_rate` raises the weight of the filter penalty. A lower filter rate
-            reduces the penalty, but not below the curriculum weight. With a fixed penalty, the filter rate is 1
-            to 6 %, depending on the seed (benchmarks/results/minutes.md). Integral control adapts the logarithm of
-            the penalty weight, as for a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
+            curriculum's change. anneal: fractions of the budget at which the change of the weights starts and ends.
+        max_filter_rate: largest filter rate in a training, exploration included; None: no limit. After the start of
+            the change, a filter rate above `max_filter_rate` raises the weight of the filter penalty. A filter rate
+            below `max_filter_rate` lowers the penalty weight, but not below the curriculum's weight. With a fixed
+            penalty, the filter rate is 1 to 6 %, depending on the seed (benchmarks/results/minutes.md). Integral
+            control adapts the logarithm of the penalty weight, as for a Lagrange multiplier (Stooke, Achiam and
+            Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.

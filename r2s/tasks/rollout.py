@@ -69,8 +69,9 @@ def rollout(
 
     Args:
         policy: maps observations to actions. arms: simulated or real arms. task: the task with its controller.
-        starts: (E, n) rad, start postures of E episodes. goals: (E, ...), as in `Task.goals`; `arms.width` divides E.
-        progress: callback with the number of finished episodes and their total.
+        starts: (E, n) rad, start postures of E episodes. goals: (E, ...), as in `Task.goals`; E is a multiple of
+            `arms.width`.
+        progress: callback, called with the numbers of finished episodes and of all episodes.
     """
     robot, count, shape = arms.robot, len(goals), (len(goals), task.steps)
     torque, controller = task.torque_limit(robot), task.control(robot)
@@ -149,7 +150,7 @@ def _run(
 
 
 def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
-    """Return the state; where the episode is `over` (m,) bool, q, dq, ee and tau have the values in `last`."""
+    """Return the state with q, dq, ee and tau from `last` in the arms whose episode is `over` (m,) bool."""
     names, here = ("q", "dq", "ee", "tau"), over[:, None]
     kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
     return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
@@ -160,12 +161,12 @@ def measures(episodes: Episodes) -> dict[str, float]:
 
     success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
     of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth:
-    return_paper without speed noise, which causes false accelerations in eq. (2). time_to_reach_s: median time
-    after which the end effector stays within 2 cm, over the episodes that achieve this. overshoot_m: mean over
-    episodes of the largest distance beyond 2 cm after the first time within 2 cm. rest: share of episodes in which
-    every joint is slower than REST throughout the last 0.5 s; an end effector at rest is not enough. q_left_rad: 5 %
-    quantile over episodes of the smallest distance from the position limits. limited: mean filter rate. collision:
-    share of episodes that a contact ended.
+    return_paper computed from speeds without noise, because noise causes false accelerations in eq. (2).
+    time_to_reach_s: median time after which the end effector stays within 2 cm, over the episodes in which it stays
+    there. overshoot_m: mean over episodes of the largest distance beyond 2 cm after the first time within 2 cm. rest:
+    share of episodes in which every joint is slower than REST throughout the last 0.5 s; joints can move although the
+    end effector is at rest. q_left_rad: 5 % quantile over episodes of the smallest distance of a joint from its
+    position limits. limited: mean filter rate. collision: share of episodes that a contact ended.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)

@@ -43,20 +43,21 @@ class SurfaceTask(TipTask):
     """A task that presses a tool's tip on a surface whose position is known roughly.
 
     A goal begins with 9 + n numbers: point of the nominal plane that the tip touches first, m; normal of the plane;
-    two forces, N; start height of the tip's center above that point, m; start posture, rad.
+    two forces, N; start height of the tip's center above the touched point, m; start posture, rad.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        force: (low, high) N, range of the requested forces. force_rate: N/s, rate of change of a force.
-        approach_speed: m/s, speed of the target against the nominal normal: the highest closing speed at contact.
-        clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of touched points
+        force: (low, high) N, range of the requested forces. force_rate: N/s, rate of change of a requested force.
+        approach_speed: m/s, speed at which the target approaches the nominal plane, and highest tip speed at contact.
+        clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of a touched point
             from `point`. place, tilt: m and degrees, largest shift and tilt of the true plane from the nominal plane.
         point, normal: the nominal plane in the base frame, m; None: a work table below the tip in home posture.
         tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of different goals in a training.
         stop: kind of stop in contact, a key of `r2s.physics.push_limit.STOPS`; None: "release".
-        model: model of the arm. own, parameters: default controller and its parameters. `with_model` sets these.
+        model: model of the arm. own, parameters: default controller and its parameters. `with_model` sets model, own
+            and parameters.
     """
 
     ctrl_hz: int = 100
@@ -221,9 +222,10 @@ class SurfaceTask(TipTask):
         return goals[:, POINT]
 
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, how far the target of the tip's center is below the nominal plane at the times t (m,) s.
+        """Return (m,) m, the depth of the target of the tip's center below the nominal plane at the times t (m,) s.
 
-        The depth grows at `approach_speed` until the tip touches the lowest plane, then by `force_rate` / stiffness.
+        The depth grows at `approach_speed` until the tip touches the lowest plane, then at the speed `force_rate` /
+        stiffness.
         """
         height, K = goals[:, HEIGHT], self.spring
         touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` refers to the tip's center
@@ -239,7 +241,7 @@ class SurfaceTask(TipTask):
 
     @property
     def spring(self) -> float:
-        """Stiffness, N/m, of the spring in `controller`, or if `controller` has none, in the default controller."""
+        """Stiffness, N/m, of the spring in `controller`; if `controller` has no spring, in the default controller."""
         for control in (self.controller, self.own):
             if isinstance(control, Impedance) and control.parameters[K_DEFAULT] > 0:
                 return float(control.parameters[K_DEFAULT])

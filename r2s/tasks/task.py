@@ -37,7 +37,7 @@ class State:
         noise: (m, n) rad/s, sensor noise that `measured` adds to the true speed dq; None: dq already includes sensor
             noise, or the sensors have none.
         force: (m, 3) N, force that the tool exerts, in base axes: the true force in simulation and on twins, the
-            reported force on other arms; None: unknown. Rewards and measures use this force, observations do not.
+            reported force on other arms; None: unknown. Rewards and measures use `force`, but observations do not.
         box: (m, 6), perceived pose of the box in the base frame: the box's center, m, and the direction of the box's
             first axis; None: the task has no box.
     """
@@ -107,7 +107,8 @@ class ObservationTerm:
         name: name of the term. unit: SI unit of the term, "1" if dimensionless.
         of: signal in the term: q, dq, ee, goal, error (goal - ee), effort, pull (J^T error), control (torque of a
             controller with `observes_torque`). For tasks with a planned path, goal is the current path position, and
-            there are also ahead (next positions - ee), velocity (of the path), limited, q_off, dq_off (plan - arm).
+            further signals are ahead (next positions - ee), velocity (of the path), limited, q_off, dq_off (plan -
+            arm).
         divided_by: divisor of the signal: a number, or one per element; None: 1. tanh: whether tanh is applied last.
     """
 
@@ -125,10 +126,11 @@ class Task(Protocol):
         ctrl_hz: policy rate. cutoff_hz: cut-off of the low-pass on the torque. steps: control steps per episode.
         substeps: physics steps per control step.
         observation_summary: terms and units of an observation, for the metadata of policy.onnx.
-        reward_terms: names of the reward terms. paper_weights: (k,), their weights in `Episodes.reward`.
+        reward_terms: names of the reward terms. paper_weights: (k,), weights of the reward terms in
+            `Episodes.reward`.
         pool: number of different goals in a training.
-        speed_noise: rad/s; a training raises the standard deviation of each arm's speed noise to at least a random
-            value ~ U(0, speed_noise); None or 0: no lower bound.
+        speed_noise: rad/s; in a training, each arm's speed noise has at least a random standard deviation ~ U(0,
+            speed_noise); None or 0: no lower bound.
         measure_table: the measures that `measures` returns, with their presentation (r2s/tasks/measures.py).
         may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
         touches: whether the tool touches a surface; simulated arms then need `Dynamics.surface`.
@@ -180,7 +182,7 @@ class Task(Protocol):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "Task":
-        """Return the task with limits of contact force, N, and speed, m/s; friction: (n,) Nm, joint friction."""
+        """Return the task with limits of contact force, N, and contact speed, m/s; friction: (n,) Nm, of joints."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -212,7 +214,7 @@ class Task(Protocol):
         ...
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, divisors of the distances in the reward, computed from the episodes' first state."""
+        """Return (m,) m, divisors of the distances in the reward, computed from the first state of the episodes."""
         ...
 
     def judge(
@@ -221,7 +223,7 @@ class Task(Protocol):
         """Return the distance (m,) m from the goal, and the reward terms (m, k).
 
         Args:
-            state: state after a control period. ddq: (m, n) rad/s^2, mean over this period.
+            state: state after a control period. ddq: (m, n) rad/s^2, mean over the control period.
             goals: (m, ...), goals of the episodes. scale: (m,) m, result of `distance_scale`.
         """
         ...
@@ -243,7 +245,7 @@ class Task(Protocol):
         ...
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return the score of a row of `measures`; the highest score selects the best policy."""
+        """Return the score of a policy from a row of `measures`; the best policy has the highest score."""
         ...
 
 
@@ -295,7 +297,7 @@ class BaseTask:
         return round(1.0 / (self.ctrl_hz * SIM_DT))
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task unchanged, because it uses no model of the arm."""
+        """Return the task unchanged, because the task uses no model of the arm."""
         return self
 
     def controlled_by(self, controller: Controller) -> Self:
@@ -340,8 +342,8 @@ class BaseTask:
     def score(self, row: Mapping[str, float]) -> float:
         """Return the score of one evaluation.
 
-        The score is the return, plus 1 per percentage point of success within 1 cm and of episodes that end at rest,
-        minus 10 per percentage point of the filter rate above MAX_FILTER_RATE.
+        The score is return + 100 (success within 1 cm + share of episodes that end at rest) - 1000 max(0, filter rate
+        - MAX_FILTER_RATE).
         """
         price = 1e3 * max(row["limited"] - MAX_FILTER_RATE, 0.0)
         return 100 * (row["success_1cm"] + row["rest"]) + row["return_paper"] - price

@@ -27,7 +27,7 @@ class TipTask(BaseTask):
     own: Impedance | None
 
     def as_reach(self) -> ReachTask:
-        """Return a reach task of this task's timing, torque limit and noise; raise UserError if any is wrong."""
+        """Return a reach task with the timing, torque limit and noise of this task; raise UserError if wrong."""
         return ReachTask(
             self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
         )
@@ -46,7 +46,7 @@ class TipTask(BaseTask):
         return value
 
     def control(self, robot: Robot) -> Controller:
-        """Return the controller that `controlled_by` set, or if none was set the default controller."""
+        """Return the controller that `controlled_by` set, else the default controller."""
         return self.controller or self.own or super().control(robot)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:

@@ -65,7 +65,7 @@ class TrackTask(BaseTask):
         torque_fraction, boost: the largest target torque is boost x torque_fraction x tau_max, at most tau_max.
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         preview: number of future path positions in an observation.
-        speed: (low, high) m/s, range of random peak speeds; a path is slower if the arm's limits require it.
+        speed: (low, high) m/s, range of random peak speeds; the arm's limits can require a slower path.
         size: (low, high) m, range of random path radii. kinds: curves, a subset of KINDS, equally probable.
         reach, height, azimuth: region that contains the paths, see `ReachTask`.
         pool: number of different paths in a training.
@@ -205,7 +205,7 @@ class TrackTask(BaseTask):
 
         Args:
             robot: the arm. start: (3,) m, first end-effector position. shape: function from the arc length u (T,) m
-                to the offset (T, 3) m from `start`. pace: m/s, peak du/dt; reduced if the arm's limits require this.
+                to the offset (T, 3) m from `start`. pace: m/s, peak du/dt; r2s reduces an infeasible pace.
 
         Raises:
             UserError: the arm cannot follow the curve.
@@ -272,7 +272,7 @@ class TrackTask(BaseTask):
         return np.concatenate([now[:, X], now[:, V]], axis=1)
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones, because the reward of this task needs no initial distance as a scale."""
+        """Return (m,) ones, because the reward of task track needs no initial distance as a scale."""
         return np.ones(len(goals))
 
     def judge(
@@ -290,8 +290,8 @@ class TrackTask(BaseTask):
         """Return the measures of task track, one row of evaluations.csv.
 
         path_rmse_mm: RMS distance between end effector and reference over the steps of the paths without a stop.
-        path_max_mm: each path's largest distance, averaged over paths without a stop. within_x: share of steps with a
-        distance below x; steps of stopped paths never qualify. return_track: mean over paths of the summed reward.
+        path_max_mm: mean over paths without a stop of the largest distance on a path. within_x: share of steps with a
+        distance below x; steps of stopped paths never qualify. return_track: mean over paths of the reward's sum.
         torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector, from cubic fits
         over JERK_S. stopped: share of stopped paths. q_left_rad, limited: see `r2s.tasks.rollout.measures`.
         """
@@ -319,7 +319,7 @@ class TrackTask(BaseTask):
         }
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return minus the RMSE in mm, minus 1 for every percent of stopped paths."""
+        """Return -path_rmse_mm - 100 stopped, where `stopped` is a share of the paths."""
         return -(row["path_rmse_mm"] if np.isfinite(row["path_rmse_mm"]) else 1e3) - 100 * row["stopped"]
 
     def _at(self, t: np.ndarray) -> np.ndarray:

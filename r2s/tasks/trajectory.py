@@ -1,9 +1,9 @@
 """End-effector trajectories: curves, joint postures along the curves, and the fastest feasible timing.
 
-A curve is x(u), m, with |dx/du| <= 1. Inverse kinematics on a grid of u and a cubic spline yield the postures q(u).
-The clock u(t) accelerates along a minimum-jerk polynomial to the pace v, m/s, and slows down likewise at the end, so
-that position, velocity and acceleration of end effector and joints are continuous. `Paths` reduces the pace until
-torque, speed and acceleration are well within the limits of the arm and of its safety filter.
+A curve is a position x(u) in m; u is in m too, and |dx/du| <= 1. Inverse kinematics on a grid of u and a cubic spline
+yield the postures q(u). The pace du/dt rises from 0 to v m/s along a minimum-jerk polynomial and falls likewise at
+the end. Position, velocity and acceleration of end effector and joints are thus continuous. `Paths` reduces the pace
+until torque, speed and acceleration are well within the limits of the arm and of its safety filter.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ Curve = Callable[[np.ndarray], np.ndarray]
 
 
 def curve(kind: str, rng: np.random.Generator, size: float, axes: np.ndarray = SPACE) -> Curve:
-    """Return the curve u (T,) m -> x(u) - x(0) (T, 3) m, within `size` m of its center and with |dx/du| <= 1.
+    """Return a function u (T,) m -> x(u) - x(0) (T, 3) m: a curve within `size` m of its center, |dx/du| <= 1.
 
     axes: (k, 3), orthonormal vectors that span the plane (k = 2) or the space (k = 3) of the curve.
     """
@@ -88,7 +88,7 @@ def _waypoints(rng: np.random.Generator, size: float, axes: np.ndarray) -> Curve
 
 
 def smooth(s: np.ndarray) -> np.ndarray:
-    """Return 10 s^3 - 15 s^4 + 6 s^5: from 0 to 1 with zero slope and curvature at both ends."""
+    """Return 10 s^3 - 15 s^4 + 6 s^5, which rises from 0 to 1 with zero slope and curvature at s = 0 and s = 1."""
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
@@ -153,7 +153,7 @@ class Paths:
         return q(u[:, 0]), along * rate, q(u[:, 0], 2) * rate**2 + along * slope
 
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
-        """Return the largest ratio of a path's torque to the allowed torque, or of its motion to the allowed motion.
+        """Return the largest ratio of torque to allowed torque, or of motion to allowed motion, on a path.
 
         The nominal model predicts the path's torque. The safety filter requires -RATE (v + dq) <= ddq and
         ddq <= RATE (v - dq), where v is the speed limit in the posture q.

@@ -73,7 +73,7 @@ class WipeTask(SurfaceTask):
 
     @property
     def begin_s(self) -> float:
-        """Time, s, at which the path starts: the tip then presses even on the lowest surface with full force."""
+        """Time, s, at which the path starts, when the tip presses with full force even on the lowest surface."""
         return self.down_s + self.force[1] / self.force_rate + REST_S
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
@@ -123,7 +123,7 @@ class WipeTask(SurfaceTask):
         return goals[:, -9 * (self.steps + 1) :].reshape(len(goals), -1, 9)
 
     def now(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 9), position, velocity and acceleration of the paths at t (m,) s, linear between rows."""
+        """Return (m, 9), position, velocity and acceleration of the paths at t (m,) s, interpolated linearly."""
         rows, which = self.rows(goals), np.arange(len(t))
         k = (t * self.ctrl_hz).clip(0.0, self.steps)
         low = np.minimum(k.astype(np.int64), self.steps - 1)
@@ -139,7 +139,7 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and requested force, N, for hybrid control, linear between a goal's forces."""
+        """Return (m, 4), normal and requested force, N, for hybrid control; the force is linear along the path."""
         share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
         force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
@@ -178,7 +178,7 @@ class WipeTask(SurfaceTask):
         ]
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the requested force."""
+        """Return (m, 2) N, the force on the surface against the nominal normal, and the requested force."""
         return self.pressed(state, goals, self.contact(state.t, goals)[:, 3])
 
     def judge(
@@ -202,5 +202,5 @@ class WipeTask(SurfaceTask):
         return wipe_measures(episodes, round(self.begin_s * self.ctrl_hz), self.ctrl_hz)
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return the wiped share in percent, minus 1 for every percent of stopped episodes."""
+        """Return 100 (wiped - stopped), where `wiped` is a share of steps, and `stopped` a share of episodes."""
         return 100 * (row["wiped"] - row["stopped"])

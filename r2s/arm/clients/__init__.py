@@ -1,1 +1,1 @@
-"""Clients of Franka arms through libfranka: Panda and FR3, hardware or the emulator."""
+"""Clients that command a Panda or an FR3 through libfranka, on hardware or on the emulator."""

@@ -21,10 +21,10 @@ FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/cont
 class CollisionThresholds:
     """Thresholds of external torque and force above which the arm stops itself.
 
-    r2s also uses these values as libfranka's contact thresholds. The defaults are the lowest in libfranka's examples.
+    r2s also sets libfranka's contact thresholds to these values. The defaults are the lowest in libfranka's examples.
 
     Attributes:
-        torque: (7,) Nm, per joint. force: (6,) N and Nm, wrench at the end effector.
+        torque: (7,) Nm, threshold of each joint. force: (6,) N, Nm, thresholds of the wrench at the end effector.
 
     Raises:
         UserError: the number of values is wrong, or a value is not above 0.
@@ -45,13 +45,13 @@ CAUTIOUS = CollisionThresholds()
 
 
 def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
-    """Return collision thresholds of at least CAUTIOUS that exceed every force that the push limit allows.
+    """Return thresholds above every contact force that the push limit allows, and at least as high as CAUTIOUS.
 
-    The thresholds assume that the tip exerts the largest normal force that the push limit allows on a rigid surface,
-    and FRICTION times this force tangentially. ERROR times CAUTIOUS is added for model errors.
+    On a rigid surface, the tip exerts at most the normal force F that the push limit allows, and the tangential force
+    FRICTION * F. The thresholds are the resulting torques and forces plus ERROR * CAUTIOUS for model errors.
 
     Raises:
-        UserError: the thresholds would be so high that they switch the reflexes off.
+        UserError: the push limit needs thresholds so high that they would switch the reflexes off.
     """
     cautious = np.array(CAUTIOUS.torque), np.array(CAUTIOUS.force)
     if limit is None:

@@ -1,4 +1,4 @@
-"""Check whether computer and network are fast enough for an arm: kernel, permissions, states of a resting arm."""
+"""Check whether kernel, permissions and network let this computer command an arm in real time."""
 
 import os
 import resource
@@ -16,7 +16,7 @@ LIMITS = resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK
 
 
 def computer_findings(realtime: bool) -> list[Finding]:
-    """Check kernel and permissions; if `realtime`, lack of a real-time kernel or of SCHED_FIFO forbids motion."""
+    """Check kernel and permissions; if `realtime`, forbid motion without a real-time kernel or without SCHED_FIFO."""
     kernel = REALTIME.is_file() and REALTIME.read_text().strip() == "1"
     fifo, (priority, _), (memory, _) = _may_use_fifo(), *map(resource.getrlimit, LIMITS)
     locked = "unlimited" if memory == resource.RLIM_INFINITY else f"{memory / 2**20:.0f} MiB"
@@ -30,7 +30,7 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check for lost or late states, from their times (k,) s by the clocks of arm and computer (`here`)."""
+    """Check for lost or late states; arm, here: (k,) s, times of the states by the arm's and the computer's clock."""
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)
@@ -44,7 +44,7 @@ def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
 
 
 def _may_use_fifo() -> bool:
-    """Return whether this process may use libfranka's priority; restore the previous priority after the attempt."""
+    """Return whether this process may use SCHED_FIFO at the highest priority; restore the previous scheduler."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO)))

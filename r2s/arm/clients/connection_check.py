@@ -1,4 +1,4 @@
-"""Check whether a newly connected arm matches the model, before the arm moves."""
+"""Check whether a newly connected arm matches the robot model, before the arm moves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -62,7 +62,8 @@ class Finding:
     """Result of comparing a property of the arm or computer with the value that r2s expects.
 
     Attributes:
-        name: the property. expected: expected value. found: actual value. refused: whether the result forbids motion.
+        name: name of the property. expected: expected value. found: actual value.
+        refused: whether the result forbids motion.
     """
 
     name: str
@@ -122,13 +123,13 @@ class Connection:
 
 
 def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
-    """Return the gravity torque (n,) Nm of the nominal links and a load (4,) (`mass_and_moment`) at q (n,) rad."""
+    """Return the gravity torque (n,) Nm at q (n,) rad of nominal links plus `load` (4,), see `mass_and_moment`."""
     rest = np.zeros((1, robot.n))
     return nominal_torque(robot, q[None], rest, rest)[0] + LoadTorque(robot)(q, load)
 
 
 def _load_of(robot: Robot, s: Any) -> np.ndarray:
-    """Return the mass and first moment (4,) that the arm's RobotState declares for end effector plus load."""
+    """Return (4,): mass, kg, and first moment, kg m, of end effector plus load according to the arm's RobotState."""
     place, axes = ee_pose(robot)
     tool = np.array(s.F_T_EE).reshape(4, 4).T
     flange = axes @ tool[:3, :3].T
@@ -136,7 +137,7 @@ def _load_of(robot: Robot, s: Any) -> np.ndarray:
 
 
 def refuse(findings: Sequence[Finding], what: str) -> None:
-    """Raise UserError with a one-line list of the findings that forbid motion, if there are any."""
+    """Raise UserError if any finding forbids motion; the message lists all such findings in one line."""
     if wrong := [str(finding) for finding in findings if finding.refused]:
         raise UserError(f"{what}: {'; '.join(wrong)}")
 
@@ -149,7 +150,7 @@ def _posture(arm: ArmType, q: np.ndarray) -> Finding:
 
 
 def _limits(arm: ArmType, robot: Robot) -> list[Finding]:
-    """Check that the robot's torque limits do not exceed the arm's and that home lies within the clipped limits."""
+    """Check that the model's torque limits do not exceed the arm's, and that its position limits include q_home."""
     step, torque = robot.dtau_max / arm.dtau_max, robot.tau_max / arm.tau_max
     i, j, home = int(torque.argmax()), int(step.argmax()), robot.q_home
     k = int(np.maximum(robot.q_min - home, home - robot.q_max).argmax())
@@ -184,7 +185,7 @@ def _end_effector(robot: Robot, s: Any) -> Finding:
 
 
 def _external(s: Any) -> Finding:
-    """Report the external torque without refusing it, because an adapter may compensate an undeclared payload."""
+    """Report the external torque, but never forbid motion: an adapter may compensate an undeclared payload."""
     return Finding("external torque at rest", "about 0 Nm", f"{_row(np.array(s.tau_ext_hat_filtered), 1)} Nm")
 
 

@@ -1,10 +1,10 @@
 """The wire format of the Franka Control Interface (FCI), limited to what torque control needs.
 
-A client connects to TCP port 1337 and sends its version and a UDP port. The robot then sends one RobotState per
-millisecond by UDP and, in a motion, expects a RobotCommand for each state. Two versions are implemented: 5 (libfranka
-0.9, the Panda, FER) and 10 (libfranka 0.18 and later, the FR3). All structs are packed and little-endian.
+A client connects to TCP port 1337 and sends its FCI version and its UDP port. The robot then sends one RobotState
+per millisecond by UDP and, in a motion, expects a RobotCommand for each state. r2s implements FCI version 5
+(libfranka 0.9, Panda or FER) and version 10 (libfranka 0.18 or later, FR3). All structs are packed and little-endian.
 
-Source: the public headers of libfranka-common (service_types.h, rbk_types.h), checked against the clients' packages.
+Source: the public headers of libfranka-common (service_types.h, rbk_types.h), checked with panda-python, pylibfranka.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
-"""Implement the `Arm` protocol on a libfranka client, hardware or emulated: the base of Panda and FR3.
+"""Implement the `Arm` protocol through libfranka, as the base class of Panda and FR3.
 
-libfranka has no point-to-point motion in torque control. `move_to` therefore follows a slow, checked joint path
-with the recorder's tracking controller, in the same 1 kHz torque loop as every other motion. So `move_to` needs no
-robot model from libfranka, and tests on the emulator run the code that also moves the hardware.
+libfranka has no point-to-point motion in torque control. `move_to` follows a slow, checked joint path with the
+recorder's tracking controller, in the 1 kHz torque loop that all motions use. `move_to` needs no robot model from
+libfranka, and the same code moves an emulated arm in tests and the hardware.
 """
 
 import weakref
@@ -46,20 +46,20 @@ MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
 
 
 class Franka:
-    """An `Arm` (r2s/arm/interface.py) that is commanded through a `Client`, with an operator (`Operated`).
+    """An `Arm` (r2s/arm/interface.py) that r2s commands through a libfranka `Client`; implements `Operated`.
 
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked: see `Operated`. Any stop other than a call of `stop` sets `blocked`: a reflex, the stop
-            button (even if released since), a rejected command, a failed `move_to`. hold: see `Holds`.
-        findings: results of the check at connection.
+        operator, blocked: see `Operated`. A reflex, the stop button (even if a person has released it), a rejected
+            command and a failed `move_to` set `blocked`; a successful `stop` does not. hold: see `Holds`.
+        findings: results of comparing the arm with `connection`.
         realtime: whether motions run in a `realtime_section`. In real time, r2s rejects recordings and episodes in
             which less than 99 % of the commands arrive in time.
 
     Args:
         robot: limits and nominal model.
-        client: the connection.
+        client: connection to the arm through libfranka.
         operator: function that is called with a stop's reason before the arm moves again. Without an operator (None),
             `move_to` raises NotCleared after a stop until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
@@ -103,15 +103,15 @@ class Franka:
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Bring the arm to rest at q (7,) rad, at up to a fifth of the speed limits; stay if within 2 mrad of q.
+        """Move the arm to q (7,) rad at up to a fifth of the speed limits; do nothing if already within 2 mrad of q.
 
         The arm follows the first path of r2s/excitation/paths.py that respects the limits and clearances.
 
         Raises:
-            NotCleared: the arm stopped before, and no operator agreed that the arm may move.
+            NotCleared: after an earlier stop, no operator agreed that the arm may move.
             StopRequested: a signal requested a stop, or the policy's process ended; the arm is at rest.
-            ArmStopped: before a motion, q is outside the limits, the arm is not ready, or no path exists. In motion,
-                the arm stopped itself, deviated from the path by 0.1 rad, or ended more than 10 mrad from q.
+            ArmStopped: q is outside the limits, the arm is not ready, no path exists, the arm stopped itself, the arm
+                deviated from the path by 0.1 rad (less near obstacles), or the arm came to rest over 10 mrad from q.
 
         """
         q = np.array(q, dtype=float)
@@ -127,15 +127,15 @@ class Franka:
         return self._state
 
     def read(self) -> ArmState:
-        """Return the state of the current cycle, or of the arm at rest if the motion has had no command yet."""
+        """Return the state of the current cycle; before the first `command`, return the state of the arm at rest."""
         return self._state
 
     def command(self, tau: np.ndarray) -> None:
         """Send tau (7,) Nm, without gravity, and wait for the next cycle; the first command starts the motion.
 
         Raises:
-            ArmStopped: the arm stopped itself (libfranka's message), or the arm would reject the command. This method
-                does not send a command that the arm would reject, but brings the arm to rest.
+            ArmStopped: the arm stopped itself (libfranka's message), or the arm would reject the command. Instead of
+                sending a command that the arm would reject, this method brings the arm to rest.
 
         """
         if self._stopped is not None:
@@ -151,7 +151,7 @@ class Franka:
         self._send(tau)
 
     def stop(self) -> None:
-        """Damp the motion for at most 0.5 s, then end the motion; do not overwrite an earlier reason in `blocked`."""
+        """Damp the motion for at most 0.5 s, then end the motion; keep an earlier reason in `blocked`."""
         if self._damping:  # the command loop calls `stop` while it damps
             return
         for part in (self._damp, self._end):  # `_end` also runs if damping failed
@@ -167,7 +167,7 @@ class Franka:
             self._stopped = "stop was called"
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of the arm at rest; return their times (k,) s by the arm's clock and by this computer's."""
+        """Read states of the arm at rest for `seconds`; return times (k,) s of the arm's and the computer's clock."""
         return self._client.watch(seconds)
 
     def close(self) -> None:
@@ -229,7 +229,7 @@ class Franka:
         return found
 
     def _read_idle(self) -> None:
-        """Read the state between motions; replace tau_J_d, the torque of the arm's own controller, by 0."""
+        """Read the state between motions; set tau_J_d to 0, because it is a torque of the arm's own controller."""
         s = self._client.idle()
         self._begun = _ms(s)
         sample = self._sample(s)

@@ -1,4 +1,4 @@
-"""Use libfranka through its two Python packages: import, connection, messages, and the clients' base class."""
+"""Use libfranka through panda-python or pylibfranka: base class of the clients, connection, error messages."""
 
 import socket
 import time
@@ -18,16 +18,16 @@ CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in 
 
 
 class Client:
-    """Base of the clients for libfranka's two Python packages, whose RobotState has the same attributes.
+    """Base class of the clients that use panda-python or pylibfranka; their RobotStates have the same attributes.
 
-    If libfranka reports an error, a method raises ArmStopped with libfranka's message.
+    If libfranka reports an error, the called method raises ArmStopped with libfranka's message.
 
     Attributes:
-        name: option of the group `arm`, also the name of the extra to install. package: name of the Python module.
+        name: name of the option `arm=` and of the extra to install. package: name of the Python module.
         version: version of the arm's FCI.
 
     Args:
-        address: host name or IP. realtime: require a real-time kernel and priority.
+        address: host name or IP of the arm. realtime: whether to require a real-time kernel and priority.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Client:
         raise NotImplementedError
 
     def exchange(self, tau: np.ndarray) -> Any:
-        """Send tau (7,) Nm for this cycle, wait for the next cycle and return its RobotState."""
+        """Send tau (7,) Nm for this cycle, wait, and return the RobotState of the next cycle."""
         raise NotImplementedError
 
     def finish(self) -> None:
@@ -58,7 +58,7 @@ class Client:
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of an arm at rest; return their times (k,) s by the arm's clock and by this computer's."""
+        """Read states of an arm at rest for `seconds`; return times (k,) s of the arm's and the computer's clock."""
         times, begun = [], time.perf_counter()
         while time.perf_counter() < begun + seconds:
             times.append((self._call(self._robot.read_once).time.to_sec(), time.perf_counter()))

@@ -1,8 +1,8 @@
 """Connect to a Panda (FER) through panda-python (libfranka 0.9): hardware, or the emulator in FCI version 5.
 
-libfranka calls a callback once per millisecond, but r2s calls the methods of an `Arm`. So libfranka's loop runs in a
-thread, in which the callback passes each state to r2s and waits for a command. libfranka's rate limiter and low-pass
-are switched off, so the arm receives unchanged commands.
+libfranka calls a callback once per millisecond, but r2s calls the methods of an `Arm`. Therefore, libfranka's loop
+runs in a thread. The callback passes each state to r2s and waits for a command. r2s switches libfranka's rate limiter
+and low-pass off, so the arm receives unchanged commands.
 """
 
 import threading
@@ -122,16 +122,17 @@ class Panda(Franka):
     """A Franka Emika Panda.
 
     Attributes:
-        arm_type: type of the arm. client_type: class of the client. within: clips a robot's limits to the arm's.
+        arm_type: type of the arm. client_type: class of the client.
+        within: function that clips a robot's limits to the arm's limits.
 
     Args:
         robot: limits and nominal model.
         address: host name or IP of the arm or of an emulator.
         operator: see `Franka`; 'terminal' asks a person at the terminal.
-        realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
+        realtime: whether to require a real-time kernel and priority; True for hardware, False for the emulator.
         collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
         declared_payload: payload that the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
-            `payload_of`; r2s refuses to move an arm whose declared mass differs. moves: see `Connection`.
+            `payload_of`. r2s does not move an arm that assumes another mass. moves: see `Connection`.
 
     Raises:
         UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the connected arm

@@ -1,1 +1,1 @@
-"""An emulated control box of a Franka arm, for the real clients: robot model, control cycle, server, process."""
+"""An emulated Franka control box, to which libfranka's clients connect as to a real box."""

@@ -1,4 +1,4 @@
-"""Emulate the control box between FCI server and arm: modes, cycles, missed answers, reflexes, injected faults.
+"""Emulate how a Franka control box controls its arm: modes, cycles, missed answers, reflexes, injected faults.
 
 This model of the control box (Franka's Control) has no sockets and no clock: each call of `cycle` simulates 1 ms.
 """
@@ -39,11 +39,11 @@ class Fault:
     Attributes:
         kind: 'late': the client's answers arrive too late, and the arm repeats its last torque. 'drop': the arm's
             states do not reach the client. 'discontinuity': the first joint's torque steps by twice the allowed size.
-            'joint_limit': the arm reports a position limit. 'estop': the stop button is pressed and stays pressed.
-            'press': the stop button is pressed for `cycles` ms. 'hold': an external force stops the first link; the
-            arm needs the attribute `external`.
-        cycle: control cycle in which the fault begins, from 0.
-        motion: number of the motion, from 0; a client's `move_to` makes one motion per straight path segment.
+            'joint_limit': the arm stops and reports a position limit. 'estop': the stop button is pressed and stays
+            pressed. 'press': the stop button is pressed for `cycles` ms. 'hold': an external force stops the first
+            link; the arm needs the attribute `external`.
+        cycle: index, from 0, of the control cycle in which the fault begins.
+        motion: index, from 0, of the motion with the fault; `move_to` makes one motion per straight path segment.
         cycles: number of consecutive cycles with the fault; 20 late or dropped cycles stop the arm.
 
     """
@@ -74,7 +74,7 @@ class Control:
     Args:
         arm: the arm. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
         version: version of the FCI. faults, max_missed: see `Emulator`.
-        desk: values of settings in `DESK`, such as {"m_ee": 0.73}; even wrong values do not change the arm.
+        desk: values of settings in `DESK`, such as {"m_ee": 0.73}; they change the box's arm model, not the arm.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Control:
 
     @property
     def aborted_as(self) -> str:
-        """Return the Move status of an aborted motion."""
+        """Return the status that answers the Move request of an aborted motion."""
         return "EmergencyAborted" if self._mode == fci.USER_STOPPED else "ReflexAborted"
 
     @property
@@ -129,7 +129,7 @@ class Control:
         return self.running and self._has("drop")
 
     def begin(self) -> None:
-        """Start a motion at the arm's posture; call `first_answer` before the first `cycle`."""
+        """Start a motion at the arm's present posture; call `first_answer` before the first `cycle`."""
         self.running, self.stopped_by = True, None
         self._motion, self._cycle, self._missed = self._motion + 1, 0, 0
         self._answered.clear()
@@ -186,7 +186,7 @@ class Control:
             self._place(self._arm.read().q)
 
     def idle(self, ms: int) -> None:
-        """Advance the time between motions by `ms`; an arm becomes idle when its stop button is released."""
+        """Let `ms` pass between two motions; the arm becomes idle when the stop button is released."""
         if self._mode == fci.USER_STOPPED and self._pressed_ms > 0:
             self._pressed_ms -= ms
             if self._pressed_ms <= 0:
@@ -206,7 +206,7 @@ class Control:
         self._sense()
 
     def recover(self) -> bool:
-        """Clear a reflex; return whether the arm can move again, which a pressed stop button prevents.
+        """Clear a reflex; return True if the arm can move again, False if the stop button is pressed.
 
         A person must guide a real arm back into its joint limits; `recover` moves the emulated arm back.
         """
@@ -237,7 +237,7 @@ class Control:
         self._sense()
 
     def _has(self, kind: str) -> bool:
-        """Return whether a fault of this kind is active in the current cycle."""
+        """Return whether a fault of the given kind is active in the current cycle."""
         return any(f.kind == kind and self._is_now(f) for f in self._faults)
 
     def _is_now(self, fault: Fault) -> bool:
@@ -260,9 +260,9 @@ class Control:
             self._arm.external = np.zeros(7)
 
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
-        """Filter the external torque, set wrench and contact flags; after a collision, return error and message.
+        """Filter the external torque, set wrench and contact flags; in a collision, return error index and message.
 
-        As in libfranka, external torque is tau_J minus the torque of the box's model, which has the `DESK` settings.
+        As in libfranka, external torque is tau_J minus the torque of the box's arm model with the `DESK` settings.
         Unlike on a real arm, friction and model errors have no effect on the emulated external torque.
 
         Args:
@@ -312,7 +312,7 @@ class Control:
 
 
 def _outside_fr3(q: np.ndarray, dq: np.ndarray) -> tuple[int, str] | None:
-    """Return error and message if a joint at q, dq (7,) rad, rad/s is beyond an FR3's limits, else None."""
+    """Return error index and message if a joint at q, dq (7,) rad, rad/s exceeds an FR3's limits, else None."""
     q_min, q_max = fr3_limits.Q_MIN, fr3_limits.Q_MAX
     outside = np.maximum(q_min - q, q - q_max)
     i = int(outside.argmax())

@@ -1,13 +1,14 @@
-"""Emulate a Franka control box for libfranka's clients: our FCI server runs in a separate process, on loopback.
+"""Emulate a Franka control box, to which libfranka's clients connect on loopback, in a separate process.
 
     with Emulator(partial(RigidTwin, robot, 3), version=5) as address:
         arm = Panda(robot, address, operator=lambda reason: True)
 
-The emulated box can control any `Arm`. In lock-step, the default, the arm's clock advances only with a command: equal
-commands cause the same motion, bit for bit, even on a slow computer. In real time the clock runs at 1 kHz, and an
-answer that arrives after its millisecond counts as missed.
+The emulated box can control any `Arm` of 7 joints. In lock-step, the default, the arm's clock advances only with a
+command. Equal commands then cause bit-identical motions, even on a slow computer. In real time, the arm's clock runs
+at 1 kHz, and the client misses a cycle if its answer arrives after that cycle.
 
-The emulator has no network jitter and no brakes, and does not show whether a motion is safe beside a person.
+The emulator simulates neither network jitter nor brakes. A test on the emulator does not prove that a motion is safe
+beside a person.
 """
 
 import multiprocessing
@@ -28,12 +29,12 @@ START_S = 180.0  # longest time for the server's process to import, compile and 
 
 
 class Emulator:
-    """Runs a `Server` in a separate process, which ends when the context or this process ends.
+    """Runs a `Server` in a child process, which ends when the context or the parent process ends.
 
     Args:
-        make_arm: picklable function that creates the arm in the server's process: `partial(RigidTwin, robot, 3)`.
+        make_arm: picklable function that creates the arm in the child process: `partial(RigidTwin, robot, 3)`.
         version: FCI version: 5 for libfranka 0.9 (Panda), 10 for libfranka 0.18 and later (FR3).
-        realtime: run at 1 kHz instead of in lock-step.
+        realtime: whether the emulator runs at 1 kHz; False: it waits for each command (lock-step).
         faults: faults that the emulator injects.
         max_missed: consecutive unanswered cycles after which the arm stops. desk: settings of the box, see `Control`.
     """

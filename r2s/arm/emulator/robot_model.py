@@ -16,7 +16,7 @@ SINGULAR = 0.03  # least singular value of the Jacobian (rows in m and 1); our c
 
 
 def urdf(robot: Robot) -> str:
-    """Return the arm as URDF, without geometry and with an FR3's joint limits: the answer to GetRobotModel."""
+    """Return a URDF of the arm, without geometry and with an FR3's joint limits, to answer GetRobotModel."""
     envelope = fr3_limits.DECELERATION, fr3_limits.VELOCITY_OFFSET
     q_min, q_max, dq_max = fr3_limits.Q_MIN, fr3_limits.Q_MAX, fr3_limits.DQ_MAX
     fr3 = replace(robot, q_min=q_min, q_max=q_max, dq_max=dq_max, velocity_envelope=envelope)
@@ -34,7 +34,7 @@ class BoxModel:
         self._place, self._axes = ee_pose(robot)
 
     def pose(self, q: np.ndarray, tool: np.ndarray) -> np.ndarray:
-        """Return the base-frame pose (4, 4), at q (n,) rad, of a frame with the pose `tool` (4, 4) on the flange."""
+        """Return a frame's pose (4, 4) in the base frame at q (n,) rad; tool: (4, 4), pose in the flange frame."""
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         flange = np.eye(4)
@@ -43,7 +43,7 @@ class BoxModel:
         return flange @ tool
 
     def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that explains torque (n,) Nm best.
+        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that best fits J^T wrench = torque (n,) Nm.
 
         Near a singularity the wrench is zero, as in libfranka.
         """
@@ -61,6 +61,6 @@ class BoxModel:
         return self._data.qfrc_bias + self._load(q, self._carried(s), s["O_ddP_O"])
 
     def _carried(self, s: np.ndarray) -> np.ndarray:
-        """Return the mass and first moment (4,) of end effector plus load, in the last link's frame."""
+        """Return (4,): mass, kg, and first moment, kg m, of end effector plus load, in the last link's frame."""
         parts = ((s["m_ee"], s["F_x_Cee"]), (s["m_load"], s["F_x_Cload"]))
         return np.sum([np.append(m, m * (self._place + self._axes @ x)) for m, x in parts], axis=0)

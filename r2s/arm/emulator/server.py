@@ -23,9 +23,10 @@ BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's fi
 class Server:
     """Serves one client at a time, in one thread.
 
-    A motion begins when the client answers the newest state. Until this first answer, the arm stands still and the
-    server sends more states, because a starting client may skip some. The server does not execute the first answer.
-    The first executed command answers the first state whose control_command_success_rate is above zero.
+    A motion begins when the client answers the newest state. Before the client's first answer, the arm stands still,
+    and the server keeps sending states, because a starting client may skip states. The server does not execute the
+    command in the first answer. The first executed command answers the first state whose control_command_success_rate
+    is above 0.
     """
 
     def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
@@ -37,7 +38,7 @@ class Server:
         self._reset()
 
     def serve(self, parent: int) -> None:
-        """Serve the client until the parent process, watched through the file descriptor `parent`, ends."""
+        """Serve clients until the parent process ends; parent: file descriptor that signals this end."""
         with realtime_section() if self._realtime else contextlib.nullcontext():
             self._serve(parent)
 
@@ -188,7 +189,7 @@ class Server:
                     self._ahead = True
 
     def _cycle(self, tau: np.ndarray | None) -> None:
-        """Run one cycle, then all cycles whose states a fault drops; the client cannot answer dropped states."""
+        """Run one cycle; in lock-step, also run the following cycles whose states a fault drops."""
         self._control.cycle(tau)
         while self._control.dropped and not self._realtime:
             self._message_id += 1
@@ -196,14 +197,14 @@ class Server:
         self._report()
 
     def _report(self) -> None:
-        """Send the state after a cycle, or the end of an aborted motion."""
+        """Send the state after a cycle; if the motion was aborted, report its end instead."""
         if self._control.running:
             self._send()
         else:
             self._finish(self._control.aborted_as)
 
     def _tick(self) -> None:
-        """Send the state that was scheduled for this time, and schedule the next state."""
+        """Send the state that is due, in real time after running an unanswered cycle; schedule the next state."""
         assert self._due is not None
         if self._started and self._realtime:
             if not self._ahead:
@@ -248,7 +249,7 @@ def open_port() -> socket.socket:
     """Open the FCI's fixed port on the first loopback address where this port is free; return the server socket.
 
     Raises:
-        UserError: the port is in use on all addresses.
+        UserError: the port is in use on all loopback addresses.
     """
     for k in range(1, 255):
         try:

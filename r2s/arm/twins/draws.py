@@ -1,4 +1,4 @@
-"""Draw parameters of rigid and elastic twins: links, torque offset, cable drag and sensor noise."""
+"""Draw random parameters of rigid and elastic twins: links, torque offset, cable drag and sensor noise."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ ENCODER = 2e-5  # rad, resolution
 
 
 def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
-    """Draw masses, centers of mass and inertia tensors of the links."""
+    """Draw random masses, centers of mass and inertia tensors of the links."""
     model = robot.model(gravity=True)
     n, bodies = robot.n, model.jnt_bodyid
     small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # scale for joints weaker than a Panda's wrist
@@ -36,7 +36,7 @@ def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw 8 parameters per joint (8, n): torque offset, Nm, four for `drag`, standard deviations of q, dq, tau_J.
+    """Draw 8 parameters per joint (8, n): torque offset, Nm; 4 arguments of `drag`; noise of q, dq and tau_J.
 
     Args:
         robot: the arm. rng: random number generator. hold: (n,) Nm, lower bound of each joint's stiction.

@@ -5,14 +5,15 @@ A joint has the motor angle theta and velocity w, scaled to the joint's side of 
     s = K (theta - q) + D (w - v)
     f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c has a value per direction
 s is the gear torque, and F the contact force of a surface (r2s/physics/contact.py). The drive's torque loop damps the
-gear by L (w - v). A resting motor does not move while the net torque on it is below the breakaway torque, f at w = 0.
+gear by L (w - v). A resting motor stays at rest while the net torque on it is below the breakaway torque f(w = 0).
 warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus three sines of theta, whose periods are one joint
 revolution, one motor revolution and half a motor revolution (the two lobes of a strain wave gear).
 
 A step follows position Verlet: positions advance by half a step, velocities by a whole step with the forces at
-mid-step, then positions by the other half. Velocity-dependent forces are computed at the mid-step velocity that a
-first pass predicts. A motor that reaches zero velocity within a step then stays at rest or reverses, as in
-r2s/physics/stick_slip.py. Motors act on each other only through their gears, so each motor is solved separately.
+mid-step, then positions by the other half. A first pass predicts the velocities at mid-step; a second pass computes
+the velocity-dependent forces at the predicted velocities. A motor whose velocity reaches zero within a step stays at
+rest or reverses, as in r2s/physics/stick_slip.py. Motors act on each other only through their gears, so each motor is
+solved separately.
 """
 
 import numpy as np
@@ -43,7 +44,7 @@ HALF_WARM = 0.6  # heat scale of the friction decrease; steady motion at a quart
 
 @njit(cache=True)
 def warmth(p, heat, i):
-    """Return the factor by which heat changes friction: 1 for a cold joint, down to 1 - FALL for a warm one."""
+    """Return the factor by which heat changes friction: 1 for a cold joint, down to 1 - FALL for a warm joint."""
     return 1.0 - p[FALL, i] * (1.0 - np.exp(-heat / HALF_WARM))
 
 
@@ -66,11 +67,12 @@ def level(p, w, load, side, i):
 
 @njit(cache=True)
 def _next_velocity(p, w, middle, push, load, factor, h, i):
-    """Return a motor's velocity, rad/s, after h s under friction and all other torques, whose sum is `push`, Nm.
+    """Return a motor's velocity, rad/s, after h s under friction and `push`, Nm, the sum of all other torques.
 
     Args:
-        p: parameters. i: joint index. w: present velocity, rad/s. middle: rad/s, mid-step velocity, used
-            for friction if it has the motor's direction. load: gear torque, Nm. factor: scale of friction.
+        p: parameters. i: joint index. w: present velocity, rad/s. middle: mid-step velocity, rad/s, at which
+            friction is computed if the motor moves in the direction of `middle`. load: gear torque, Nm.
+        factor: factor on the friction.
     """
     side = np.sign(w)
     if w != 0.0:
@@ -89,7 +91,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
 
 @njit(cache=True)
 def _active(line, cycle, t, delay):
-    """Return the row of the newest command in `line` that is effective at time t, cycles; -1: no such command."""
+    """Return the row in `line` of the newest command in effect at time t, in cycles; -1: no such command."""
     slots, arrival = len(line), line.shape[1] - 1
     for k in range(cycle, max(cycle - slots, -1), -1):
         if line[k % slots, arrival] + delay <= t:
@@ -110,7 +112,7 @@ def _commanded(line, cycle, begin, end, delay, i):
 
 @njit(cache=True)
 def compensate(p, s, gravity):
-    """Compute the torque that the arm adds to a command (row ADDED): gravity (n,) Nm plus part of the friction."""
+    """Write to row ADDED the torque that the arm adds to a command: gravity (n,) Nm plus part of the friction."""
     for i in range(s.shape[1]):
         dq = s[DQ_MEASURED, i]
         s[ADDED, i] = gravity[i] + p[HELP, i] * np.tanh(dq / p[HELP_WIDTH, i]) + p[HELP_VISCOUS, i] * dq
@@ -181,7 +183,7 @@ def _touch(s, links, touch, h, out):
 
 @njit(cache=True)
 def _external_forces(p, s, f, line, cycle, begin, end, h):
-    """Write motor and spring torques, friction factors and velocities of a step (`begin` to `end`, cycles) to `f`."""
+    """Write to `f` motor and spring torques, friction factors and velocities of a step; begin, end: times, cycles."""
     for i in range(s.shape[1]):
         target = s[ADDED, i] + _commanded(line, cycle, begin, end, p[DELAY, i], i)
         change = (target - s[MOTOR, i]) * -np.expm1(-h / p[LAG, i])
@@ -217,7 +219,7 @@ def _accelerate(p, s, f, bias, root, h, last):
 
 @njit(cache=True)
 def sense(p, s, noise, dq_filter):
-    """Compute the sensor values from the rows *_AT of the state and the standard normal `noise` (3, n)."""
+    """Compute the sensor values from the rows *_AT of the state `s` and from standard normal `noise` (3, n)."""
     for i in range(s.shape[1]):
         s[Q_MEASURED, i] = ENCODER * np.round((s[THETA_AT, i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
         s[DQ_MEASURED, i] += dq_filter * (s[W_AT, i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_MEASURED, i])

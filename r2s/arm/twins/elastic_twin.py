@@ -6,8 +6,9 @@ compensates part of the friction, has a clock that jitters, and occasionally los
 between joints. Links, offsets, cable drag, noise and quantization are as in the rigid variant. The seed determines
 the robot's parameters, which only the twin reads. Seeds 0-9 are for development, seeds >= 200 for evaluation.
 
-In each 1 ms cycle the control box adds its compensation to the command. elastic_joints.py then integrates rotors and
-links in steps of at most 0.05 ms. The sensors measure the motors up to 0.5 ms before the end of the cycle.
+In each 1 ms cycle the control box adds gravity and friction compensation to the command. elastic_joints.py then
+integrates rotors and links in steps of at most 0.05 ms. The sensors measure the motors up to 0.5 ms before the end of
+the cycle.
 """
 
 from typing import Any
@@ -128,7 +129,7 @@ class ElasticTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw the parameters (ROWS, n) of all joints except the damping of the gears.
+    """Draw random parameters (ROWS, n) for all joints; the caller sets the rows GEAR and LOOP.
 
     Args:
         robot: the arm. rng: random number generator.
@@ -167,7 +168,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
 
 def _critical_damping(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return the critical damping (n,) Nm s/rad of each gear, without torque on the other joints."""
+    """Return the critical damping (n,) Nm s/rad of each gear while the other joints are free to move."""
     reduced = 1 / (1 / p[ej.ROTOR] + np.diag(np.linalg.inv(inertia)))
     return 2 * np.sqrt(p[ej.STIFF] * reduced)
 

@@ -28,7 +28,7 @@ SWEEPS, CONVERGED = 50, 1e-9  # largest number of Gauss-Seidel sweeps; velocity 
 
 @njit(cache=True)
 def _stribeck(p, z, v, load, i):
-    """Return the friction level g(v), Nm, for the sign of the bristle deflection z."""
+    """Return the friction level g(v), Nm, of joint i in the direction of the bristle deflection z."""
     coulomb = p[C_POS, i] if z >= 0 else p[C_NEG, i]
     fade = np.exp(-((v / p[V_STRIBECK, i]) ** 2))
     return coulomb * (1 + (p[BREAK, i] - 1) * fade) + p[MU, i] * abs(load)
@@ -36,7 +36,7 @@ def _stribeck(p, z, v, load, i):
 
 @njit(cache=True)
 def cable_drag(p, q, i):
-    """Return the cable's torque, Nm, on joint i at the joint angles q (n,) rad."""
+    """Return the torque, Nm, of a cable on joint i at the joint angles q (n,) rad."""
     own, along, waves, phase = p[DRAG_OWN, i], p[DRAG_NEXT, i], p[DRAG_WAVES, i], p[DRAG_PHASE, i]
     return drag(own, along, waves, phase, q[i], q[(i + 1) % len(q)])
 
@@ -157,7 +157,7 @@ def sense(p, s, mass, noise):
     """Update bristles, friction, bias torque and sensor values after the engine has taken its step.
 
     Args:
-        p: joint parameters. s: joint states: Q and V after the step, V_BEFORE (velocity) before the step.
+        p: joint parameters. s: joint states; Q, V: angle and velocity after the step; V_BEFORE: velocity before.
         mass: (n, n) kg m^2, mass matrix. noise: (3, n), standard normal, for the sensors of q, dq and tau_J.
     """
     n, h, v, before = s.shape[1], SIM_DT, s[V], s[V_BEFORE]

@@ -27,11 +27,11 @@ def make_twin(
     """Return a hidden twin; `TwinBase` explains the arguments, which conf/arm/twin.yaml sets.
 
     Args:
-        variant: 'rigid': LuGre friction and rigid or quasi-static gears, simulated in DART. 'elastic': effects that
-            no identified model contains, see r2s/arm/twins/elastic_twin.py.
+        variant: 'rigid': a twin in DART with LuGre friction; its gears are rigid or deflect without oscillation.
+            'elastic': a twin with effects that no identified model contains, see r2s/arm/twins/elastic_twin.py.
 
     Raises:
-        UserError: an unknown variant, or an argument out of its range.
+        UserError: the variant is unknown, or an argument is out of its range.
     """
     if not isinstance(variant, str) or variant not in VARIANTS:
         raise UserError(f"arm.variant: {variant!r}; {instead_of(variant, VARIANTS)}")

@@ -1,13 +1,14 @@
 """The rigid variant of the hidden twin: it replaces a real arm and has effects that a rigid-body simulator lacks.
 
-The twin runs in DART, not in the training engine, with LuGre friction (bristles, Stribeck effect, load and direction
-dependence, breakaway), torque offsets, delay and lag, cable drag, sensor noise and quantization. Masses,
-centers and tensors differ from the nominal values that gravity compensation uses. The seed determines the robot's
-parameters, which only the twin reads. Seeds 0-9 are for development, seeds of 100 and above for final evaluation.
+The twin runs in DART, not in the training engine. It has LuGre friction (bristles, Stribeck effect, load and
+direction dependence, breakaway), torque offsets, delay and lag, cable drag, sensor noise and quantization. Masses,
+centers and inertia tensors of the links differ from the nominal values that gravity compensation uses. The seed
+determines the robot's parameters, which only the twin reads. Seeds 0-9 are for development, seeds of 100 and above
+for final evaluation.
 
 In each cycle, delay and lag act on the command first. lugre_joints.py then solves the next step implicitly for joint
-velocities, friction and contact force. DART integrates this step with the contact force and with friction linearized
-about the solution. Finally the sensors measure the new state.
+velocities, friction and contact force. DART integrates the step with this contact force and with the friction,
+linearized about the computed velocities. Finally the sensors measure the new state.
 """
 
 from typing import Any
@@ -105,11 +106,11 @@ class RigidTwin(TwinBase):
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw the parameters (ROWS, n) of all joints; the caller sets delay, lag and speed filter.
+    """Draw random parameters (ROWS, n) for all joints; the caller sets delay, lag and speed filter.
 
     Args:
         robot: the arm. rng: random number generator.
-        inertia: (n,) kg m^2, inertia of each joint in the home posture without torque on the other joints.
+        inertia: (n,) kg m^2, inertia of each joint in the home posture while the other joints are free to move.
         unbalanced: (n,) Nm, gravity compensation minus gravity torque in the home posture.
 
     """

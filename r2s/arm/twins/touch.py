@@ -1,6 +1,6 @@
-"""Draw a twin's surface from the twin's seed, and compute the tool's contact with this surface.
+"""Draw a twin's random surface from the twin's seed, and compute the tool's contact with this surface.
 
-The surface may be a box on a table. Each episode draws a new position of the box.
+The surface may be a box on a table. In each episode, the box has a new random pose.
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ CAMERA = 33, 1e-3, np.radians(0.5)  # cycles between two images, and noise of a 
 
 @dataclass(frozen=True)
 class BoxSurface:
-    """A box as surface: frame of the table, and surface of the randomly drawn box at the box's nominal pose."""
+    """A random box on a table: frame of the table, and surface of the box at its nominal pose."""
 
     frame: TableFrame
     surface: Surface
@@ -52,7 +52,8 @@ class Touch:
 
     Attributes:
         contact, jacobian: (COLUMNS,) and (ROWS, n), state and Jacobian of the contact, see contact_layout.py.
-        frames, axes: (n, POSE), (n, 3), link frames and joint axes. links: nominal links. there: a surface exists.
+        frames, axes: (n, POSE), (n, 3), link frames and joint axes. links: nominal links.
+        there: whether a surface exists.
 
     Args:
         robot: the arm. surface: surface from `draw_surface`; None: no surface.
@@ -71,7 +72,7 @@ class Touch:
         self._first = self.contact.copy()
 
     def start(self, q: np.ndarray, seed: list[int]) -> float:
-        """Reset the contact, draw the pose of a box, and return the tip's penetration depth, m, at q (n,) rad.
+        """Reset the contact, draw a random pose of a box, and return the tip's penetration depth, m, at q (n,) rad.
 
         `seed` is the episode's seed. Far from the surface the depth is -inf. The friction bristle starts undeflected.
         """
@@ -88,7 +89,7 @@ class Touch:
         return float(self.contact[DEPTH]) if self.near(q, np.zeros_like(q)) else -np.inf
 
     def near(self, q: np.ndarray, dq: np.ndarray) -> bool:
-        """Return whether the tip may touch the surface in a cycle that starts at q, dq (n,); update `jacobian`."""
+        """Return whether the tip may touch the surface in a cycle from q, dq (n,) rad, rad/s; update `jacobian`."""
         if not self.there:
             return False
         link_frames(self.links, q, self.frames, self.axes)
@@ -118,11 +119,11 @@ class Touch:
 
 
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
-    """Draw a twin's surface near the nominal pose that the setting `surface` describes.
+    """Draw a random surface near the nominal pose that the setting `surface` describes.
 
     False: no surface. True: a work table below the tip of the home posture. {point: m, normal}: a plane through the
     point. box: a box with edges `r2s.physics.box.SIZE` on a work table ahead of the tip. {box: [3 edges, m]}: a box
-    of these edges; if point and normal are also given, the box stands at the point.
+    with the given edges; if point and normal are also given, the box stands at the point.
 
     Raises:
         UserError: `surface` is invalid, the robot has no tool, or the surface contains the home posture's tip.
@@ -155,7 +156,7 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
 
 
 def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) -> BoxSurface:
-    """Draw the mass and the contact parameters of a box from the ranges in r2s/physics/box.py."""
+    """Draw a random mass and random contact parameters of a box from the ranges in r2s/physics/box.py."""
     size = settings.pop("box")
     point, normal = _place(settings) if settings else (None, None)
     edges, frame = check_size("arm.surface.box", size, box.TABLE[1]), table_frame(robot, point, normal)

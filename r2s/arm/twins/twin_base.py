@@ -1,7 +1,7 @@
 """Implement the base of both twin variants: settings, reflexes, payload, surface, extra delay and episodes.
 
-Each variant (rigid_twin.py, elastic_twin.py) draws a random robot near the nominal robot from the seed, and adds a
-model of drives and friction. No code outside the variant reads the drawn parameters.
+Each variant (rigid_twin.py, elastic_twin.py) draws, from the seed, a random robot near the nominal robot. A
+variant adds a model of drives and friction. No code outside the variant reads the drawn parameters.
 """
 
 from collections import deque
@@ -26,10 +26,10 @@ class TwinBase:
     The same seed, noise stream and calls produce bit-identical states. Each `move_to` begins an episode with its own
     random numbers, so the noise of the k-th episode does not depend on earlier episodes.
 
-    A variant implements `_start(q)`, which places the arm, `_advance(tau)`, which runs one cycle with a command,
-    `_attach(payload)`, which changes the payload at once, and `_sensors()`, which returns q, dq and tau_J. A variant
-    sets `_cycle`, `_tau_J_d`, and the `_q` and `_dq` that the reflexes check. A variant multiplies its friction by
-    `_friction_scale` and applies the contact force of `_touch` to its links, which have the angles `_link_q`.
+    A variant implements `_start(q)` (place the arm), `_advance(tau)` (run a cycle with a command), `_attach(payload)`
+    (change the payload at once) and `_sensors()` (return q, dq and tau_J). A variant sets `_cycle`, `_tau_J_d`, `_q`
+    and `_dq`; the reflexes check `_q` and `_dq`. A variant multiplies its friction by `_friction_scale`, and
+    applies the contact force of `_touch` to its links. `_link_q` are the angles of the links.
 
     Attributes:
         robot, declared_payload: see Args.
@@ -39,13 +39,13 @@ class TwinBase:
         payload: carried body, a point mass in kg or a mapping, see `r2s.physics.payload.payload_of`.
         declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), in the format of
             `payload`; None: no payload.
-        stiffness: Nm/rad, gear stiffness of the strongest joints; gears of other joints scale with the torque limit.
+        stiffness: Nm/rad, gear stiffness of the strongest joints; a gear's stiffness is proportional to tau_max.
         noise: stream number of the sensor noise; two recordings of one robot need different numbers.
         friction_scale: factor on the drawn friction, except on its load-dependent part; below 1 for a warm arm.
-        extra_delay_s: s, delay of commands in addition to the twin's own delay; whole milliseconds.
-        surface: a surface for the tool, drawn from the seed. False: none. True: a work table below the tip in the
-            home posture. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of this plane (base frame).
-            box: a box on a work table. See `draw_surface`.
+        extra_delay_s: s, delay of commands in addition to the twin's own delay; a whole number of ms.
+        surface: a surface for the tool, drawn from the seed. False: no surface. True: a work table below the tip in
+            the home posture. {point: (3,) m, normal: (3,)}: a random plane within 5 mm and 5 degrees of the given
+            plane (base frame). box: a box on a work table. See `draw_surface`.
 
     Raises:
         UserError: an argument is out of its range.
@@ -184,7 +184,7 @@ class TwinBase:
 
 
 def _delay_cycles(extra_delay_s: float) -> int:
-    """Return the extra delay in cycles; raise UserError unless it is whole ms up to MAX_EXTRA_DELAY_S."""
+    """Return the extra delay in cycles; raise UserError unless it is a whole number of ms up to MAX_EXTRA_DELAY_S."""
     check_number("arm.extra_delay_s", extra_delay_s, f"[0, {MAX_EXTRA_DELAY_S}]")
     cycles = round(extra_delay_s / SIM_DT)
     if abs(extra_delay_s / SIM_DT - cycles) > 1e-6:

@@ -52,7 +52,8 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     """Write contact.yaml at `path`, and contact_posterior.npz in the same folder.
 
     Args:
-        path: the contact.yaml to write. robot: the arm with its tool. source: names of recording, calibration, run.
+        path: the contact.yaml to write. robot: the arm with its tool. source: names of recording, calibration and
+            run.
     """
     tool, simulated = robot.tool, found.rigid_gears or found
     assert tool is not None

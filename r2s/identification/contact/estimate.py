@@ -1,7 +1,7 @@
 """Identify a surface that an arm has pressed: stiffness, exponent, damping, friction and plane, with intervals.
 
-If an arm's encoders are on the motors, the gears' deflection adds to the penetration of the surface. A first estimate
-assumes rigid gears. A second estimate includes the gears' compliance; its prior uses a stated stiffness, if any.
+If an arm's encoders are on the motors, the gears' deflection adds to the penetration of the surface. r2s estimates
+the surface first with rigid gears, then with compliant gears, whose prior may use a stated stiffness.
 """
 
 from collections.abc import Callable
@@ -45,17 +45,17 @@ class ContactEstimate:
 
     Attributes:
         surface: the estimate; `surface.point` is the mean of the tip centers in contact, projected onto the plane.
-        draws: posterior draws {name: (S, ...)} of the values, point and normal of a `Surface`; `slope`: slope of the
-            force curve at LOAD, N/m; `gears`: (S, n) rad/Nm, compliance of the gears.
+        draws: posterior draws {name: (S, ...)} of the parameters, point and normal of a `Surface`; `slope`: slope of
+            the force curve at LOAD, N/m; `gears`: (S, n) rad/Nm, compliance of the gears.
         identifiable: {name: whether the data determine this value}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
-        training: predicted and measured forces of fitted presses. validation: forces of unfitted presses, or None.
-        gears: (n,) rad/Nm, compliance of the gears behind encoders on motors; 0: rigid gears or encoders on links.
-            For a hardly loaded joint, deflection / mean deflection keeps its prior value.
+        training: predicted and measured forces of fitted presses. validation: forces of other presses, or None.
+        gears: (n,) rad/Nm, compliance of the gears, if encoders are on the motors; 0: rigid gears or encoders on
+            links. For a hardly loaded joint, the ratio of deflection to mean deflection keeps its prior value.
         stated: whether the user stated the stiffness of the gears.
         tau_max: (n,) Nm, largest torques of the joints.
         rigid_gears: the estimate for simulations with rigid gears; its surface includes the compliance of the gears.
-            None in an estimate that assumes rigid gears.
+            `rigid_gears` is None in an estimate that assumes rigid gears.
     """
 
     surface: Surface
@@ -106,12 +106,13 @@ def identify_contact(
     seed: int = 0,
     report: Callable[[float, str], None] = lambda share, what: None,
 ) -> ContactEstimate:
-    """Estimate the surface from a recording with contact, for elastic gears and, in `rigid_gears`, for rigid gears.
+    """Estimate the surface from a recording with contact; the field `rigid_gears` is the estimate for rigid gears.
 
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
-        held_out: presses on the same surface for validation; None: a fit without the last press predicts that press.
-        gears: prior of the gears' deflection; None: their stiffness is unknown.
+        held_out: presses on the same surface for validation; None: validate on the last press, after a refit without
+            it.
+        gears: prior of the gears' deflection; None: the prior for gears of unknown stiffness.
         seed: seed of the posterior's draws. report: function that receives the completed share and the next step.
 
     Raises:
@@ -134,7 +135,7 @@ def identify_contact(
 
 
 def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | None, refit: Fit) -> Press | None:
-    """Return forces in unfitted presses: those of `other`, else the last press, after a refit without this press.
+    """Return forces in unfitted presses: all presses in `other`, else the last press after a refit without it.
 
     Return None if `other` is None and there are fewer than two presses.
     """
@@ -151,7 +152,8 @@ def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, 
     """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution for rigid gears u (8,).
 
     The weights remain those of the fit with rigid gears. Weights from the smaller residual of elastic gears would
-    ignore the friction law's error: on elastic twins 0 to 9, 23 instead of 9 of 80 intervals would miss the truth.
+    ignore the friction law's error: on the elastic twins 0 to 9, 23 of 80 intervals (not 9) would miss the true
+    value.
     """
     return _fitted(problem, problem.space.with_gears(u))
 

@@ -1,7 +1,7 @@
 """Export an identified surface to other simulators as contact parameters of MuJoCo and SDF, linearized at 10 N.
 
 MuJoCo's contact force is d (aref - a0) / A with impedance d, reference acceleration aref, inverse mass A and free
-acceleration a0 (MuJoCo documentation, Computation: Constraint model). A contact with small d is a spring
+acceleration a0 (MuJoCo documentation, Computation: Constraint model). For a small impedance d, a contact is a spring
 and damper with coefficients solref / A (N/m, Ns/m). A high `impratio` makes friction stiff although d is small.
 """
 
@@ -41,9 +41,9 @@ def inverse_mass(robot: Robot) -> float:
 
 
 def mujoco_contact(surface: Surface, inverse_mass: float) -> dict[str, Any]:
-    """Return MuJoCo's contact parameters for a body of `inverse_mass`, 1/kg, on the plane.
+    """Return MuJoCo's parameters of the contact between the plane and a body with `inverse_mass`, 1/kg.
 
-    solref is (-stiffness, -damping). The plane must be fixed, and body and plane must both have these parameters.
+    solref is (-stiffness, -damping). The plane must be fixed, and body and plane must have equal contact parameters.
     """
     slope, damping, deeper = linearized(surface)
     share = (1.0 - IMPEDANCE) * inverse_mass

@@ -28,20 +28,21 @@ PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least squares over u (U,), which describes surface and gears, and the arm's model errors w (r,) ~ N(0, I).
+    """Least-squares problem in u (U,) of surface and gears, and in model errors w (r,) ~ N(0, I) of the arm.
 
-    Each of the R rows is a window in which a joint slides in one direction (see `TorqueResidual`). Resting joints
-    have no rows, since their friction may have any value between the breakaway torques. A closed form eliminates w,
-    because w acts linearly on the residual (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+    Each of the residual's R rows is a mean over a window in which a joint slides in one direction (see
+    `TorqueResidual`). Resting joints have no rows, because their friction may have any value between the breakaway
+    torques. Because the residual is linear in w, a closed form eliminates w (variable projection: Golub and Pereyra,
+    SIAM J. Numer. Anal. 10, 1973).
 
-    Encoders on the motors do not measure the gears' deflection: gravity moves the tip by `sag`, and in contact the
-    gears act as a spring in series with the surface. Presses with different lever arms distinguish the two springs.
+    Encoders on the motors do not measure the gears' deflection by gravity (`sag`) and contact. In contact, gears and
+    surface are springs in series. Presses with different lever arms distinguish the stiffness of gears and surface.
 
     Attributes:
         torque: torque residual without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
         error: (T, n) Nm, residual torque of the arm with the parameters x, before subtraction of the contact torque.
         directions: (T, n, r) Nm, derivative of the residual torque with respect to w.
-        sigma: (T, n) Nm, standard deviation of each residual torque, which the fit treats as independent.
+        sigma: (T, n) Nm, standard deviation of each residual torque; the fit treats residual torques as independent.
         space: the space of the vectors u.
         sag: (F, n, 3) m per rad/Nm; gravity moves the tip by -sum_j c[j] sag[:, j] for compliances c (n,) rad/Nm.
     """
@@ -102,7 +103,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return the errors w (r,) of the arm's model that minimize the cost of a given u (U,)."""
+        """Return the errors w (r,) of the arm's model that minimize the cost for a given u (U,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:
@@ -110,7 +111,7 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + r + U) of vectors u (C, U), each at its best w, with a normal prior on u."""
+        """Return residuals (C, R + r + U) of vectors u (C, U): data rows at the best w, prior rows of w and u."""
         center, weight = self.space.prior(trials.shape[1])
         return np.stack([np.concatenate([self._projected(self.data(u)), weight * (u - center)]) for u in trials])
 
@@ -124,7 +125,7 @@ class ContactProblem:
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with each row's weight set from the size and correlation of the residual at u (U,)."""
+        """Return the problem with row weights from the size and the correlation of the residual at u (U,)."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
@@ -154,7 +155,7 @@ def contact_problem(
 
     Args:
         space: parameter space of an arm with a tool. x: (P,), values of the arm's parameters.
-        samples: (S, P), posterior draws of x; None: the arm's uncertainty consists only of DRIFT.
+        samples: (S, P), posterior draws of x; None: the arm's uncertainty is only the drift DRIFT.
         recording: recording with commanded torque. surfaces: the space of the unknown surface.
     """
     torque = TorqueResidual(space, recording, slowest=SLOWEST)

@@ -40,9 +40,9 @@ class Gears:
     """Prior of the gears' deflection under the joints' largest torques.
 
     Attributes:
-        shape: (n,) deflection of each joint, relative to the mean over joints.
-        center, width: mean and standard deviation, rad, of the mean deflection.
-        scatter: relative standard deviation of a joint's deflection.
+        shape: (n,) prior mean of each gear's deflection, relative to the mean over all gears.
+        center, width: rad, prior mean and standard deviation of the mean deflection over all gears.
+        scatter: relative standard deviation of a gear's deflection about the mean deflection times `shape`.
         stated: whether the user stated the stiffness of the gears.
     """
 
@@ -61,11 +61,11 @@ def unknown_gears(n: int) -> Gears:
 def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float = 0.1) -> Gears | None:
     """Return the prior of gears of known stiffness, or None if `stiffness` is None.
 
-    Half of the variance is common to all gears, as an error of the data sheet would be.
+    Half of the stiffness's variance is an error that all gears have in common, such as an error of the data sheet.
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints.
-        stiffness: Nm/rad, one value per joint, or one value for the strongest joint; in the second case, all gears
+        stiffness: Nm/rad, one value per joint, or one value for the strongest joint; with one value, all gears
             deflect equally at the joints' largest torques. accuracy: relative standard deviation of the stiffness.
 
     Raises:
@@ -128,7 +128,7 @@ class SurfaceSpace:
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
 
     def compliance(self, u: np.ndarray) -> np.ndarray:
-        """Return the compliance (..., n) rad/Nm of the gears for u (..., U); 0 if u describes no gears."""
+        """Return the joint compliance (..., n) rad/Nm of the gears in u (..., U), 0 if u has only surface values."""
         if u.shape[-1] == SURFACE:
             return np.zeros((*u.shape[:-1], len(self.tau_max)))
         relative = 1.0 + FARTHEST * (2.0 * u[..., SURFACE + 1 :] - 1.0)
@@ -139,7 +139,7 @@ class SurfaceSpace:
         return np.concatenate([u, [self.gears.center / SOFTEST], np.full(len(self.tau_max), 0.5)])
 
     def prior(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return center and 1 / standard deviation (count,) of the normal prior on a vector u (count,)."""
+        """Return the mean and 1 / standard deviation, each (count,), of the normal prior of a vector u (count,)."""
         joints = np.full(len(self.tau_max), 2.0 * FARTHEST / self.gears.scatter)
         weight = np.concatenate([np.full(SURFACE, FLAT), [SOFTEST / self.gears.width], joints])
         return self.with_gears(np.full(SURFACE, 0.5))[:count], weight[:count]

@@ -87,12 +87,13 @@ def _frames(links, q, frames, axes):
 def _contact(motion, settings, point, normal, law, tau, out):
     """Write joint torque into tau (F, n); write normal force, penetration depth and depth rate into out (3, F).
 
-    Friction is mu F z with the bristle deflection z (Dahl 1968 in two dimensions): dz = (dx - |dx| z) / bristle. Here
-    x is the tip's deepest point, projected onto the surface. Encoder noise of a resting tip adds up in |dx| and would
-    relax the bristles. Therefore a path shorter than `play` only bends bristles elastically.
+    Friction is mu F z with the bristle deflection z (Dahl 1968 in two dimensions): dz = (dx - |dx| z) / bristle. In
+    dx, x is the tip's deepest point, projected onto the surface. Encoder noise of a resting tip adds up in |dx| and
+    would relax the bristles, so a path shorter than `play` only bends bristles elastically.
 
     Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
-    with compliances C and the force F g = F (n - mu z). `bristle` includes the gears' deflection along the surface.
+    with Jacobian J, normal n, compliances C and contact force F g = F (n - mu z). `bristle` includes the gears'
+    deflection along the surface.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play, compliance = settings
@@ -153,7 +154,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
 
 @njit(cache=True, error_model="numpy")
 def _in_series(soft, K, exponent, damping, depth, rate):
-    """Return force, depth and its rate at a surface behind a spring of compliance `soft`, m/N, by Newton's method.
+    """Return force, depth and depth rate of a surface in series with a spring (`soft`, m/N) by Newton's method.
 
     depth, rate: m, m/s, total deflection of spring and surface, and its rate. The returned rate of the surface's
     depth neglects damping.

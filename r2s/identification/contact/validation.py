@@ -1,4 +1,4 @@
-"""Compare the normal force that an identified surface predicts for presses with the force from joint torques."""
+"""Compare two normal forces in presses: the prediction of an identified surface, and the force from joint torques."""
 
 from dataclasses import dataclass
 
@@ -55,8 +55,8 @@ def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
 def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
     """Return predicted and measured forces on a surface u (U,) in presses, given one mask per press (`parts`).
 
-    Assume that the measured force has the direction of the predicted force. A weighted least-squares fit to the
-    torques of joints in motion then determines the ratio of the measured to the predicted force.
+    The function assumes that measured and predicted force have the same direction. A weighted least-squares fit to
+    the torques of moving joints determines the ratio of the measured to the predicted force.
     """
     motion = problem.motion
     tau, force, depth, rate = problem.contact(u)

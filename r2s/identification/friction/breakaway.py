@@ -1,9 +1,9 @@
 """Estimate the breakaway torque of each joint from recorded ramps (Table II of the paper that r2s follows).
 
 A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). At the end of a ramp, the
-joint has accelerated for 10 to 150 ms and the command has risen further. Before breakaway, a physical joint also
-creeps: bristles bend by millirads, at a growing rate. Neither a threshold nor a parabola separates creep from
-breakaway. In the model that r2s fits, a joint at x creeps at first, and slides when the command u exceeds U:
+joint has accelerated for 10 to 150 ms, and the command exceeds the breakaway command. Before breakaway, a physical
+joint also creeps: bristles bend by millirads, at a growing rate. Neither a threshold nor a parabola separates creep
+from breakaway. In the model that r2s fits, a joint at x creeps at first, and slides when the command u exceeds U:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
@@ -12,10 +12,11 @@ stiction balances u, and bristles bend over the creep length z (Dahl, J. Dyn. Sy
 breakaway, friction falls from U to a lower value (0 in the paper's eq. 6, where z = 0); `jump` is this decrease times
 kappa. The fit without `Slide` estimates all parameters of the equation and needs no model of the arm.
 
-If friction falls over a range of velocities (Stribeck), motion begins slowly, and the fit without `Slide`
-overestimates U (by 4 to 22 mNm on an arm with known U), because `jump` is sudden. The fit with `Slide`, parameters of
-an identified arm, replaces `jump` by jump (1 - exp(-(v / fall)^2)); on the arm with known U, this fit's error of U
-was below 0.2 mNm. r2s uses the fit with `Slide` if it explains the motion as well as the fit without `Slide`.
+If friction falls over a range of velocities (Stribeck), motion begins slowly, and the sudden `jump` makes the fit
+without `Slide` overestimate U (by 4 to 22 mNm on an arm with known U). The fit with `Slide` uses parameters of an
+identified arm and replaces `jump` by jump (1 - exp(-(v / fall)^2)). On the arm with known U, the error of the fit
+with `Slide` was below 0.2 mNm. r2s uses the fit with `Slide` if it explains the motion as well as the fit without
+`Slide`.
 """
 
 from collections.abc import Callable, Iterator
@@ -94,7 +95,7 @@ class Slide:
 
     Attributes:
         kappa: (K,) rad/s^2 per Nm, inverse inertia of the ramped joint while the other joints rest.
-        level: (K,) Nm, command for slow sliding at a speed above `fall`: Coulomb friction minus other torques.
+        level: (K,) Nm, command that sustains slow sliding, above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad, viscous friction.
         fall: (K,) rad/s, Stribeck velocity: friction falls from breakaway to `level` as exp(-(v / fall)^2).
         misfit: (K,) rad, `Breakaway.misfit` of the fits without `Slide`, see WORSE.
@@ -112,13 +113,14 @@ def estimate_breakaway(
 ) -> Breakaway:
     """Estimate, from t, q and tau of the ramps, the commands at which joints broke away.
 
-    The estimate is NaN if the joint moves by less than MOVED rad along the ramp, or moves before the command rises.
+    The estimate is NaN if the joint moves less than MOVED rad in the ramp's direction, or before the command rises.
 
     Args:
         ramps: recorded ramps at any rate, in which the command rises from rest (falls for sign -1). For an encoder
-            noise of 2e-5 rad, the error is the ramp's rate times 0.5 ms (small inertia) to 3 ms (large inertia).
-        delay, lag: s, dead time and time constant between command and torque; r2s adds half of the command's hold.
-        slide: an identified arm's motion after breakaway; None: use only the fit that needs no model of the arm.
+            noise of 2e-5 rad, the estimate's error is the ramp's rate times 0.5 ms (small inertia) to 3 ms (large
+            inertia).
+        delay, lag: s, dead time and time constant between command and torque; r2s adds half of the hold to `delay`.
+        slide: motion after breakaway of an identified arm; None: use only the fit that needs no model of the arm.
 
     Raises:
         UserError: delay or lag is out of range.

@@ -1,9 +1,10 @@
-"""Estimate the presliding distance, over which the bristles of friction with memory bend after a reversal.
+"""Estimate the presliding distance, over which bristles bend after a joint has reversed its direction.
 
 The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
-bristles bend, so replays determine the presliding distance. The torque fit determines all other parameters. But only
-reversals distinguish some parameters from each other, such as offset and asymmetry. The last steps of the search
-therefore vary the parameters in WITH together with the distance, but only the distance is returned.
+bristles bend, so replays determine the presliding distance. The torque fit determines all parameters except the
+presliding distance. However, only reversals distinguish some parameters, such as offset and asymmetry. The last steps
+of the search therefore vary the parameters in WITH and the presliding distance together, but r2s keeps only the
+distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,7 +52,7 @@ def estimate_presliding(
 
     Args:
         dynamics: dynamics of the arm fitted to torque. torque_data: torque residual that `dynamics` minimizes.
-        known: posterior of the torque fit, which is the prior of the parameters in WITH.
+        known: posterior of the torque fit, used here as the prior of the parameters in WITH.
         prior: prior of all parameters; only the prior of the presliding distance is used.
         seed: seed of the random draws from the posterior. nthread: threads of the physics. report: see `identify`.
     """
@@ -80,10 +81,10 @@ def estimate_presliding(
 
 
 def nearest_distance(data: ReplayResidual) -> np.ndarray:
-    """Simulate TRIED distances, each in all joints at once; return each joint's best distance (n,) on the unit cube.
+    """Simulate TRIED presliding distances, each in all joints; return each joint's best one (n,) on the unit cube.
 
-    A search must not start at a distance that is several times too small, because the residual's weights at such a
-    distance would suppress all reversals.
+    A search must not start at a presliding distance that is several times too small, because the residual's weights
+    at such a distance would suppress all reversals.
     """
     u = np.tile(np.linspace(0.0, 1.0, TRIED)[:, None], data.space.n)
     cost = (data(data.space.from_unit(u)) ** 2).reshape(TRIED, -1, data.space.n).sum(1)
@@ -92,9 +93,9 @@ def nearest_distance(data: ReplayResidual) -> np.ndarray:
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """One step of a search from `start` (P,) to `end`, with `parts` of residual and Jacobian at `start`.
+    """A Gauss-Newton step from `start` (P,) to `end` (P,); `parts`: residual and Jacobian at `start`.
 
-    `linearize` yields the linear prediction of the residual, so that a posterior costs no further replays.
+    `linearize` predicts the residual linearly, so that computing a posterior needs no further replays.
     """
 
     start: np.ndarray
@@ -118,7 +119,7 @@ class GaussNewton:
 
 
 def _part(space: ParameterSpace, dynamics: Dynamics, names: Sequence[str]) -> ParameterSpace:
-    """Return the space of the blocks `names` alone, with the bounds of `space` and other values from `dynamics`."""
+    """Return the space of only the parameters `names`, with bounds of `space` and nominal values of `dynamics`."""
     at = {name: space.where(name) for name in names}
     bounds = {name: [space.lower[k], space.upper[k]] for name, k in at.items()}
     return replace(parameter_space(space.robot, dynamics, bounds), fixed=space.fixed)

@@ -3,8 +3,9 @@
 Friction varies between ramps, because of posture, load and cables. Two ramps per joint and direction hardly determine
 a variance: by Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors. Therefore r2s
 averages a joint's variance with the mean variance of all joints of the same size; this mean has the weight of
-PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small: the scatter of joints
-of the same size differs, on twins by factors of 3 and more. If no ramp is repeated, r2s assumes the scatter REPEATS.
+PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small, because the scatter
+differs between joints of the same size: on twins by factors of 3 and more. If no ramp is repeated, r2s assumes the
+standard deviation REPEATS.
 """
 
 from typing import NamedTuple

@@ -1,6 +1,6 @@
 """Choose the stiction model of joints at rest and, if no ramps were recorded, the breakaway torques.
 
-r2s tries every model and a grid of torques, because the replay error has no useful gradient.
+r2s tries every stiction model and a grid of breakaway torques, because the replay error has no useful gradient.
 """
 
 from dataclasses import replace
@@ -73,9 +73,10 @@ def scan_breakaway(
 ) -> np.ndarray:
     """Return the breakaway torques (n, 2) Nm with which `dynamics` replays the recording best.
 
-    A gradient search would fail: the replay error jumps if a joint starts to slide one step sooner. In each pass, a
-    candidate differs in one breakaway torque, and the replay error of its joint is minimized. Coarse passes scan from
-    0 to `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, as joints affect each other.
+    A gradient search would fail: the replay error jumps if a joint starts to slide one step sooner. In each pass,
+    every candidate changes one breakaway torque, and r2s minimizes this joint's replay error. Coarse passes scan from
+    0 to `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, because joints affect each
+    other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

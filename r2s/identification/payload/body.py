@@ -24,7 +24,7 @@ class BodySpace:
 
     Attributes:
         heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the center's coordinates.
-        gyration: m, radius of a ball of water with about the body's mass, divided by sqrt(5).
+        gyration: m, r / sqrt(5) for a ball of water with radius r and about the body's mass.
     """
 
     heaviest: float

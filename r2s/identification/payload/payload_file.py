@@ -21,7 +21,7 @@ def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mappi
     `arm.payload`, `arm.declared_payload` and `data.declared_payload` read payload.yaml; `robot.tool` reads tool.json.
 
     Args:
-        path: the payload.yaml to write. robot: the loaded arm. source: names of recording, calibration, run.
+        path: the payload.yaml to write. robot: the loaded arm. source: names of recording, calibration and run.
     """
 
     def numbers(values: np.ndarray) -> Any:

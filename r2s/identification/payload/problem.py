@@ -38,8 +38,9 @@ class Rows:
     """Residual of a recording with a payload, in standard deviations: error + body @ phi + arm @ w.
 
     Attributes:
-        error: (R,), residual without payload. body: (R, 10), slope for the payload's standard parameters phi about
-            the end effector. arm: (R, r), slope for model errors w ~ N(0, I). clusters: (R,), block of each row.
+        error: (R,), residual without payload. body: (R, 10), derivative for the payload's standard parameters phi
+            about the end effector. arm: (R, r), derivative for the arm's model errors w ~ N(0, I). clusters: (R,),
+            block of each row.
     """
 
     error: np.ndarray
@@ -49,14 +50,14 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10), constant (r,): gain @ phi + constant are the model errors w of least cost given phi (10,)."""
+        """Gain (r, 10), constant (r,): for a given phi (10,), w = gain @ phi + constant has the least cost."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,): |slope @ phi + constant|^2 plus a fixed number is the cost at the best w."""
+        """Slope (K, 10), constant (K,): the cost at the best w is |slope @ phi + constant|^2 plus a fixed number."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -67,7 +68,7 @@ class Rows:
         return root / size, np.linalg.lstsq(root.T, size * b, rcond=None)[0]
 
     def best_arm(self, phi: np.ndarray) -> np.ndarray:
-        """Return the arm's model errors w (r,) of least cost given a payload phi (10,)."""
+        """Return the arm's model errors w (r,) with the least cost for a payload phi (10,)."""
         gain, constant = self._eliminated
         return gain @ phi + constant
 
@@ -121,14 +122,14 @@ class LoadedTorque:
         return np.stack(moved, -1) @ np.linalg.inv(LinkInertia(np.ones(10), centre, tensor).standard()).T
 
     def load_friction(self, payload: Payload | None) -> np.ndarray:
-        """Return the change of friction (T, n) Nm by a payload's weight if 1 Nm of load adds 1 Nm of friction."""
+        """Return the change of friction (T, n) Nm due to a payload's weight if 1 Nm of load adds 1 Nm of friction."""
         m = self.torque.motion
         carried = mass_and_moment(self.arm.robot, payload)
         loaded = self._weight + np.array([self._load(q, carried) for q in m.q])
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Linearize the residual at `payload` (parameters phi (10,)); weights exclude torque from errors w (r,)."""
+        """Linearize the residual at `payload`, parameters phi (10,); weights omit the torque of errors w (r,)."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

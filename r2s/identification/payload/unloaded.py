@@ -19,7 +19,8 @@ def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff
     of the payload. Commands do not contain a declared payload's weight, because gravity compensation adds it.
 
     Args:
-        payload: the known payload. cutoff_hz: torque cutoff of the identification; acceleration has a higher cutoff.
+        payload: the known payload. cutoff_hz: the identification's cutoff for torque; that for acceleration is
+            higher.
     """
     grid = recording.resample(SIM_DT)
     smooth = grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 * recording.rate_hz))

@@ -40,7 +40,7 @@ class SlidingMotion:
     Attributes:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2, motion. bristle: (F, n), presliding state.
         means: for each piece of the recording, n sparse matrices (moments, instants) with the window weights of each
-            joint. A moment without a window has an empty row.
+            joint. A moment without a window has an empty matrix row.
         seen: (T, n) bool, whether the moment has a window; in a window, the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of a window's mean acceleration for white encoder noise of 1 rad.
         encoder: (n,) rad, standard deviation of the encoder noise.
@@ -73,7 +73,7 @@ class SlidingMotion:
 
         For a friction law with memory (`slid` > 0), bristles bend over `presliding_rad` (a number or (n,)) after a
         reversal. After a reversal, a window starts only when the joint has slid by `slid` rad. In a window, velocity
-        is nearly constant over the distance PRESLIDING, because bristle friction depends on earlier velocities.
+        must be nearly constant over the distance PRESLIDING, because bristle friction depends on earlier velocities.
 
         Raises:
             UserError: no trajectory is longer than 2 EDGE_S.
@@ -153,7 +153,7 @@ class SlidingMotion:
     def command(self, delay: float, lag: float) -> np.ndarray:
         """Return window means (T, n) Nm of the command after the hold, the `delay` in s and the `lag` in s.
 
-        The command is the mean of u(t - delay - hold - x), hold uniform over a step, x exponential with mean `lag`.
+        The result is the mean of u(t - delay - hold - x): hold is uniform over a step, x exponential with mean `lag`.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
@@ -180,7 +180,7 @@ def _averaged(means: tuple[csr_array, ...], x: np.ndarray) -> np.ndarray:
 
 
 def _weights(half: int) -> np.ndarray:
-    """Return the weights (2 half + 1,) of a window; the weights and two derivatives vanish at the window's ends."""
+    """Return the weights (2 half + 1,) of a window; the weights and two of their derivatives vanish at its ends."""
     weights = (1.0 - (np.arange(-half, half + 1) / (half + 1)) ** 2) ** 3
     return weights / weights.sum()
 
@@ -188,7 +188,8 @@ def _weights(half: int) -> np.ndarray:
 def _noise(half: int) -> float:
     """Return the standard deviation of the mean acceleration, 1/s^2, for white angle noise of 1 rad.
 
-    Integration by parts moves both time derivatives to the weights. One weight spans 1 / (RATE_HZ SIM_DT) time steps.
+    Integration by parts moves the angle's two time derivatives to the weights. A weight applies for 1 / (RATE_HZ
+    SIM_DT) time steps.
     """
     second = np.diff(np.pad(_weights(half), 2), 2) * RATE_HZ**2
     return float(np.linalg.norm(second) * np.sqrt(SIM_DT * RATE_HZ))

@@ -1,7 +1,7 @@
 """Replay residual (output error) of commanded motion: simulated minus recorded joint angles, eq. (8) of the paper.
 
-In each window, every candidate is simulated from the measured state with the recorded commands. All windows of many
-candidates are simulated in one batch. Residuals are in standard deviations, see `reweighted`.
+In each window, every candidate is simulated from the measured start state with the recorded commands. All windows of
+many candidates are simulated in one batch. Residuals are in standard deviations, see `reweighted`.
 """
 
 from copy import copy
@@ -29,7 +29,8 @@ class ReplayResidual:
     The error of a window is modeled as Z b + e. For each joint, b ~ N(0, diag(d)) contains the errors of start angle
     and start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise.
     The covariance of Z b + e whitens the error. Finite differences yield Z. The first d and s come from the
-    recording, later estimates from a fit. `clusters` (R,) is each row's block; before a fit, each window is a block.
+    recording, later d and s from a fit. `clusters` (R,): block number of each row; before a fit, each window is a
+    block.
 
     Args:
         space: parameters to estimate. recording, windows: see `cut_windows`. stride: ms, averaging time of angles.
@@ -170,8 +171,9 @@ def _random_effects(
     """Estimate the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e by maximum evidence.
 
     MacKay's fixed-point iteration (Neural Computation 4(3), 1992) starts at `sigma` and `noise`. The variance of b is
-    the sum of squared estimates of b, divided by the number of well-determined b. The estimates' mean over windows is
-    subtracted first: a wrong parameter (mostly an offset) causes it. The standard deviation of b is >= `min_sigma`.
+    the sum of squared estimates of b over the number of well-determined estimates. First, the estimates' mean over
+    windows is subtracted, because a wrong parameter (mostly an offset) causes this mean. The standard deviation of b
+    is >= `min_sigma`.
     """
     _, rows, k = z.shape
     n = len(noise)

@@ -1,7 +1,7 @@
 """Torque residual (equation error): torque predicted at the measured motion minus recorded torque.
 
 For link-side and motor torque, r2s minimizes only the torque residual, because only commands can be replayed. For
-commanded torque, a fit of the torque residual is a fast search before replays. Residuals are in standard deviations.
+commanded torque, a fast fit of the torque residual can precede replays. Residuals are in standard deviations.
 """
 
 from collections.abc import Iterator
@@ -110,13 +110,13 @@ class TorqueResidual:
         return self._with(space=space).reweighted(space.start, fitted=False)
 
     def with_lead(self, lead_s: float) -> "TorqueResidual":
-        """Return a copy for a simulator with implicit friction; `_friction` explains `lead_s` in s."""
+        """Return a copy for a simulator with implicit friction; lead_s: s, see `_friction`."""
         return self._with(lead_s=lead_s)
 
     def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
         """Return a copy for bristles that bend over `presliding_rad` (n,) rad during the motion of `recording`.
 
-        The copy has weights as before a fit, and shares motion and regressors with the original to save memory.
+        The copy has the weights of an unfitted residual, and shares motion and regressors to save memory.
         """
         of = partial(self._of, presliding_rad=presliding_rad)
         bristle = np.concatenate([of(piece).bristle for piece in _pieces(recording, of)])
@@ -236,11 +236,11 @@ class TorqueResidual:
     def _changes(
         self, x: np.ndarray, stepped: np.ndarray
     ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
-        """Return the torque error (T, n) at x, and [(parameter block, indices in x, change)] to `stepped`.
+        """Return the torque error (T, n) at x, and [(parameter block, indices in x, change from x to `stepped`)].
 
         `change` is a change of torque (T, n) or, for L link parameters, of standard parameters (n, 10 n, L). Changes
-        of standard parameters need no evaluation, as torque is linear in them. In other parameter blocks, a joint's
-        value affects only this joint's torque, so one evaluation steps the values of all joints.
+        of standard parameters need no evaluation, because torque is linear in standard parameters. A joint's friction
+        or offset affects only this joint's torque, so one evaluation changes the values of all joints.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -329,7 +329,7 @@ class _Known(NamedTuple):
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
-    """Filter a recording piece by piece with `of`; return the joined motion and the rigid-body torque."""
+    """Filter a recording piece by piece with the function `of`; return the joined motion and rigid-body torque."""
     motions = [of(piece) for piece in _pieces(recording, of)]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     joined = type(motions[0]).joined(motions)

@@ -1,7 +1,7 @@
-"""Cut a recording of commanded torque into windows, and replay each from its measured start state (paper, eq. (8)).
+"""Cut a recording of commands into windows, and replay each window from its measured start state (paper, eq. (8)).
 
-A simulated arm without feedback drifts. Windows are short, because after some seconds drift dominates the error and
-hides the effect of wrong parameters.
+A simulated arm without feedback departs from the recorded motion. Windows are short, because after some seconds the
+accumulated error hides the effect of wrong parameters.
 """
 
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Windows:
     def bristles(self, d: Dynamics) -> np.ndarray:
         """Return the presliding state (..., W, n) at the start of each window, for dynamics with batch axes (...).
 
-        The state starts from 0 in each trajectory and follows recorded velocity; without friction memory, it is 0.
+        The state starts at 0 in each trajectory and follows recorded velocity; without friction memory, it is 0.
         """
         if not d.family.has_memory:
             return np.zeros((len(self.at), self.dq.shape[1]))
@@ -84,8 +84,9 @@ def cut_windows(
 
     Args:
         limit: largest number of windows; a longer recording yields `limit` evenly spaced windows.
-        slowest: rad/s. A window ends when a joint is slower, and the next window starts when all joints are faster,
-            as a tiny parameter change could shift a slow joint's breakaway. Joints that never move are ignored.
+        slowest: rad/s. A window ends when a joint is slower than `slowest`, and the next one starts when all joints
+            are faster, because tiny parameter changes could shift a slow joint's breakaway. Joints that never move
+            are ignored.
         edges: (n, 2) Nm, lower and upper breakaway command of each joint, widened by SCATTER. A slow joint ends a
             window only if its command lies between its two breakaway commands.
 

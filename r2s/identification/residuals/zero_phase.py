@@ -31,8 +31,9 @@ class SmoothMotion:
     Attributes:
         t: (T,) s, sample times. q, dq, ddq, tau: (T, n), filtered forward and backward.
         friction_dq: (F, n) rad/s, velocity at FRICTION_HZ, with a higher cutoff than dq. bristle: (F, n), presliding
-            state. friction_dq and bristle have half a kernel of constant rows before and after each trajectory.
-        kernel: (K,), weights of the low-pass. spans: for each sample, the index of its first row in friction_dq.
+            state. friction_dq and bristle are padded with half a kernel of constant rows at both ends of a
+            trajectory.
+        kernel: (K,), weights of the low-pass. spans: for each sample, the first row of friction_dq under the kernel.
         delayed: (T, L, n) Nm, tau at L time shifts in the range SHIFTS, `shift_s` s apart.
     """
 
@@ -58,7 +59,7 @@ class SmoothMotion:
     ) -> "SmoothMotion":
         """Resample to 1 kHz, filter forward and backward, differentiate, remove EDGE_S at ends, sample at `rate_hz`.
 
-        rate_hz: rows per second, at most FRICTION_HZ. late: delay of dq, which is compensated; None: no delay.
+        rate_hz: rows per second, at most FRICTION_HZ. late: delay of dq, which is corrected; None: no delay.
 
         Raises:
             UserError: no trajectory is longer than 2 EDGE_S.

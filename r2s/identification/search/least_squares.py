@@ -15,7 +15,8 @@ class LeastSquares:
     """The least-squares search.
 
     Attributes:
-        max_evaluations: largest number of Jacobians. ftol: least relative gain for another step. minutes: time limit.
+        max_evaluations: largest number of Jacobians. ftol: the search ends when a step lowers the cost by less than
+            this share. minutes: time limit.
         level: what to minimize: "residual" for `Problem.data`, "torque" for the torque residual (takes seconds).
     """
 

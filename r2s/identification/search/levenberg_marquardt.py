@@ -58,7 +58,7 @@ def minimize(
 
 
 def normal_equations(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Sum J^T r (P,) and J^T J (P, P) over the parts (residual r, Jacobian J), and return both sums."""
+    """Return the sums of J^T r (P,) and J^T J (P, P) over all `parts` (residual r, Jacobian J)."""
     gradient, hessian = 0.0, 0.0
     for r, j in parts:
         gradient, hessian = gradient + j.T @ r, hessian + j.T @ j

@@ -1,7 +1,7 @@
 """Backward elimination: remove a term if the model predicts held-out torque equally well without this term.
 
-Models with fewer parameters generalize better. Gravity hardly distinguishes link masses from a payload. An arm with
-correct published link parameters needs no link terms; an arm without payload needs no payload term.
+Models with fewer parameters generalize better. Gravity torque hardly distinguishes link masses from a payload. An arm
+with correct published link parameters needs no link terms; an arm without payload needs no payload term.
 """
 
 from collections.abc import Sequence

@@ -18,8 +18,8 @@ CLOSE = 1.45
 def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float = 0.0) -> dict[str, Any]:
     """Return {"error": (F,) held-out torque error relative to the least one, "best": index} for F friction families.
 
-    r2s selects a family with more parameters only if it predicts torque clearly better. Rows of slow motion
-    show whether friction falls with velocity, but the low-pass adds friction at rest to them. If `slowest` > 0
+    r2s selects a family with more parameters only if it predicts torque clearly better. Rows of slow motion show
+    whether friction falls with velocity, but the low-pass mixes friction at rest into these rows. If `slowest` > 0
     (rad/s) and the best family has no memory, r2s compares the families without memory again, over windows in which
     joints are faster than `slowest` (modulating_functions.py), and returns the new errors.
 

@@ -4,7 +4,7 @@ The log alone determines the lateness of dq relative to q (r2s/recordings/latene
 fit. If an arm filters torque and dq alike, they are equally late and need no correction, because inertial torque and
 friction refer to the same time; a correction of only dq would increase the error. On a physical Panda, dq is 5.3 ms
 late and torque about 2 ± 0.5 ms. Correcting only the Panda's dq raised the error on held-out motion of the training
-part, but the training residual did not reveal this error.
+data, which the training residual did not reveal.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether to estimate the delay of torque, "alike": whether torque and dq are equally late}.
 
-    If dq is on time, or the lateness of dq unknown, r2s estimates the delay of torque unless this delay is clearly
-    below LATE_S: a delay fixed at 0 would have no uncertainty. If dq is late, r2s first fits torque with corrected
-    dq, and corrects torque and dq if torque clearly has a delay in this fit. If not, r2s corrects only dq, unless
-    this hardly lowers the error of held-out torque (by one standard error or less); torque and dq as logged are then
-    treated as equally late. With fewer than 2 folds, r2s corrects only dq if torque has no clear delay.
+    If dq is on time or has an unknown lateness, r2s estimates the delay of torque unless this delay is clearly below
+    LATE_S: a delay fixed at 0 would have no uncertainty. If dq is late, r2s first fits torque with corrected dq, and
+    corrects torque and dq if torque clearly has a delay in this fit. If torque has no clear delay, r2s corrects only
+    dq; but if this correction hardly lowers the error of held-out torque (by one standard error or less), r2s treats
+    torque and dq as equally late. With fewer than 2 folds, r2s corrects only dq if torque has no clear delay.
     """
     on_time = not np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure).any()
     if DELAY in terms:

@@ -1,7 +1,7 @@
 """Compare adapters by their transfers, in tables with a row per adapter and a column per condition of the arm.
 
-Means are over arms and episodes. The bootstrap is paired: all rows of a condition share the drawn arms and the drawn
-episodes of each arm.
+Each mean is taken over arms and episodes. The bootstrap is paired: each draw resamples arms, and episodes of each
+arm, and uses this sample for all rows of a condition.
 """
 
 import os
@@ -31,10 +31,10 @@ class AdapterComparison:
         scores: a line per measure, condition and row: `mean`, 95 % interval `low` to `high`; `difference` from the
             row `reference` (None: no reference); 95 % interval `worse_low` to `worse_high` of how much worse the row
             is; counts of `stopped` episodes, episodes common to all rows (`asked`), averaged `episodes`, and `arms`.
-        losses: table with a line per condition and row. `value` is the mean of the headline measure in the condition;
-            `nominal` is its mean over the same arms and episodes in the nominal condition.
-        costs: table with a line per row. `us` is the adapter's computing time per cycle, microseconds.
-        runs: {row: transfers of the row}. key: lines that explain policy names. left_out: lines on omitted episodes.
+        losses: table with a line per condition and row. The columns `value` and `nominal` are means of the headline
+            measure in the condition and, over the same arms and episodes, in the nominal condition.
+        costs: table with a line per row. The column `us` is the adapter's computing time per cycle, microseconds.
+        runs: {row: its transfers}. key: lines that explain policy names. left_out: lines on omitted episodes.
     """
 
     measures: Mapping[str, Measure]
@@ -96,7 +96,7 @@ def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return the table `AdapterComparison.losses`; `shared` joins the outputs of `in_common` for all conditions."""
+    """Return the table `AdapterComparison.losses`; `shared`: the joined outputs of `in_common` for all conditions."""
     key = ["row", "arm", "goal"]
     values = shared.rename(columns={measure: "value"})
     nominal = values.loc[values["condition"] == NOMINAL, [*key, "value"]].rename(columns={"value": "nominal"})
@@ -105,13 +105,14 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
-    """Return the part of the table `AdapterComparison.scores` for one measure and one condition.
+    """Return the lines of the table `AdapterComparison.scores` for one measure and one condition.
 
-    An episode without a finite value in one row is omitted in all rows; a stopped episode, for example, has no RMSE.
-    A row without any values causes no omissions in other rows. The mean of a single episode has no interval.
+    An episode without a finite value in one row, such as a stopped episode without an RMSE, is omitted in all rows. A
+    row that has no finite value at all does not make other rows omit episodes. The mean of a single episode has no
+    interval.
 
     Args:
-        shared: output of `in_common`. measure: the compared measure. reference: {row: reference row or None}.
+        shared: output of `in_common`. measure: the compared measure. reference: {row: its reference row or None}.
         seed: seed of the bootstrap.
     """
     wide = shared.pivot(index=["arm", "goal"], columns="row", values=measure.key)[list(shared["row"].unique())]
@@ -145,8 +146,8 @@ def _interval(draws: np.ndarray, count: int) -> tuple[float, float]:
 def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]], list[str]]:
     """Return {row name: transfers} with the shortest distinct names, and lines that explain the names of policies.
 
-    If any arm ran several policies, a row is an adapter with one policy. If each arm ran only one policy, a row is an
-    adapter with all policies.
+    If any arm ran several policies, a row is an adapter with one policy. If each arm ran only one policy, a row
+    combines all policies of an adapter.
     """
     of_arm: dict[str, set[str]] = {}
     for r in found:
@@ -172,7 +173,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return {path: short path}. A short path is the last components of the path, as few as distinguish all paths."""
+    """Return {path: short path}. A short path contains only as many last components as distinguish all paths."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -181,7 +182,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the reference of row `name`: its policy's adapt=none row, else the only adapt=none row, else None."""
+    """Return the row to compare `name` with: adapt=none with the same policy, else the only adapt=none, else None."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]
@@ -189,7 +190,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Return a line on a row: headline measure in the worst condition; conditions with a better reference."""
+    """Return text on a row: its headline measure in its worst condition, and where it is worse than its reference."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:
@@ -211,7 +212,7 @@ def verdict(found: AdapterComparison, row: str) -> str:
 
 
 def _place(found: AdapterComparison, worse: pd.DataFrame) -> str:
-    """Name a condition and the worse measures of a row: "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)"."""
+    """Name a condition and the measures that got worse: "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)"."""
     parts = []
     for r in worse.to_dict("records"):
         m = found.measures[r["measure"]]

@@ -1,4 +1,4 @@
-"""Write tables, figure and report of an adapter comparison."""
+"""Write the tables, the figure and the report of a comparison of adapters."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -55,7 +55,7 @@ def _square(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def lines(found: AdapterComparison) -> list[str]:
-    """Return lines about the tables: a verdict per row, names of policies, and episodes that the means omit."""
+    """Return lines of text about the tables: a verdict per row, names of policies, episodes that the means omit."""
     s = found.scores
     out = [verdict(found, row) for row in found.runs]
     if len(s) and not s["stopped"].any():

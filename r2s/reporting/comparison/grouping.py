@@ -27,7 +27,8 @@ def group(runs: Sequence[Trained]) -> Groups:
     """Group the runs by their settings, so that the runs of a group differ only in their seeds.
 
     A group's label is the algorithm and the overrides of settings that differ among groups. A setting that the label
-    omits is default or equal in all groups. Labels longer than LONGEST are numbered, as in "tqc #1" (`Groups.key`).
+    omits is default or equal in all groups. A label longer than LONGEST letters is replaced by the algorithm and a
+    number, such as "tqc #1" (`Groups.key`).
     """
     sets: dict[str, list[Trained]] = {}
     for run in runs:
@@ -70,7 +71,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: differing settings}; compare algo settings per algorithm, other settings in all runs."""
+    """Return {algorithm: settings that differ}: algo.* among the algorithm's runs, other settings among all runs."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}

@@ -96,7 +96,7 @@ def _sections(
 
 
 def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]:
-    """Return a report section per heading in `parts`, {heading: {run: reason}}; omit headings without runs."""
+    """Return a report section for each heading in `parts`, {heading: {run: reason}}, that has runs."""
     return {heading: [[f"{k}: {v}" for k, v in why.items()]] for heading, why in parts.items() if why}
 
 

@@ -14,7 +14,7 @@ Grouped = Mapping[str, Sequence[Trained]]
 
 
 def measures_in(grouped: Grouped) -> MeasureTable:
-    """Return the measure table of the task, which is the same in all runs."""
+    """Return the measure table of the task; all runs have the same task."""
     return next(iter(grouped.values()))[0].measures
 
 
@@ -24,7 +24,7 @@ def scores(group: Sequence[Trained], measure: str) -> np.ndarray:
 
 
 def summary_table(grouped: Grouped) -> pd.DataFrame:
-    """Return a row per group and measure: seeds, mean, interquartile mean and its 95 % interval."""
+    """Return a row per group and measure: number of seeds, mean, interquartile mean with a 95 % interval."""
     rows, table = [], measures_in(grouped)
     for label, group in grouped.items():
         for measure in dict.fromkeys((*table.comparison, *table.scores)):
@@ -36,7 +36,7 @@ def summary_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def improvement_table(grouped: Grouped) -> pd.DataFrame:
-    """Return, per pair of groups, the probability that a run of the first beats a run of the second group."""
+    """Return the probability that a run of one group beats a run of another group, for each ordered pair."""
     rows, table = [], measures_in(grouped)
     pairs = [(first, second) for first in grouped for second in grouped if first != second]
     for first, second in pairs:
@@ -50,12 +50,13 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
-    """Return how much a measure depends on an algorithm's settings, for each algorithm with two settings or more.
+    """Return how much a measure depends on the settings of an algorithm, for each algorithm with several settings.
 
-    `best`, `median` and `worst` summarize the interquartile means of the settings. `best` is optimistic, because the
-    same seeds select and score the setting. `held_out` is a mean over seeds, in which each seed scores the setting
-    that is best at the other seeds. `spread`, with 95 % interval over seeds, is `held_out` minus the median setting's
-    score, or nan for fewer than two common seeds. An algorithm with a small `spread` needs little tuning.
+    `best`, `median` and `worst` are the best, median and worst interquartile mean of all settings. `best` is
+    optimistic, because the same seeds select and score the setting. `held_out` is the mean over seeds of a seed's
+    score with the setting that is best at the other seeds. `spread` is the mean over seeds of how much this score is
+    better than the median score of all settings; `low` and `high` are its 95 % interval. Fewer than two common seeds
+    give nan. An algorithm with a small `spread` needs little tuning.
 
     Args:
         grouped: groups of trainings. measure: key of the measure; None: the last measure of `MeasureTable.selection`.
@@ -79,7 +80,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return, at S held-out seeds, the score (S,) of the setting best at the other seeds, and the median score (S,).
+    """Return, for S seeds, the score (S,) of the setting that is best at the other seeds, and the median score (S,).
 
     Args:
         settings: {seed: score} of each setting; a larger score is better. Only seeds common to all settings are used;
@@ -94,7 +95,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line for each algo or reward setting whose best value is at an end of three or more tried values."""
+    """Return a line per algo or reward setting whose best value is the smallest or largest of three or more tried."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -128,7 +129,7 @@ def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid of x (points,), and the interquartile mean, minimum and maximum of y over seeds (3, points).
+    """Return a grid of x (points,), and (3, points) the interquartile mean, minimum and maximum of y over the seeds.
 
     The curves of all seeds are interpolated over their common range of x.
     """

@@ -12,7 +12,7 @@ DRAWS = 2000  # number of draws of a bootstrap, as in Agarwal et al.
 
 
 def interquartile_mean(x: np.ndarray) -> np.ndarray:
-    """Return the mean over the last axis of x (..., S) without the lowest and the highest quarter.
+    """Return the mean over the last axis of x (..., S) without the lowest and the highest quarter of the values.
 
     A quarter has S / 4 values, rounded down as in rliable; for S < 4, all values are averaged.
     """
@@ -44,7 +44,8 @@ def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     """Return bootstrap means (DRAWS, A) of A rows; each draw uses the same resampled arms and episodes for all rows.
 
     Args:
-        each: values (E, A) of E episodes in A rows of a comparison, one array per arm. rng: random generator.
+        each: one array (E, A) per arm, with the values of E episodes in A rows of a comparison. rng: random
+            generator.
     """
     draws = []
     for _ in range(DRAWS):

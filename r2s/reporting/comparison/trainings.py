@@ -92,7 +92,7 @@ def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[
 
 
 def why_not(folder: Path, stage: str, files: Iterable[str]) -> str:
-    """Return the reason why a folder is not a finished run of `stage` with all `files`, or "" for such a run."""
+    """Return why a folder is no finished run of `stage` with all `files`; "" if the folder is a finished run."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
         seen, status = meta.get("stage", "train"), meta["status"]
@@ -144,7 +144,7 @@ def _read(folder: Path) -> Trained:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    """Return commit, machine, threads and device of a run; for a resumed run, of all its parts between stops."""
+    """Return commit, machine, threads and device of a run; a resumed run can have several of each ("A and B")."""
     found: dict[str, set[str]] = {key: set() for key in ORIGIN}
     for part in parts_of(json.loads((folder / "meta.json").read_text())):
         git, machine = part["git"] or {}, part["machine"] or {}
@@ -156,7 +156,7 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 
 def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, Any]:
-    """Return the settings in `groups` of a config as {"dr.phi_relative": 0.1, ...}, without keys `_target_`."""
+    """Return the settings of the config groups `groups` as {"dr.phi_relative": 0.1, ...}, without `_target_` keys."""
     own = flat({group: node for group, node in config.items() if group in groups})
     return {key: value for key, value in own if not key.endswith("_target_")}
 
@@ -187,9 +187,10 @@ def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, di
 def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
     """Return the largest set of comparable runs, and {run: reason} for all other runs.
 
-    Runs are comparable if robot, task, evaluation and all of ORIGIN agree, and budgets differ by at most the factor
-    `MOST_BUDGETS`. Of sets of equal size, sets without +experiment=toy have priority, then sets with more env steps.
-    Only the first run with given settings and seed is kept, because a repetition adds no evidence.
+    Runs are comparable if they agree in robot, task, number of episodes and all keys of ORIGIN, and if the ratio of
+    their budgets is at most `MOST_BUDGETS`. Of sets of equal size, sets without +experiment=toy have priority, then
+    sets with more env steps. Only the first run with given settings and seed is kept, because a repetition adds no
+    evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -208,7 +209,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why a run is not comparable with `first`, the smallest-budget run of a set; "" for a comparable run."""
+    """Return why a run is not comparable with `first`, the run of a set with the least budget; "" if comparable."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]

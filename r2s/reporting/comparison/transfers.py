@@ -33,7 +33,8 @@ class Transferred:
         arm: name such as "twin, rigid, seed 0". condition: output of `condition`. robot: robot config in training.
         measures: measures of the task. length: episode length and rate, as "4 s at 100 Hz". goals: number of goals.
         us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
-        episodes: a row per episode, indexed by goal, with `MeasureTable.transfer`, gap and arm_stopped (0 or 1).
+        episodes: table with a row per episode, indexed by goal; columns: `MeasureTable.transfer`, path gap,
+            arm_stopped (0 or 1).
     """
 
     folder: Path
@@ -103,7 +104,7 @@ def _cost(path: Path) -> float:
 
 
 def _names(goals: np.ndarray) -> Iterator[str]:
-    """Yield a name per goal, the same in all transfers; a number distinguishes equal goals.
+    """Yield a name for each goal; a goal has the same name in all transfers, and a number distinguishes equal goals.
 
     Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometers.
     """
@@ -132,7 +133,7 @@ def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[st
 
 
 def _difference(run: Transferred, first: Transferred) -> str:
-    """Return why a transfer is not comparable with `first`; "" if it is comparable."""
+    """Return why a transfer is not comparable with `first`; "" for a comparable transfer."""
     if keys := [k for k in first.robot | run.robot if run.robot.get(k) != first.robot.get(k)]:
         return f"another robot: robot.{keys[0]} differs"
     one, other = (r.measures[r.measures.selection[0]].title for r in (run, first))

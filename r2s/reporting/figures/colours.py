@@ -13,8 +13,8 @@ OTHERS = (
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
-    The first label that contains the word "measured" has the color of this word in KNOWN; likewise for "nominal" and
-    "identified". All further labels cycle through the twelve colors in OTHERS.
+    For each of the words "measured", "nominal" and "identified", the first label that contains the word has the color
+    of the word in KNOWN. All labels without a color in KNOWN cycle through the twelve colors in OTHERS.
     """
     found: dict[str, str] = {}
     others = 0

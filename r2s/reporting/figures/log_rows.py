@@ -7,20 +7,20 @@ PAUSE = 0.1  # s, drawn length of a pause of any length
 
 
 def thin(count: int, most: int = MOST_POINTS) -> slice:
-    """Return a slice that selects evenly spaced rows, at most `most` out of `count` rows."""
+    """Return a slice that selects at most `most` evenly spaced rows out of `count` rows."""
     return slice(None, None, max(1, -(-count // most)))
 
 
 def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
-    """Return row indices that sample a log with times t (T,) s at about `rate` Hz, first and last row included."""
+    """Return indices that sample a log with times t (T,) s at about `rate` Hz, including its first and last row."""
     grid = np.arange(t[0], t[-1], 1 / rate)
     return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
 
 
 def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shorten each pause of the clock t (T,) s to `PAUSE`; return a clock from 0, and the first row after each pause.
+    """Shorten the pauses of a clock t (T,) s to `PAUSE`; return a clock that starts at 0, and the rows after pauses.
 
-    A pause is a time step longer than five median steps, or a backward step at a clock restart.
+    A pause is a time step that is longer than five median time steps, or not positive because the clock restarted.
     """
     steps = np.diff(t)
     usual = float(np.median(steps)) if len(steps) else 0.0

@@ -55,19 +55,19 @@ def panels(
 
 
 def joint_panels(path: Path, n: int, title: str) -> AbstractContextManager[list[Axes]]:
-    """Return the context manager `panels` for one panel per joint."""
+    """Return the context manager `panels` for a figure with one panel per joint."""
     return panels(path, n, 2 if n > 3 else 1, title)
 
 
 def label_axis(axis: Axes, m: Measure) -> None:
-    """Set the title of a measure's panel, and the range 0 to 100 % of the y axis if the measure is a percentage."""
+    """Set the title of a measure's panel; for a percentage, also limit the y axis to 0 to 100 %."""
     axis.set_title(m.heading, loc="left")
     if m.unit == "%":
         axis.set_ylim(-3, 103)
 
 
 def log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Make the y axis logarithmic, with ticks at the multiples `ticks` of each power of ten, without exponents."""
+    """Make the y axis logarithmic; label the multiples `ticks` of powers of ten, without exponents."""
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(subs=ticks))
     axis.yaxis.set_major_formatter("{x:g}")

@@ -19,7 +19,7 @@ FINE = "{:.4g}"
 
 
 def contact_table(found: ContactEstimate) -> pd.DataFrame:
-    """Return a row per parameter of the surface: value, 95 % interval, whether the data determine the parameter."""
+    """Return a row per surface parameter: value, 95 % interval, and whether the data determine the parameter."""
     rows = {f"slope at {LOAD:g} N, N/m": (found.slope, found.interval("slope"), found.identifiable["slope"])}
     for name, unit in UNITS.items():
         value, known = getattr(found.surface, name), found.identifiable[name]

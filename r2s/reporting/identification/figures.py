@@ -57,7 +57,7 @@ def torque_figure(
 def position_figure(
     path: Path, windows_q: np.ndarray, predicted: Mapping[str, np.ndarray], dt: float = SIM_DT
 ) -> Path:
-    """Draw the open-loop error, rad: |q - windows_q| for predicted {label: q (W, S, n)} and measured windows_q.
+    """Draw the open-loop error |q - windows_q| in mrad; predicted: {label: q (W, S, n) rad}; windows_q: measured.
 
     `dt` is the time step of the S rows, s. Lines are medians over the W windows; bands contain 90 % of the windows.
     """
@@ -127,7 +127,7 @@ def friction_figure(
 def _band(
     axis: Axes, speed: np.ndarray, torque: np.ndarray, limits: tuple[float, float], colour: str, label: str
 ) -> tuple[float, float]:
-    """Draw the 95 % band of torque (T, S); return y limits that cut off a wide band, so that curves stay readable."""
+    """Draw the 95 % band of S torque draws (T, S); return y limits that cut off a wide band for readable curves."""
     low, high = limits
     bottom, top = np.quantile(torque, [0.025, 0.975], axis=1)
     axis.fill_between(speed, bottom, top, label=f"95 % band, {label}", color=colour, alpha=0.25, linewidth=0)
@@ -136,7 +136,7 @@ def _band(
 
 
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw the cost of each search over time, relative to the search's start; shade the searches in SCANS.
+    """Draw the cost of each search over time, divided by its cost at the start; shade the searches in SCANS.
 
     Costs are comparable only within one search, because each search uses new weights of the residuals.
     """

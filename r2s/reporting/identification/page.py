@@ -55,9 +55,9 @@ class Evidence(NamedTuple):
     """Content of an identification's page that `IdentificationResult` does not contain.
 
     Attributes:
-        pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, 99.5 % quantiles of validation speed.
+        pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, 99.5 % quantile of each joint's speed.
         whiteness: result of `whiteness_table` for the validation motion. base: result of `base_table`.
-        window_s: length of a replay, s. cutoff_hz: cutoff of the torque fit's low-pass, Hz.
+        window_s: length of a replay, s. cutoff_hz: cutoff frequency of the low-pass in the torque fit, Hz.
     """
 
     pictures: Mapping[str, Path]
@@ -83,8 +83,9 @@ def identification_page(
 
     Args:
         run: run of the identification. nominal: nominal model. found: the result. validation: held-out motion.
-        summary: content of summary.json. window_s: length of a replay, s. cutoff_hz: low-pass of the torque fit, Hz.
-        more: further sections of the page, {heading: items}, which follow the prediction errors.
+        summary: content of summary.json. window_s: length of a replay, s. cutoff_hz: cutoff frequency of the low-pass
+            in the torque fit, Hz.
+        more: {heading: items}, further sections of the page, placed after the prediction errors.
     """
     robot, shown = found.space.robot, spread(validation, SCORED_S, SCORED_EACH_S)
     torque = TorqueResidual(found.space, shown, cutoff_hz=cutoff_hz)

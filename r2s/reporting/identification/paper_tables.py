@@ -89,7 +89,7 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
 
 
 def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
-    """Return the base parameters, a row per link; a combination is in the column of its first parameter."""
+    """Tabulate the base parameters, with a row per link; a combination is in the column of its first parameter."""
     columns: dict[str, list[str]] = {}
     rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
     for first, row in zip(base["parameter"], rows.tolist(), strict=True):
@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return a cell per link with the value of `get`, identifiable if the link's parameters in `blocks` are."""
+        """Return a cell per link: the value of `get`, marked identifiable if all its parameters in `blocks` are."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]
@@ -149,7 +149,7 @@ def _centre(axis: int, d: Dynamics) -> np.ndarray:
 
 
 def _consistency(d: Dynamics) -> str:
-    """State whether all links are physically consistent (Wensing, Kim and Slotine, RA-L 3(1), 2018)."""
+    """Return a sentence on the physical consistency of all links (Wensing, Kim and Slotine, RA-L 3(1), 2018)."""
     second = 0.5 * np.trace(d.inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - d.inertia
     wrong = np.flatnonzero((np.linalg.eigvalsh(second).min(-1) < 0) | (d.mass <= 0)) + 1
     if not len(wrong):
@@ -181,7 +181,7 @@ def friction_table(robot: Robot, nominal: Dynamics, found: IdentificationResult,
 
 
 def other_terms(robot: Robot, found: IdentificationResult) -> list[Item]:
-    """Return up to two tables: parameters of the whole arm; armature, load, drag and gain per joint."""
+    """Return up to two tables: one of parameters of the whole arm, one of armature, load, drag and gain per joint."""
     space = found.space
     items: list[Item] = []
     if arm := of_whole_arm(space, found.found, found.unseen):

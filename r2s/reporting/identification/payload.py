@@ -13,7 +13,7 @@ FINE = "{:.4g}"
 
 
 def payload_table(found: PayloadEstimate) -> pd.DataFrame:
-    """Return a row per parameter of the payload: value, 95 % interval, whether the data determine the parameter."""
+    """Return a row per payload parameter: value, 95 % interval, and whether the data determine the parameter."""
     cells = {}
     names = {"mass": ["mass, kg"], "centre": [f"centre {k}, m" for k in "xyz"]}
     names["inertia"] = [f"inertia {k}, kg m²" for k in ELEMENTS]
@@ -28,7 +28,7 @@ def payload_table(found: PayloadEstimate) -> pd.DataFrame:
 
 
 def load_error_table(found: PayloadEstimate) -> pd.DataFrame:
-    """Return the loaded arm's torque RMSE per joint, of predictions without and with the identified payload."""
+    """Return the RMSE per joint of torque predicted for the loaded arm, without and with the identified payload."""
     rows = {"without": found.rmse(found.without), "with": found.rmse(found.predicted)}
     cells = {f"{name} payload": [number(x) for x in values] for name, values in rows.items()}
     joints = [f"joint {j + 1}" for j in range(found.measured.shape[1])]

@@ -19,7 +19,7 @@ MOST = 7  # largest number of joints side by side in a terminal of 100 columns
 
 
 def identification_tables(robot: Robot, found: IdentificationResult, summary: Mapping) -> dict[str, pd.DataFrame]:
-    """Return {title: table}: parameters, breakaway, and the prediction errors in `summary` (summary.json)."""
+    """Return {title: table}: parameters, breakaway torques, and the prediction errors in `summary` (summary.json)."""
     space, estimate, tables = found.space, found.found, {}
     own = [b for b in space.blocks if b not in WHOLE_ARM and b not in LINK]
     rows = dict(_parameter(b, values(space, estimate, b, found.unseen)) for b in own)
@@ -56,7 +56,7 @@ def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
 
 
 def _breakaway(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
-    """Return the breakaway torque per joint and side, with the reason if the ramps did not measure it."""
+    """Return the breakaway torque per joint and direction; give the reason if the ramps did not measure a torque."""
     reasons = identified.edges.unknown if identified.edges is not None else {}
     columns = {}
     for side, edges in zip(SIDES, identified.dynamics.breakaway.T, strict=True):
@@ -109,13 +109,13 @@ def error_tables(robot: Robot, summary: Mapping) -> dict[str, pd.DataFrame]:
 
 
 def _pair(errors: Mapping, key: str) -> tuple[list[float], ...]:
-    """Return two lists of errors with the mean appended: of the nominal model, and of the identified model."""
+    """Return the errors of the nominal and of the identified model as two lists, each with its mean appended."""
     before, after = errors.get(f"nominal_{key}", [np.nan] * len(errors[key])), errors[key]
     return [*before, float(np.mean(before))], [*after, float(np.mean(after))]
 
 
 def _before_after(columns: Mapping[str, Sequence[Sequence[float]]], index: pd.Index) -> pd.DataFrame:
-    """Return a table with columns nominal, identified and ratio for training motion and for validation motion."""
+    """Return a table with the columns nominal, identified and ratio, both for training and for validation motion."""
     table = {}
     for side, (before, after) in columns.items():
         ratios = [a / b if b else np.nan for b, a in zip(before, after, strict=True)]

@@ -17,7 +17,7 @@ LEGEND = f"?: wider than {2 / SHARPER:g} standard deviations of the prior; prior
 
 
 class Widths(Protocol):
-    """Interface for expected interval widths of P parameters, as in `ExpectedWidths` and `PlannedWidths`."""
+    """Interface of `ExpectedWidths` and `PlannedWidths`: the expected interval widths of P parameters."""
 
     @property
     def space(self) -> ParameterSpace: ...  # noqa: D102
@@ -36,7 +36,7 @@ def verdict_table(verdict: Verdict) -> pd.DataFrame:
 
 
 def width_table(expected: Widths, n: int) -> pd.DataFrame:
-    """Return a row per parameter and a column per joint or link; whole-arm parameters are in the first column."""
+    """Return a row per parameter and a column per joint or link; parameters of the whole arm use the first column."""
     space, unit, rows = expected.space, units(), {}
     for block in space.blocks:
         parts = (space.block(x, block) for x in (expected.width, expected.share, expected.identifiable))
@@ -51,7 +51,7 @@ def width_table(expected: Widths, n: int) -> pd.DataFrame:
 
 
 def print_verdict(console: Console, robot: Robot, verdict: Verdict, title: str) -> None:
-    """Print the table of checks and, if the verdict contains them, the expected widths of the intervals."""
+    """Print the checks of a verdict as a table and, if present, its expected widths of the intervals."""
     print_table(console, verdict_table(verdict), title, sentences=True)
     if verdict.expected is not None:
         print_table(console, width_table(verdict.expected, robot.n), WIDTHS, LEGEND)

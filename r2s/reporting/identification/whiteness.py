@@ -24,7 +24,8 @@ def whiteness_figure(
     """Draw the autocorrelation of torque residuals {label: (T, n) Nm} over t (T,) s.
 
     Args:
-        path: figure file (PNG). cutoff_hz: cutoff of the zero-phase low-pass. block_s: length of bootstrap blocks, s.
+        path: figure file (PNG). cutoff_hz: cutoff frequency of the zero-phase low-pass, Hz. block_s: length of
+            bootstrap blocks, s.
     """
     colour = colours(error)
     lags, white, band = _filtered_white(t, cutoff_hz)
@@ -42,7 +43,7 @@ def whiteness_figure(
 
 
 def whiteness_table(t: np.ndarray, error: np.ndarray, cutoff_hz: float) -> pd.DataFrame:
-    """Return a row per joint: mean, standard deviation and correlation of the residual (T, n) Nm over t (T,) s."""
+    """Return a row per joint: mean, standard deviation and autocorrelation of the residual (T, n) Nm at t (T,) s."""
     lags, white, band = _filtered_white(t, cutoff_hz)
     far = lags > 2 / cutoff_hz
     rows = []
@@ -72,7 +73,7 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lags (L,) s, and the autocorrelation (L,) of filtered white noise with its 95 % band's half width (L,).
+    """Return lags (L,) s, the autocorrelation (L,) of filtered white noise, and half the width (L,) of its 95 % band.
 
     The filter is `Recording.smooth`. The band follows Bartlett (JRSS Supplement 8(1), 1946) for large lags.
     """

@@ -29,7 +29,7 @@ class AsyncTracker:
         self._thread.start()
 
     def send(self, call: Callable[[Tracker], None] | None) -> None:
-        """Queue a call of the tracker; None ends the thread."""
+        """Queue a call of the tracker, or None to end the thread."""
         try:
             self._queue.put_nowait(call)
         except Full:

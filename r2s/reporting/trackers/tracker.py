@@ -20,7 +20,7 @@ class Tracked:
     """Information about a run for its trackers.
 
     Attributes:
-        folder: runs/<stage>/<name>. stage: the run's stage. group: the run's sweep; None: no sweep.
+        folder: runs/<stage>/<name>. stage: the run's stage. group: name of the run's group; None: no group.
         config: composed config as nested dicts. meta: content of meta.json (git commit, versions, machine).
         resumed: whether the run continues a stopped run.
     """
@@ -62,7 +62,7 @@ class Tracked:
 
 
 class Tracker(Protocol):
-    """Interface to a tool that shows runs; a single thread calls a tracker, which r2s creates before the run folder.
+    """Interface to a tool that shows runs; r2s makes a tracker before the run folder and calls it from one thread.
 
     After an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
     """

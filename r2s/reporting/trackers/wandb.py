@@ -15,7 +15,8 @@ class Wandb(LoggerTracker):
     """Tracker that logs a run of a W&B project.
 
     Args:
-        project, entity: names in W&B; entity None: your account. offline: store the run on this computer only.
+        project, entity: W&B project and team; entity None: your account. offline: store the run on this computer
+            only.
     """
 
     def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):

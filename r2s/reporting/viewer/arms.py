@@ -22,7 +22,7 @@ WORST_M = 0.01  # m, the trail on a path is red from this error on
 
 
 class _Arm(NamedTuple):
-    """An arm in the rerun recording; `frames`: logged rows per episode; `starts`: start times of the episodes, s."""
+    """An arm in the rerun recording; `frames`: indices of each episode's logged rows; `starts`: start times, s."""
 
     stream: rr.RecordingStream
     base: str
@@ -48,7 +48,7 @@ class _Arm(NamedTuple):
 def log_arms(
     stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Sequence[Episode]], error: Measure
 ) -> None:
-    """Log the arms of all labels side by side; `error` sets the scale of the distance plot."""
+    """Log one arm per label, side by side; the distance plot has the unit of the measure `error`."""
     stream.log("arms", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     model, palette, starts = robot.model(gravity=False), colours(episodes), starts_of(episodes)
     for i, (label, sequence) in enumerate(episodes.items()):

@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """The task's measures for learning curves and comparisons that occur in `curves`."""
+        """Those of the task's measures for learning curves and comparisons that are columns of `curves`."""
         table = self.measures
         if table is None:
             return []

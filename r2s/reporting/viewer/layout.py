@@ -24,7 +24,7 @@ def entity(*parts: str) -> str:
 
 
 def rgb(colour: str) -> np.ndarray:
-    """Return red, green and blue (3,), 0 to 255, of "#rrggbb"."""
+    """Return the values 0 to 255 (3,) of red, green and blue in "#rrggbb"."""
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
 
 
@@ -84,7 +84,7 @@ def _picture(name: str, title: str) -> rrb.View:
 
 
 def _learning_tab(curves: Iterable[Measure], pictured: bool) -> rrb.Container:
-    """Return a tab of learning curves: plots over env_steps or wall_clock and, if `pictured`, the figure."""
+    """Return a tab of learning curves: plots over env_steps or wall_clock and, if `pictured`, their figure."""
     plots = _plots({m.heading: entity(LEARNING, m.title) for m in curves}, rrb.Corner2D.RightBottom)
     live = rrb.Grid(*plots, grid_columns=3, name="plots: select the timeline env_steps or wall_clock below")
     return rrb.Tabs(*[_picture(LEARNING, "figure")] * pictured, live, active_tab=0, name="learning")
@@ -122,7 +122,7 @@ def _plot(
     y: tuple[float, float] | None = None,
     until: float | None = None,
 ) -> rrb.View:
-    """Return a plot that first shows the time from 0 to `until` s, or all of the timeline if `until` is None."""
+    """Return a plot that initially shows 0 to `until` s of the timeline, or the whole timeline if `until` is None."""
     edge = rrb.TimeRangeBoundary
     ends = (edge.infinite(), edge.infinite())
     if until is not None:

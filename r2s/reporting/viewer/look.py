@@ -28,7 +28,7 @@ LOOPBACK = "127.0.0.1"
 def side_by_side(folder: Path, robot: Robot, runs: Mapping[str, Path]) -> list[Path]:
     """Write the episodes, torques and learning curves of {label: run folder} into one recording.rrd in `folder`.
 
-    For all runs, recording and figures use the measures of the first run with learning curves or episodes.
+    The recording and the figures show the measures of the first run that has learning curves or episodes.
 
     Returns:
         Paths of figures (PNG) of the same episodes, torques and learning curves.

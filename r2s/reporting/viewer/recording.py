@@ -1,7 +1,8 @@
 """Write the rerun recording (.rrd): arms side by side, torques, learning curves and figures.
 
 One file contains everything, because two rerun recordings cannot share a timeline. Episodes and torque overlays use
-the timeline `time`, learning curves `env_steps` and `wall_clock`. The command `rerun FILE` plays the episodes.
+the timeline `time`; learning curves use the timelines `env_steps` and `wall_clock`. The command `rerun FILE` plays
+the episodes.
 """
 
 import os
