@@ -24,7 +24,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments
     **dict.fromkeys(("bench", "gallery"), ()),
     "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"(rigid|elastic)_\d+"),
     "grid": ("page",),
-    "press": (r"env_steps=[1-9]\d*", r"(rigid|elastic)_\d+"),
+    "press": (r"env_steps=[1-9]\d*", r"policies=[1-9]\d*", r"(rigid|elastic)_\d+"),
     "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
     "searches": (NUMBER,),
     "transfer": ("page", "twins", "noise", r"\d+"),

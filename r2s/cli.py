@@ -109,7 +109,7 @@ def run_job(cfg):
 
 
 def check_paths(cfg):
-    """Check the options that name a file or folder; make a name a string if YAML reads the name as a number."""
+    """Check the options that name a file or folder; convert a name that YAML read as a number to a string."""
     for key in PATHS:
         value = cfg[key]
         if value is not None and (isinstance(value, bool) or not isinstance(value, str | int | float) or value == ""):
@@ -166,7 +166,10 @@ def is_completed(cfg):
 
 
 def differing(saved, cfg, most=3, counts=lambda key: True):
-    """Return lines for the first `most` keys that differ between `saved` and `cfg` and for which `counts` is True."""
+    """Return a line for each key that differs between `saved` and `cfg` and that the function `counts` accepts.
+
+    After `most` keys, a last line contains the number of further keys.
+    """
     from omegaconf import OmegaConf
 
     from r2s.reporting.trackers.tracker import flat
@@ -231,7 +234,7 @@ def end_workers():
 
 
 def end_job(error):
-    """Print an error, and exit with status 2 or, in a sweep, append the error to the sweep's error file."""
+    """Print an error, then exit with status 2; in a sweep, append the error to the sweep's error file instead."""
     status = fail(error)
     if FAILED not in os.environ:
         sys.exit(status)

@@ -60,8 +60,8 @@ def import_failure(error: ImportError, package: str, install: str) -> str:
     """Return why an import failed: the package, a package that it needs, or a shared library is missing.
 
     Args:
-        error: exception of the import: ModuleNotFoundError if a package is missing, ImportError if a shared library,
-            such as libGL, is missing.
+        error: exception that the import raised, a ModuleNotFoundError if a package is missing, another ImportError if
+            a shared library such as libGL is missing.
         install: argument of `pip install` that installs the package.
     """
     if not isinstance(error, ModuleNotFoundError):

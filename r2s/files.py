@@ -43,7 +43,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def run_file(folder: str | Path, name: str, option: str) -> Path:
-    """Return the path of the file `name` in `folder`, or `folder` if it is a file; errors begin with `option`.
+    """Return the path of the file `name` in `folder`, or `folder` if `folder` is a file; errors begin with `option`.
 
     Raises:
         UserError: the file does not exist.

@@ -37,7 +37,7 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
     """Show a run in the notebook: in the rerun viewer, or as figures if rerun-notebook is not installed.
 
     Args:
-        folder: run folder. figures: names of the figures to show, such as "torque"; no names: all figures.
+        folder: run folder. figures: names of the figures to show, such as "torque"; without names, show all.
         width, height: size of the viewer, pixels; `width` is also the width of the figures.
     """
     from IPython.display import Image, display

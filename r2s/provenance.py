@@ -19,7 +19,7 @@ def sha256(path: str | Path) -> str:
 
 
 def git() -> dict[str, Any]:
-    """Return the commit of the checkout, and whether it has uncommitted changes; both None without a checkout."""
+    """Return the checkout's commit, and whether it has uncommitted changes; without a checkout, both are None."""
     root = Path(__file__).parent.parent
     if not (root / ".git").exists():  # an installed r2s may lie inside another project's repository
         return {"commit": None, "dirty": None}

@@ -246,7 +246,7 @@ class Run:
             self.tracker.summary(document)
 
     def _write_meta(self) -> None:
-        """Write meta.json, which lists all parts of a resumed run and the sum of their durations."""
+        """Write meta.json, which contains all parts of a resumed run and the sum of the parts' durations."""
         self._noted = time.monotonic()
         own = round(self._noted - self._began, 3)
         self._meta["wall_clock_s"] = round(own + sum(p["wall_clock_s"] for p in self._earlier), 3)

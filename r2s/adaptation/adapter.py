@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Adapter(Protocol):
-    """An object that computes, at 1 kHz, a torque that the driver of one arm adds before the safety filter.
+    """An object that computes a torque for one arm at 1 kHz; the driver adds this torque before the safety filter.
 
     An adapter must be picklable, because the adapter and the policy of a real-time arm run in different processes.
     """

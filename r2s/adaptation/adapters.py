@@ -29,9 +29,9 @@ class AdapterContext:
     """Result of an arm's identification, from which a function such as `observer` creates an adapter for this arm.
 
     Attributes:
-        robot, dynamics: the identified arm. posterior: parameter space and samples of the posterior; None without
-            samples.
-        unloaded: two recordings with commanded torque and without a payload; None without such recordings.
+        robot, dynamics: the identified arm.
+        posterior: parameter space and samples of the posterior. If None, `default_noise` assumes a prior.
+        unloaded: two recordings with commanded torque and without a payload. If None, the model stays uncorrected.
     """
 
     robot: Robot

@@ -1,8 +1,8 @@
 """Convert an identified arm to arrays for compiled functions: links, friction and latency.
 
-A table for each joint, with a column for each speed, represents any friction law. At the presliding deflection z in
-[-1, 1], friction is z FORWARD + SPEED_ONLY if z >= 0, else z BACKWARD + SPEED_ONLY; the names denote rows of the
-table.
+A table for each joint, with a column for each speed and the rows FORWARD, BACKWARD and SPEED_ONLY, represents any
+friction law. At the presliding deflection z in [-1, 1], friction is z * FORWARD + SPEED_ONLY if z >= 0, else
+z * BACKWARD + SPEED_ONLY.
 """
 
 from typing import NamedTuple
@@ -48,7 +48,7 @@ class ArmModel(NamedTuple):
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
-    """Return the `ArmModel` of one arm; d: the arm's `Dynamics`, without a batch dimension."""
+    """Return the `ArmModel` of the arm with the dynamics `d`, whose arrays have no batch dimension."""
     position, axes = ee_pose(robot)
     compensated = np.column_stack([robot.mass, robot.mass[:, None] * robot.com])
     compensated[-1] += d.declared_payload

@@ -54,7 +54,7 @@ def detect(thresholds, floor, state):
 
 @njit(cache=True, error_model="numpy")
 def _square(P, floor, force):
-    """Return f^T (P[:3, :3] + floor^2 I)^-1 f, the square of `force` f (3,) N in units of its covariance."""
+    """Return the squared force f^T C^-1 f in units of its covariance C = P[:3, :3] + floor^2 I; f: `force` (3,) N."""
     square = floor**2
     a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]
     d, e, f = P[1, 1] + square, P[2, 1], P[2, 2] + square

@@ -70,7 +70,7 @@ class Estimator:
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Start a motion from rest; keep the estimate, with added variance if a pause of `pause_s` came before."""
+        """Start a motion from rest and keep the estimate; a pause of `pause_s` s before the motion adds variance."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None
@@ -129,7 +129,7 @@ class Estimator:
 
     @property
     def now(self) -> Estimate:
-        """Return the estimate at the end of the last 20 ms span, computed here so that `__call__` stays fast."""
+        """Compute and return the estimate at the end of the last 20 ms span, which would be slow in `__call__`."""
         if self._now is None:
             self._now = self._report(self._changed)
         return self._now
@@ -142,7 +142,7 @@ class Estimator:
 
     @property
     def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:
-        """Return the Kalman filter, the state of `update_residual`, and the last residual; callers only read them."""
+        """Return the Kalman filter, the state of `update_residual` and the last residual, all for reading only."""
         return self._filter, self._state, self._residual
 
     def _report(self, changed: bool) -> Estimate:

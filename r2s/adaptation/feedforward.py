@@ -13,8 +13,8 @@ c*.
 
 The feedforward follows the motion without delay, but a low-pass with a time constant of 20 ms smooths the torque step
 at a new estimate. Without a low-pass, a torque step twists elastic gears, the Kalman filter explains the twist by a
-new payload, and the new estimate causes another torque step. On an elastic development twin, torque steps of 30 Nm
-then repeated at 25 Hz.
+new payload, and the new estimate causes another torque step. On an elastic development twin without a low-pass,
+torque steps of 30 Nm repeated at 25 Hz.
 """
 
 import numpy as np
@@ -74,10 +74,11 @@ class Feedforward:
 
 @njit(cache=True, error_model="numpy")
 def plausible_payload(x, most, out):
-    """Write the inertial parameters (10,) of a payload with estimated mass and center, clipped to the arm's limits.
+    """Write a payload's inertial parameters (10,) to `out`; mass and center are the estimate x, clipped to `most`.
 
-    most: (2,), largest mass in kg, and largest distance in m from the payload frame to the center. The tensor is that
-    of a ball of water, because data hardly determine tensors, and a wrong tensor would feed back the acceleration.
+    most: (2,), largest mass in kg, and largest distance in m from the payload frame to the center. The payload has
+    the tensor of a ball of water, because data hardly determine tensors, and a wrong tensor would feed back the
+    acceleration.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0
@@ -94,7 +95,7 @@ def plausible_payload(x, most, out):
 
 @njit(cache=True, error_model="numpy")
 def shrinkage_weights(filter, residual, payload, weight):
-    """Write the shrinkage weights of the joints' torques, at the end of a 20 ms span, to `weight` (n,)."""
+    """At the end of a 20 ms span, write the shrinkage weight of each joint's torque to `weight` (n,)."""
     x, P, n = filter.x, filter.P, len(weight)
     h, at = np.empty(BODY + 2), np.empty(BODY + 2, dtype=np.int64)
     for j in range(n):
@@ -112,7 +113,7 @@ def shrinkage_weights(filter, residual, payload, weight):
 
 @njit(cache=True, error_model="numpy")
 def _estimated_torque(x, state, payload, weight, slow, torque):
-    """Write the weighted torque of x and `payload` to `torque` (n,) Nm; slow: (n, 10), low-passed `payload_p`."""
+    """Write the weighted torque of payload and state x to `torque` (n,) Nm; slow: (n, 10), low-passed `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
         total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j]

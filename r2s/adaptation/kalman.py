@@ -9,8 +9,8 @@ The state of an arm with n joints has N = 10 + 4 n components:
 
 The filter processes the momentum residual of one joint after the other. Breakaway or a vibrating gear causes large
 residuals for one or two spans of 20 ms. Huber's function (Robust Statistics, 1981) therefore reduces the weight of
-innovations beyond HUBER standard deviations. The filter still follows a payload change, because its innovations stay
-large for more than two spans.
+innovations beyond HUBER standard deviations. The filter still follows a payload change, because a payload change
+causes large innovations for more than two spans.
 """
 
 from typing import NamedTuple
@@ -94,7 +94,7 @@ def update(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def predict(filter, noise, residual):
-    """Predict mean, covariance and response to payload jumps (`signature`) of the filter one 20 ms span ahead."""
+    """Predict the filter's mean, covariance and `signature` (response to payload jumps) one 20 ms span ahead."""
     P, counts, n, moving = filter.P, filter.counts, len(residual.y), False
     for j in range(n):
         moving |= residual.sliding[j] > 0.0
@@ -193,7 +193,7 @@ def correct(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def _innovation(filter, noise, residual, j):
-    """Return the innovation of joint j in Nm and the innovation's variance; write P h^T into filter.work[0]."""
+    """Return joint j's innovation, Nm, and its variance; write its covariance with the state to filter.work[0]."""
     x, P, h, n = filter.x, filter.P, filter.work[0], len(residual.y)
     friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
     of_friction, of_rate, payload = residual.friction[j], residual.rate[j], residual.payload

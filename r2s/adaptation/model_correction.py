@@ -7,8 +7,8 @@ gear. Each parameter has a prior with mean zero and a typical standard deviation
 (Bishop 2006, 3.3). The fit uses momentum residuals (momentum_residual.py), which need no accelerations.
 
 A compliant gear of stiffness K twists by torque / K. A residual that ignores the twist between motor and link has an
-error of M d2(torque)/dt2 / K. This error is 0.7 Nm on a Panda with K = 15 kNm/rad whose torque varies by 4 Nm at 7
-Hz.
+error of M d2(torque)/dt2 / K, where M is the mass matrix. This error is 0.7 Nm on a Panda with K = 15 kNm/rad whose
+torque varies by 4 Nm at 7 Hz.
 """
 
 from typing import NamedTuple
@@ -110,7 +110,10 @@ def corrected_residuals(
 def _columns(
     robot: Robot, arm: ArmModel, residuals: list[MomentumResidual]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return regressors of links and gears (T, n, 5 n) and of joints (T, n, K), residuals Nm and sliding (T, n)."""
+    """Return the regressors of links and gears (T, n, 5 n) and of joint terms (T, n, K), and two arrays (T, n).
+
+    The two arrays are the residuals, Nm, and whether each joint slides.
+    """
     names = ("q", "dq", "friction", "y", "sliding", "acceleration", "torque_rate")
     q, v, friction, y, sliding, ddq, torque_rate = (np.array([getattr(r, name) for r in residuals]) for name in names)
     samples, n = q.shape

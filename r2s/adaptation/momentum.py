@@ -1,4 +1,4 @@
-"""Compute an arm's momentum and its derivatives (columns) by a payload's inertial parameters, in compiled code.
+"""Compute an arm's momentum and, as columns, its derivatives with respect to a payload's inertial parameters.
 
 The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q) (De Luca and Mattone, ICRA 2003). Let S_j be the
 screw axis of joint j about the base origin, and h_j the total momentum of all bodies that joint j moves. Then p_j is
@@ -102,7 +102,7 @@ def momentum(arm, q, dq, terms, work):
 
 @njit(cache=True, error_model="numpy")
 def _payload_columns(arm, R, p, w, v, terms, work):
-    """Write the payload's columns to `terms`; R, p and w, v: last link's pose, and twist about the base origin."""
+    """Write the payload's columns to `terms`; (R, p): last link's pose, (w, v): its twist about the base origin."""
     frame, (px, py, pz), (wx, wy, wz), (vx, vy, vz) = arm.payload_frame, p, w, v
     rx, ry, rz = rotate(R, frame[0], frame[1], frame[2])
     px, py, pz = px + rx, py + ry, pz + rz

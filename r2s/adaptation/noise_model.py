@@ -27,7 +27,10 @@ def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
 
 
 def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
-    """Return the default `Noise` of an arm; prior: from `prior_of`, or None for 30 % of the friction level."""
+    """Return the default `Noise` of an arm; `prior` comes from `prior_of`.
+
+    If `prior` is None, the prior standard deviations of friction and offsets are 30 % of the friction level.
+    """
     n = len(arm.level)
     zero = np.zeros(n)
     friction, offset = prior or (zero + 0.3, 0.3 * arm.level)
@@ -60,7 +63,7 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 
 
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
-    """Return a commanded recording's momentum residuals: one per 20 ms span, from a trajectory's third span on."""
+    """Return the momentum residuals of a recording with commanded torque, from each trajectory's third span on."""
     n, out = recording.n_joints, []
     q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # array type of an arm's signals
     for stretch in recording.stretches:
@@ -76,12 +79,12 @@ def fit_noise(
 ) -> tuple[ModelCorrection, Noise]:
     """Return the model correction from two motions without a payload, and the noise of the corrected model.
 
-    The motion `train` yields a first model correction. The noise is fitted to the residuals of the corrected model in
-    the motion `other`. Covariances at lags of 60 to 300 ms yield a joint's model error; the remaining variance yields
-    white noise that grows with the momentum rate. The noise of each joint is then scaled until the joint's
-    innovations have the predicted variance. A factor on the noise of all joints then limits the odds of a false
-    payload change to the number of residuals. `train` and `other` together determine the returned correction and the
-    prior means of friction and offsets.
+    The motion `train` yields a first model correction. The residuals of the corrected model in the motion `other`
+    determine the noise. Covariances of a joint's residuals at lags of 60 to 300 ms yield the joint's model error; the
+    remaining variance yields white noise that grows with the momentum rate. A factor for each joint then scales the
+    joint's noise, so that the joint's innovations have the predicted variance. A factor on the noise of all joints
+    then limits the odds of a false payload change to the number of residuals. `train` and `other` together determine
+    the returned correction and the prior means of friction and offsets.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)
@@ -100,7 +103,7 @@ def fit_noise(
 
 
 def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
-    """Return the noise fitted to residuals without a payload, then scaled to the Kalman filter's innovations."""
+    """Fit the noise to residuals without a payload, scale it to the Kalman filter's innovations, and return it."""
     n = len(noise.level)
     white, momentum, model = noise.white.copy(), noise.momentum_share.copy(), noise.model.copy()
     for j in range(n):
@@ -119,7 +122,10 @@ def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
 
 
 def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: float) -> tuple[float, float, float]:
-    """Return joint j's white noise, Nm, its growth with the momentum rate, and model error, Nm (default `model`)."""
+    """Return joint j's white noise, Nm, the growth of white noise with the momentum rate, and the model error, Nm.
+
+    If the joint slides too rarely for covariances, the model error is `model`, clipped to plausible values.
+    """
     columns = np.array([[r.friction[j], 1.0] for r in residuals])
     y, sliding = np.array([r.y[j] for r in residuals]), np.array([r.sliding[j] > 0 for r in residuals])
     fitted = columns @ np.linalg.lstsq(columns[sliding], y[sliding], rcond=None)[0]
@@ -139,7 +145,7 @@ def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: f
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
-    """Return `noise` with the white noise and the errors of each joint multiplied by a factor, `scale` (n,)."""
+    """Return `noise` after multiplying each joint's white noise and errors by the joint's factor in `scale` (n,)."""
     parts = {name: getattr(noise, name) * scale for name in ("white", "momentum_share", "model", "reversal")}
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["momentum_share"]))
 
@@ -159,7 +165,7 @@ def _without_payload(noise: Noise) -> Noise:
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Filter M residuals; return `Filter`, normalized innovations (M, n), nan for joints at rest, log odds (M,)."""
+    """Filter M residuals; return `Filter`, normalized innovations (M, n), nan at rest, and log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)
@@ -175,7 +181,7 @@ def _largest_odds(noise: Noise, residuals: list[MomentumResidual]) -> float:
 
 
 def _innovation_scale(noise: Noise, residuals: list[MomentumResidual]) -> np.ndarray:
-    """Return each joint's root mean square (n,) of the normalized innovations, for an arm without a payload."""
+    """Return the root mean square (n,) of each joint's normalized innovations, for an arm without a payload."""
     size = np.abs(_run(_without_payload(noise), residuals)[1])[len(residuals) // 10 :]  # offsets have settled
     scale = np.ones(size.shape[1])
     for j in range(len(scale)):

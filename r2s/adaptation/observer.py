@@ -1,13 +1,13 @@
-"""Add the momentum residual, after a first-order low-pass, to the policy's torque (disturbance observer).
+"""Disturbance observer: add the low-passed momentum residual to the policy's torque.
 
 The momentum p = M(q) dq obeys dp/dt = tau + C^T dq - g - friction - d, which yields the disturbance torque d without
 accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006). The
 observer uses the mean of d over 60 ms (momentum_residual.py); tau is the command after the identified delay and lag.
-The low-pass filter_s dd^/dt = d - d^ yields the estimate d^.
+A first-order low-pass with the time constant filter_s yields the estimate d^: filter_s dd^/dt = d - d^.
 
-If a joint does not slide throughout the 60 ms, stiction may hold the joint, and the residual only bounds d. While
-stiction may hold a joint, the estimate d^ changes only as far as these bounds require, because stiction also supports
-the arm in training.
+If a joint does not slide throughout 60 ms, stiction may hold the joint, and the residual yields only bounds on the
+disturbance d. While stiction may hold a joint, the estimate d^ changes only as far as the bounds on d require,
+because stiction also supports the arm in training.
 """
 
 import numpy as np
@@ -42,10 +42,10 @@ class Observer:
         """Start a motion from rest; set the estimated disturbance to zero."""
         n = len(self._arm.level)
         self._state, self._residual = ResidualState.fresh(n), MomentumResidual.empty(n)
-        self._disturbance = np.zeros((2, n))  # disturbance of the last span, and its low-pass
+        self._disturbance = np.zeros((2, n))  # 60 ms mean of the disturbance, and its low-pass
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Process one cycle and return the torque (n,) Nm to add; see `Adapter`."""
+        """Process one cycle; return the torque (n,) Nm that the driver adds in the next cycle; see `Adapter`."""
         share = 0.0 if self.held else self._share
         _observe(self._arm, self._state, self._residual, q, dq, tau, share, self._disturbance)
         return self._disturbance[1]

@@ -75,7 +75,7 @@ def estimate_recording(
 
 
 def pauses(recording: Recording) -> list[float]:
-    """Return the pause, s, before each trajectory; UNKNOWN_PAUSE_S if the clock restarts with the trajectory."""
+    """Return the pause, s, before each trajectory; if the clock restarts, the pause counts as UNKNOWN_PAUSE_S."""
     starts = [recording.t[s.start] for s in recording.stretches]
     ends = [recording.t[s.stop - 1] for s in recording.stretches]
     between = [float(b - a) for a, b in zip(ends[:-1], starts[1:], strict=True)]

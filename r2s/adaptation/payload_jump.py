@@ -23,7 +23,7 @@ MEAN, ONSET = range(2)  # indices of `Filter.log_odds`
 
 @njit(cache=True)
 def begin_onset(filter):
-    """Make this 20 ms span a possible onset of a jump; it replaces the oldest onset if all slots are used."""
+    """Make this 20 ms span a possible onset of a jump; if all slots are used, the span replaces the oldest onset."""
     at = filter.counts[NEXT]
     filter.signature[at] = 0.0
     filter.information[at] = 0.0
@@ -34,7 +34,7 @@ def begin_onset(filter):
 
 @njit(cache=True, error_model="numpy")
 def update_onsets(filter, residual, j, v, S):
-    """Update all onsets with the innovation v of joint j, its variance S, and P h^T in filter.work[0] (N,)."""
+    """Update all onsets with joint j's innovation v, its variance S, and filter.work[0], see `kalman._innovation`."""
     g, h, payload, N, n = np.empty(JUMP), filter.work[0], residual.payload, len(filter.x), len(residual.y)
     friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
     for k in range(filter.counts[USED]):
@@ -57,7 +57,7 @@ def update_onsets(filter, residual, j, v, S):
 
 @njit(cache=True, error_model="numpy")
 def detect(filter, noise):
-    """Write `Filter.log_odds`: log of the mean odds of a jump over all onsets, and index of the likeliest onset."""
+    """Write the log of the mean odds of a jump over all onsets, and the likeliest onset, to `Filter.log_odds`."""
     best, at, mean, total = -np.inf, -1, -np.inf, 0.0
     A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
     logs = np.empty(ONSETS)
@@ -75,7 +75,10 @@ def detect(filter, noise):
 
 @njit(cache=True, error_model="numpy")
 def _solve(C, d, prior, A, b):
-    """Return an onset's log odds d (C + P0^-1)^-1 d / 2 - log(det(1 + P0 C)) / 2, with the prior covariance P0."""
+    """Return an onset's log odds of a jump from the onset's `information` C (4, 4) and `vector` d (4,), see `Filter`.
+
+    The log odds are d (C + P0^-1)^-1 d / 2 - log(det(1 + P0 C)) / 2, where P0 is the prior covariance of a jump.
+    """
     log = 0.0  # A: Cholesky factor of C + P0^-1, its diagonal inverted; b: the jump
     for i in range(JUMP):
         for k in range(i + 1):

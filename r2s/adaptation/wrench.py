@@ -44,12 +44,12 @@ class WrenchObserver:
     """Observer that estimates the wrench on one arm, cycle by cycle.
 
     Attributes:
-        thresholds: (2,), of the force test and the impact test: squared forces in units of their covariances.
-        tool: tool of the robot; None for a robot without a tool.
+        thresholds: (2,), thresholds of the force test and the impact test: squared forces in units of covariances.
+        tool: the robot's tool, or None if the robot has no tool.
 
     Args:
-        robot, dynamics: the identified arm. thresholds: see the attribute; None: 2 GAUSSIAN for the force test, and
-            no impact test.
+        robot, dynamics: the identified arm. thresholds: see the attribute. If None, the threshold of the force test
+            is 2 GAUSSIAN, and the observer has no impact test.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):
@@ -167,8 +167,8 @@ def observe_recording(
     """Return a table with one row per millisecond: wrench, half widths of its 95 % intervals, contact, tip position.
 
     Args:
-        estimator: estimates a payload, whose effect is subtracted; if the robot has a tool, contact freezes the
-            estimate.
+        estimator: estimates a payload, whose effect on the wrench the observer subtracts. If the robot has a tool,
+            contact freezes the estimate. If None, the observer subtracts no payload.
         report: called with each new estimate of the payload.
     """
     recording = at_rate(robot, recording)
@@ -212,7 +212,7 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
 
 
 def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
-    """Return why recordings are too slow or too short for `contact_thresholds`; None if they are neither."""
+    """Return why rate or length of the recordings is too small for `contact_thresholds`, or None if both suffice."""
     if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
         return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
     rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]

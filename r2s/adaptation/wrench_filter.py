@@ -230,7 +230,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Keep friction at rest between the breakaway torques (edges), and its variance at most that of `_hidden`."""
+    """Keep friction at rest between the breakaway torques (edges), and limit its variance to that from `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)

@@ -1,9 +1,9 @@
 """Determine, for the wrench filter, which joints rest, and in which direction (side) the other joints slide.
 
 The friction of a joint at rest balances all other torques. The mass matrix M couples joints at rest (r) to joints in
-motion (s). With A = M_rs M_ss^-1 and M' = dM/dt, the momentum of the joints at rest changes by dp_r/dt = A (dp_s/dt -
-M'_ss dq_s) + M'_rs dq_s. The friction of the joints at rest is f_r = u_r + J_r^T wrench - dp_r/dt, with the known
-torque u_r.
+motion (s). With A = M_rs M_ss^-1 and M' = dM/dt, the momentum p_r of the joints at rest changes at the rate dp_r/dt =
+A (dp_s/dt - M'_ss dq_s) + M'_rs dq_s. The friction of the joints at rest is f_r = u_r + J_r^T wrench - dp_r/dt, with
+the known torque u_r and the Jacobian J_r.
 """
 
 import numpy as np
@@ -149,7 +149,10 @@ def _unlagged(joints, j):
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the friction variance, Nm^2: 4 f^2 p (1 - p), p the probability of a wrong sign, plus presliding."""
+    """Return the variance, Nm^2, of a moving joint's friction from an uncertain sign and from uncertain presliding.
+
+    If the sign of a friction f is wrong with probability p, the variance is 4 f^2 p (1 - p).
+    """
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # approximately the normal cdf

@@ -118,7 +118,7 @@ def surface_force(law, k, tip, rate):
 
 @njit(cache=True, error_model="numpy")
 def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the variance, N^2, of the normal force due to the posterior, encoder noise, and errors of the law."""
+    """Return the normal force's variance, N^2, which posterior, encoder noise and errors of the law cause."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count

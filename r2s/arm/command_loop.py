@@ -41,8 +41,8 @@ class CommandLoop:
         arm: the arm. driver: the driver, which limits every torque that the loop sends.
         log: queue to which the loop appends (state, torque) in every cycle, before it sends the torque.
         adapter: called once per cycle; the driver adds the adapter's torque in the next cycle. If the adapter raises
-            an exception, the loop sends the driver no more commands. The driver stops the arm, and the loop raises
-            the exception.
+            an exception, the loop sends the driver no more commands. The driver then stops the arm, and the loop
+            raises the adapter's exception.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class CommandLoop:
         """Bring the arm to rest at q (n,) rad and begin a motion there.
 
         Raises:
-            StopRequested: a stop was requested. ArmStopped: see `Arm.move_to`.
+            StopRequested: a stop was requested. ArmStopped: the arm could not move to q, or stopped on the way to q.
         """
         self._check_request()
         self._reset()
@@ -91,7 +91,8 @@ class CommandLoop:
         """Run one cycle and return the state of the next cycle.
 
         Args:
-            command: (c,), input of the control law; None: no new command. hold: (n,) Nm, see `DriverBatch.__call__`.
+            command: (c,), input of the control law; if None, the last command still applies.
+            hold: (n,) Nm, see `DriverBatch.__call__`.
 
         Raises:
             StopRequested: a stop was requested, and the driver has brought the arm to rest.
@@ -168,7 +169,7 @@ class CommandLoop:
     def end(self) -> str | None:
         """Stop the arm; return the reason if the driver was stopping the arm or if the arm stops itself, else None.
 
-        A driver with a push limit first holds or ends a contact, as in any stop (r2s/physics/contact_stop.py).
+        A driver with a push limit first holds or ends a contact (r2s/physics/contact_stop.py).
         """
         reason = None if self._ended else self.driver.stopping
         if reason is not None:

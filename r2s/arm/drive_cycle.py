@@ -45,10 +45,12 @@ class Memory(NamedTuple):
         sent: (m, n) Nm, the last torque command.
         held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop without contact still applies this sum.
         share: (m,), factor on the allowed speeds, which is 1 in a motion and decreases in a stop (`_brake`).
-        cycle, silent, damped: (m,), cycles since the motion's start, the last finite command, or the stop's start.
-        why: (m,), reason code of a stop; RUNS: no stop. limited: (m,), cycles in which the safety filter acted.
+        cycle, silent, damped: (m,) each, cycles since the motion began, since the last finite command, and since the
+            stop began.
+        why: (m,), reason code of a stop; RUNS: no stop.
+        limited: (m,), number of cycles in which the safety filter changed the torque.
         rests: (m,), whether each arm is at rest. commanded: (m,), whether each arm has received a command.
-        least: (m, K) m, smallest allowed distance between the two bodies of each of K pairs (fence.py).
+        least: (m, K) m, smallest allowed distance between the bodies of each pair (fence.py); K: number of pairs.
         push: (m, COLUMNS), parameters and state of the push limit (push_limit.py); (m, 0): no push limit.
     """
 
@@ -148,7 +150,7 @@ def _watch(i, q, dq, given, bounds, memory):
 def resist(dq, spring, most, held):
     """Adjust the torque `held` (n,) Nm of a stop to brake the joints that still move; dq: (n,) rad/s, joint speeds.
 
-    A joint may continue to move because of an undeclared load, or because `held` compensates kinetic friction.
+    A joint may continue to move because of an undeclared load, or because `held` compensates its kinetic friction.
 
     Args:
         spring: (n,) Nm/rad, SPRING^2 times each joint's inertia. most: (n,) Nm, largest magnitude of `held`.
@@ -162,7 +164,7 @@ def resist(dq, spring, most, held):
 
 @njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
-    """Add the adapter's torque, or `Memory.held` during a stop, to `target` (n,) Nm, the effort of arm i."""
+    """Add the adapter's torque, or in a stop `Memory.held`, to the effort `target` (n,) Nm of arm i."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:
@@ -193,7 +195,8 @@ def _kinematics(model, q):
 def _brake(i, seen, arm, bounds, model, memory):
     """Set the target torque of arm i in a stop, and lower the allowed speeds from the present speed toward zero.
 
-    Only for the stop codes SILENT, LAW_NOT_FINITE and REQUESTED, `stop_torque` holds or ends a contact.
+    If the driver has a push limit and the stop code is SILENT, LAW_NOT_FINITE or REQUESTED, `stop_torque` holds or
+    ends a contact.
     """
     needs, why = 0.0, memory.why[i]
     memory.target[i] = 0.0

@@ -1,11 +1,11 @@
-"""The driver: compute a torque within the arm's limits from a policy's command, once per millisecond.
+"""Compute a torque within the arm's limits from a policy's command, once per millisecond (the driver).
 
 In each cycle, the driver checks that the command is finite and recent (watchdog). The control law
 (r2s/physics/control_laws.py) computes a target torque, which passes soft start and low-pass. The driver adds the
 torque of an adapter (r2s/adaptation/adapter.py). The safety filter, which training also uses
-(r2s/physics/safety_filter.py), limits the sum of target and adapter torque. Finally, the driver limits the change of
-the torque between two cycles. The driver has no clock and no connection to an arm: its only inputs are states and
-commands. Tests can therefore run the driver on a million adversarial inputs.
+(r2s/physics/safety_filter.py), limits the sum of target and adapter torque. Finally, the driver limits the difference
+from the torque that the arm applied in the last cycle. The driver has no clock and no connection to an arm: its only
+inputs are states and commands. Tests can therefore run the driver on a million adversarial inputs.
 
 `DriverBatch` drives many arms in lock-step; `Driver` drives one arm.
 """
@@ -63,8 +63,8 @@ class DriverBatch:
         m: number of arms. cutoff_hz: cutoff of the low-pass. period_s: s, time between two policy commands.
         soft_start_s: s over which the target torque fades in at the start of a motion; 0: no fade.
         friction: (n,) Nm, friction level of each joint. rotors: (n,) kg m^2, rotor inertias
-            (`Dynamics.armature`); None: `robot.armature`.
-        control: control law that maps commands to torques; None: commands are torques (n,) Nm.
+            (`Dynamics.armature`); if None, `robot.armature`.
+        control: control law that maps commands to torques; if None, commands are torques (n,) Nm.
         fence: pairs of bodies; the driver stops an arm before the bodies of a pair touch; None: no fence.
         speed_share: factor on all allowed speeds, in (0, 1].
         push_limit: limits the contact force and the approach speed of the robot's tool; None: no limit.
@@ -130,7 +130,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, torque in a stop: adapter torque + `hold` (+ contact torque if the stop holds a contact)."""
+        """(m, n) Nm, torque of a stop: adapter torque plus `hold`, plus contact torque if a stop holds a contact."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -167,12 +167,13 @@ class DriverBatch:
         Args:
             q, dq: (m, n) rad, rad/s, measured in this cycle. If q or dq is not finite, the torque ramps to 0.
             tau_J_d: (m, n) Nm, the torque that the arms applied in the last cycle.
-            command: (m, c), new commands for the control law; None: no new commands in this cycle.
+            command: (m, c), new commands for the control law; if None, the last commands still apply.
             added: (m, n) Nm, torque of the adapters in this cycle, clipped to ADDED * tau_max; None: no adapter. If
                 an arm's adapter torque is not finite, the driver ignores this torque and the arm's new command.
             hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. A stop
                 still applies the last sum of `hold` and `added`, clipped to ADDED * tau_max.
-            contact: (m,), whether each arm is in contact; None: False. In contact, a stop omits `hold` and `added`.
+            contact: (m,), whether each arm is in contact; if None, no arm is in contact. In contact, a stop omits
+                `hold` and `added`.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)
@@ -266,7 +267,8 @@ class Driver:
         """Return the torque command (n,) Nm of this cycle.
 
         Args:
-            state: the arm's state in this cycle. command: (c,), input of the control law; None: no new command.
+            state: the arm's state in this cycle.
+            command: (c,), input of the control law; if None, the last command still applies.
             added: (n,) Nm, torque of the adapter; None: no adapter. hold: (n,) Nm, see `DriverBatch.__call__`.
         """
         given, more, kept = (None if x is None else x[None] for x in (command, added, hold))

@@ -44,7 +44,7 @@ class ArmState:
         tau_J: (n,) Nm, measured link-side torque; it includes gravity, but little of the motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
         tau_ext_hat_filtered: (n,) Nm, torque that the joints exert on the surroundings: tau_J minus the torque
-            of the arm's own model (gravity, load, dynamics). This attribute and all later ones may be None.
+            of the arm's own model (gravity, load, dynamics). This attribute and all attributes below may be None.
         O_F_ext_hat_K: (6,) N, Nm, wrench that the end effector exerts on the surroundings, in the base frame.
         joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,) for joints, (6,) for the end
             effector; above 0 where the external torque or force exceeds the contact or collision threshold.

@@ -1,6 +1,6 @@
 """Run episodes on a twin in parallel: each chunk of goals runs on a new twin with the same seed.
 
-The results do not depend on the number of cores, because a chunk has CHUNK goals (the last may have fewer). Each
+Every chunk except the last has CHUNK goals on any computer, so the results do not depend on the number of cores. Each
 chunk has its own stream of sensor noise. A twin with temperature-dependent friction is cold at the start of a chunk.
 """
 
@@ -39,7 +39,8 @@ def run_parallel_episodes(
 ) -> tuple[Episodes, list[Stop], Timing]:
     """Return the episodes, their early stops, and the measured durations.
 
-    On Linux, call this function before any thread starts, because it forks. Elsewhere, one process runs all chunks.
+    On Linux, this function forks, so call the function before any thread starts. On other systems, one process runs
+    all chunks.
 
     Args:
         open_twin: function that opens the twin for a chunk; the function's argument is the number of the chunk.

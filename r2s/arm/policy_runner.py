@@ -69,10 +69,10 @@ class PolicyRunner:
 
     Attributes:
         stops: stops that ended episodes early. timing: see `Timing`.
-        done: number of `place` calls that began an episode (after which `halted` was None).
+        done: number of `place` calls after which `halted` was None, so that an episode began.
         speeds: (1, T, n) rad/s, joint speeds after each control step of the last episode, see `smooth_speeds`.
-        halted: why no further episode will run: stop request, the operator's refusal after a stop, or too many
-            failed attempts to reach a start. None: not halted.
+        halted: reason why no further episode will run (a stop request, the operator's refusal after a stop, or too
+            many failed attempts to reach a start); None: further episodes may run.
         blocked: reason of a stop that the operator had not cleared when the last episode ended, or None.
 
     Args:
@@ -158,7 +158,7 @@ class PolicyRunner:
         return len(self._angles)
 
     def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
-        """Return state, effort (n,) Nm, whether stopped, and in how many cycles the safety filter acted."""
+        """Return state, effort (n,) Nm, stop flag, and the number of cycles in which the safety filter acted."""
         driver = self._loop.driver
         return self._loop.state, driver.effort, self._stopped, driver.limited
 
@@ -210,8 +210,8 @@ class PolicyRunner:
 def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
     """Return smoothed joint speeds (k, n) rad/s of every `every`-th cycle, from the angles (n,) rad of all cycles.
 
-    The speed in cycle k is the slope at k of a parabola fitted to the angles of the cycles k - SMOOTHING_CYCLES to
-    k + SMOOTHING_CYCLES (Savitzky and Golay, Anal. Chem. 36(8), 1964).
+    The speed in cycle i is the slope at i of a parabola fitted to the angles of the cycles i - SMOOTHING_CYCLES to
+    i + SMOOTHING_CYCLES (Savitzky and Golay, Anal. Chem. 36(8), 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:

@@ -78,7 +78,8 @@ def record_presses(
         timing: receives the durations of the cycles. dynamics: dynamics of the arm.
 
     Raises:
-        ArmStopped: arm or driver stopped the motion, or commands came late; `recording`: completed paths, if any.
+        ArmStopped: arm or driver stopped the motion, or commands came late. The exception's `recording` contains the
+            completed paths, if any.
         UserError: the tip cannot reach the surface, or no safe path leads to the start of a path.
     """
     robot, control = arm.robot, plan.control(arm.robot)

@@ -41,7 +41,7 @@ SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return `count` postures (count, n) rad: home, then steps of +-0.3 rad per joint, 0.2 rad inside the limits."""
+    """Return postures (count, n) rad: home, then steps of +-0.3 rad per joint, clipped 0.2 rad inside limits."""
     change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
     poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
@@ -189,7 +189,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints, `next_joint` below STILL; then fade the command to `base`; repeat if a joint moves."""
+        """Brake all joints (`next_joint` below STILL), then fade the command to `base`; repeat if a joint moves."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -233,7 +233,7 @@ class _Drive:
 
 
 def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.ndarray:
-    """Return the poses (P, n) rad; raise UserError unless each is POSE_MARGIN inside the position limits."""
+    """Return the poses (P, n) rad; raise UserError unless each lies POSE_MARGIN inside the position limits."""
     try:
         places = np.atleast_2d(np.array(poses, dtype=float))
     except (TypeError, ValueError):
@@ -251,7 +251,7 @@ def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.nd
 
 
 def _positive(name: str, value, default: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Return `value` (None: `default`) as an array (n,); raise UserError unless all elements are in (0, `most`]."""
+    """Return `value`, or if None `default`, as an array (n,); raise UserError unless all are in (0, `most`]."""
     n = len(default)
     array = per_joint(f"ramp.{name}", default if value is None else value, n, f"{n} joints")
     good = (array > 0) & (array <= most)

@@ -85,8 +85,9 @@ class Timing:
     """Measured durations, s. In lock-step only the durations of r2s's own computations are meaningful.
 
     Attributes:
-        policy: time from a state to the policy's command, once per control step. driver: computing time of one cycle.
-        adapter: computing time of one adapter update; empty without adapter. period: time between two commands.
+        policy: time from a state to the policy's command, once per control step.
+        driver, adapter: computing time of driver and adapter in one cycle; without an adapter, `adapter` is empty.
+        period: time between two commands.
         robot: time from one state of the arm to the next by the arm's clock; more than 1 ms means lost cycles.
         success: control_command_success_rate of each cycle, without the first 100 cycles of a motion.
     """
@@ -120,7 +121,7 @@ class Timing:
             self.success.append(float(rate))
 
     def refusal(self, arm: Arm) -> str | None:
-        """Return a reason if a real-time arm got less than 99 % of a motion's commands in time, else None."""
+        """Return a reason to reject the motion if a real-time arm got under 99 % of commands in time, else None."""
         rates = self.success[self._begun :]
         if not getattr(arm, "realtime", False) or not rates or (rate := float(np.mean(rates))) >= LEAST_SUCCESS:
             return None

@@ -4,9 +4,9 @@ The arm's process continues whatever happens to the policy's process. If no new 
 deadline, the driver damps and stops the arm. A thread would not suffice, because a policy that holds Python's global
 lock blocks all threads. The processes share memory without a lock, because a killed process would not release a lock.
 
-The arm's process runs in its own session, so signals from the terminal do not reach it. If either process receives a
-signal, or the policy's process ends, the arm's process damps and ends every motion, including the motion to a start
-(r2s/arm/stop_request.py).
+The arm's process runs in its own session, so signals from the terminal do not reach this process. If the policy's or
+the arm's process receives a signal, or the policy's process ends, the arm's process damps and ends every motion,
+including the motion to a start (r2s/arm/stop_request.py).
 """
 
 import multiprocessing
@@ -54,7 +54,7 @@ class Slot:
         a[0] += 1
 
     def read(self) -> tuple[int, np.ndarray] | None:
-        """Return the number of writes and the values (width,); None: a write is in progress or was interrupted."""
+        """Return the number of writes and the values (width,), or None if a write is unfinished or interrupted."""
         a = np.frombuffer(self._raw)
         for _ in range(READ_ATTEMPTS):
             before = a[0]
@@ -68,7 +68,7 @@ class Channel(NamedTuple):
     """Memory that the policy's process and the arm's process share.
 
     Attributes:
-        command: (c,), written by the policy's process. state: arm state, written by the arm's process (`_publish`).
+        command: (c,), newest command of the policy's process. state: arm state of the arm's process (`_publish`).
         end: 1 after the policy's process has ended the episode, else 0.
         signal: number of a signal that the policy's process received. lifeline: mutex locked by the policy's process.
     """
@@ -101,7 +101,7 @@ class RealtimeRunner:
         robot: the arm's model. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
-        open_arm: picklable function that returns the opened arm, or a context manager; the arm's process calls it.
+        open_arm: picklable function that the arm's process calls; it returns the opened arm or its context manager.
         robot: a model with the arm's number of joints. task, friction: see `PolicyRunner`.
         settings: further arguments of `PolicyRunner`; an adapter runs in the arm's process.
 
@@ -204,7 +204,7 @@ class RealtimeRunner:
             serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, effort (n,) Nm, whether stopped, and in how many cycles the safety filter acted."""
+        """Return cycle, state, effort (n,) Nm, stop flag, and in how many cycles the safety filter acted."""
         while (latest := self._channel.state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")
@@ -297,7 +297,7 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
-    """Wait for an episode's first command; then yield, in each cycle, the new command, or None if there is none.
+    """Wait for an episode's first command; then yield, in each cycle, the new command, or None if no command is new.
 
     Args:
         last: number of commands that the policy wrote in earlier episodes.

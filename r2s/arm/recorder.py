@@ -106,7 +106,7 @@ class _Rows:
         self.filled = 0
 
     def add(self, state: ArmState, sent: np.ndarray) -> None:
-        """Append a row with the state in a cycle and the command sent in this cycle, (n,) Nm."""
+        """Append a row from the state of a cycle and from the command `sent` (n,) Nm of the same cycle."""
         k = self.filled
         self._t[k], self._q[k], self._dq[k], self._signals[k] = state.t, state.q, state.dq, state.signals
         self._tau[k] = sent if self._torque == "commanded" else state.tau_J

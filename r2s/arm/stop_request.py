@@ -22,7 +22,7 @@ GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s eac
 
 
 class _Request:
-    """The stop request of this process; `ending`: a motion is stopping; `served`: no motion runs any more."""
+    """The stop request of this process; `ending`: whether a motion is stopping; `served`: whether all have ended."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []
@@ -64,12 +64,12 @@ def watched(source: Callable[[], str | None]) -> Iterator[None]:
 
 
 def parent_ended(parent: int) -> Callable[[], str | None]:
-    """Return a `source` for `watched` that requests a stop when the policy's process, `parent`, has ended."""
+    """Return a `source` for `watched` that requests a stop when the policy's process (pid `parent`) has ended."""
     return lambda: None if os.getppid() == parent else "the process of the policy has ended"
 
 
 def pipeline() -> int | None:
-    """Return the pid (of a parent or grandparent process) in the environment variable PARENT, or None."""
+    """Return the pid in the environment variable PARENT (parent or grandparent process); None if PARENT is unset."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 

@@ -29,15 +29,15 @@ LOADED_DEVIATION = 0.5  # rad
 class TrackingController:
     """PD control with the nominal model's feedforward torque and an adaptive estimate of friction and offset.
 
-    Each joint's estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max): offset, Coulomb and viscous friction.
-    The controller adapts theta during the motion, within limits, as in Slotine and Li (IJRR 6(3), 1987). Light wrist
-    joints need the estimate, because their PD gains are too small to overcome friction. The PD gains are
-    BANDWIDTH^2 M and 2 BANDWIDTH M with the nominal mass matrix M. Gains proportional to M suit any arm; separate
-    gains per joint would be unstable on an arm with nearly parallel joint axes.
+    The estimate of each joint is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max), where the vector theta contains
+    offset, Coulomb friction and viscous friction. The controller adapts theta during the motion, within limits, as in
+    Slotine and Li (IJRR 6(3), 1987). Light wrist joints need the estimate, because their small PD gains may not
+    overcome friction. The PD gains are BANDWIDTH^2 M and 2 BANDWIDTH M with the nominal mass matrix M. Gains
+    proportional to M suit any arm; separate gains per joint would be unstable if joint axes are nearly parallel.
 
     Args:
         robot: the nominal model. excitation: the motion to track.
-        allowed: limits of the deviation from the excitation; None: MAX_DEVIATION for each joint.
+        allowed: limits of the deviation from the excitation; if None, MAX_DEVIATION for each joint.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):

@@ -26,7 +26,7 @@ BANDWIDTH_LATENCY = 0.6
 
 @dataclass(frozen=True)
 class ComputedTorque(Controller):
-    """Computed-torque control along a task's trajectory; for the other attributes see `Controller`.
+    """Computed-torque control along a task's trajectory; `Controller` documents the inherited attributes.
 
     Attributes:
         model: the identified arm. ahead_s: s, look-ahead of the feedforward: control period / 2 + low-pass time
@@ -38,7 +38,7 @@ class ComputedTorque(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Number of values in a setpoint, 3 n + n^2: n for each of feedforward, q_d and dq_d, and n^2 for M."""
+        """Number of values in a setpoint: n each for feedforward, q_d and dq_d, and n^2 for the mass matrix."""
         n = self.action_dim
         return n * (3 + n)
 
@@ -74,9 +74,10 @@ def computed_torque(
     Args:
         robot, task: the arm and its task. dynamics: the identified arm.
         residual: torque that an action of 1 adds, as a fraction of the task's torque limit.
-        bandwidth: natural frequency w of the critically damped feedback, rad/s; the loop has the bandwidth 2 w. None:
-            w = BANDWIDTH_LATENCY / (2 latency), with latency = control period + low-pass time constant + LATENCY.
-        feedback_hz: Hz, update rate of the feedback, at most 1000; None: the policy's rate.
+        bandwidth: natural frequency w of the critically damped feedback, rad/s; the loop has the bandwidth 2 w. If
+            None, w is BANDWIDTH_LATENCY / (2 latency), with latency = control period + low-pass time constant +
+            LATENCY.
+        feedback_hz: Hz, update rate of the feedback, at most 1000. If None, the feedback has the policy's rate.
 
     Raises:
         UserError: the task has no trajectory, or a setting is out of its range.

@@ -39,8 +39,8 @@ class Controller:
         law: the compiled law; see r2s/physics/control_laws.py.
         action_scale, action_offset: (a,) in `unit`. action: name of the quantity that an action sets.
         parameters: (p,), the law's parameters. memory_size: number of values that the law stores between cycles.
-        torque_limit: (n,) Nm, the largest target torque; None: the task's limit.
-        cpp: C++17 body of the law for contract.hpp; "": bundles with this controller lack contract.hpp.
+        torque_limit: (n,) Nm, the largest target torque. If None, the task's limit applies.
+        cpp: C++17 body of the law for contract.hpp. If empty, bundles with this controller have no contract.hpp.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Controller:
         return False
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s) of m episodes with `goals`; t (m,) s contains one time for each episode."""
+        """Return the setpoints (m, `setpoint_size`) of m episodes with `goals` at the times t (m,), in seconds."""
         return np.empty((len(t), 0))
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:

@@ -33,11 +33,11 @@ CLIP_M = 0.05  # m, error at which the default spring saturates
 
 @dataclass(frozen=True)
 class Impedance(Controller):
-    """Impedance control of joints or end effector; for the other attributes see `Controller`.
+    """Impedance control of joints or end effector; `Controller` documents the inherited attributes.
 
     Attributes:
         model: the identified arm. target_size: number of values in a target. hybrid: whether hybrid control is used.
-        contact: (4,), surface normal and contact force, N, for hybrid control; None: use the task's contact.
+        contact: (4,), surface normal and contact force, N, for hybrid control. If None, the task's contact applies.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -47,7 +47,8 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Number of values: target; if `hybrid`, normal (3), force, measured force, flag; if `slides`, pull (3)."""
+        """Number of values in a setpoint: `target_size`, and 6 more if `hybrid`, and 3 more if `slides`."""
+        # target; if hybrid: normal (3), force, measured force, flag for a measured force; if it slides: pull (3)
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
@@ -61,7 +62,7 @@ class Impedance(Controller):
         return self.model(q[None], still, still, still)[0]
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s): the target; for hybrid control also the contact, without a measured force."""
+        """Return the setpoints (m, s): the target and, for hybrid control, the contact without a measured force."""
         if not self.target_size:
             return np.empty((len(t), 0))
         if self.law is joint_impedance_law:
@@ -74,7 +75,7 @@ class Impedance(Controller):
         return np.concatenate([target, contact, np.zeros((len(t), 2)), *pull], axis=1)
 
     def with_force(self, command: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Return hybrid-control commands (m, c) with the measured force (m,) N, positive against the normal."""
+        """Return commands (m, c) of hybrid control with the measured `force` (m,) N, positive against the normal."""
         out, at = command.copy(), self.command_size - 3 * self.slides - 2
         out[:, at], out[:, at + 1] = force, 1.0
         return out
@@ -93,14 +94,14 @@ def joint_impedance(
     damping: float = 1.0,
     tank: Sequence[float] = (1.0, 2.0),
 ) -> Impedance:
-    """Return the controller with joint springs to the task's trajectory or, without a trajectory, to q_home.
+    """Return the controller whose joint springs pull to the task's trajectory, or to q_home if the task has none.
 
     Args:
         robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
         action: what a policy's action sets: "target", "stiffness" or "both".
         torque_fraction: torque limit / tau_max. displacement: rad, shift of the target by an action of 1.
-        stiffness: Nm/rad, largest stiffness of each joint; None: CLIP * torque limit / displacement, or less if the
-            spring's natural frequency would exceed `fastest_spring`. damping: damping ratio of all modes.
+        stiffness: Nm/rad, largest stiffness of each joint. If None, CLIP * torque limit / displacement, or less if
+            the spring's natural frequency would exceed `fastest_spring`. damping: damping ratio of all modes.
         softest: ratio of the smallest to the largest stiffness that an action sets.
         tank: J, initial level and capacity of the energy tank.
 
@@ -167,17 +168,20 @@ def cartesian_impedance(
     Args:
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
         displacement, rotation: m and rad, shift and rotation of the target by an action of 1.
-        stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less if `fastest_spring` requires less.
-        rotational_stiffness: Nm/rad, largest stiffness; 0: only the null-space springs act on the orientation.
-        force_clip: N, largest spring force at the largest stiffness, at most the force F that the torque limit allows
-            in all directions in the home posture; None: CLIP F. moment_clip: Nm, largest spring moment, with the same
-            bound and default as force_clip.
-        null_stiffness: 1/rad, null-space stiffness (Nm/rad, towards q_home) of each joint / the joint's torque limit.
+        stiffness: N/m, largest stiffness. If None, force_clip / CLIP_M, or less if `fastest_spring` requires less.
+        rotational_stiffness: Nm/rad, largest stiffness. If 0, only the null-space springs act on the orientation.
+        force_clip: N, largest spring force at the largest stiffness. The torque limit allows a force F in all
+            directions in the home posture; force_clip may be at most F. If None, force_clip is CLIP F.
+        moment_clip: Nm, largest spring moment, at most the moment that the torque limit allows in all directions. If
+            None, CLIP times the allowed moment.
+        null_stiffness: 1/rad; this factor times a joint's torque limit is the stiffness, Nm/rad, of the joint's
+            null-space spring to q_home.
         hybrid: whether to control the force along a surface normal, and the impedance only along the surface. An
-            action that displaces the target against the normal adds a force stiffness * displacement. If
-            `task.approaches`, the target moves into the surface; its spring limits the force, so that the tip is no
-            faster than the target.
-        normal: (3,) out of the surface, base frame. force: N, push against `normal`. Both None: the task's values.
+            action that displaces the target against the normal adds the force stiffness * displacement. If
+            `task.approaches`, the target moves into the surface, and the spring to the target limits the force, so
+            that the tip is no faster than the target.
+        normal, force: (3,) out of the surface in the base frame, and push against the normal, N. If both are None,
+            the task's values apply.
         integral_rate: 1/s, integral gain on a measured force error. integral_max: integral limit / force_clip.
 
     Raises:
@@ -235,7 +239,7 @@ def cartesian_impedance(
 
 
 def _check(action: str, softest: float, displacement: float) -> None:
-    """Raise UserError if a setting of both joint and Cartesian impedance is out of range."""
+    """Raise UserError if `action`, `softest` or `displacement` has a value that is not allowed."""
     if action not in ACTIONS:
         raise UserError(f"action: '{action}'; {instead_of(action, ACTIONS)}")
     check_number("softest", softest, "(0, 1]")
@@ -266,7 +270,7 @@ def _contact(task: Any, normal: Sequence[float] | None, force: float | None, mos
 
 
 def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
-    """Check and return a force or moment; None: return CLIP times the most that `limit` allows in all directions."""
+    """Check and return `value`; if None, CLIP times the force or moment that `limit` allows in all directions."""
     most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
     if value is None:
         return CLIP * most
@@ -305,7 +309,7 @@ def _action(
 def _parameters(
     robot: Robot, task: ControlledTask, dynamics: Dynamics, damping: float, tank: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the law's parameters (p,), springs and action not set, and a view (n, ROW) of the joints' parameters."""
+    """Return the law's parameters (p,), with springs and action still 0, and a view (n, ROW) of joint parameters."""
     check_number("damping", damping, "(0, 10]")
     if np.shape(tank) != (2,) or not 0 <= tank[0] <= tank[1] < np.inf:
         raise UserError(f"tank: expected first level and size in J, 0 <= level <= size, got {tank}")

@@ -22,10 +22,10 @@ class DartEngine:
 
     Args:
         robot: the arm; its MJCF defines kinematics, inertia and limits.
-        gravity: whether gravity acts; False: libfranka's convention, in which the arm compensates gravity.
-        masses, coms, inertias: of the n moving links, in link axes: (n,) kg, (n, 3) m, (n, 3, 3) kg m^2 about the
-            center of mass; None: the MJCF's values.
-        armature: (n,) kg m^2, armature of the joints; None: the values of `robot`.
+        gravity: whether gravity acts. If False, the arm compensates gravity, as in libfranka.
+        masses, coms, inertias: of the n moving links, mass (n,) kg, center of mass (n, 3) m, and tensor (n, 3, 3)
+            kg m^2 about the center of mass, in link axes. If None, the MJCF's values.
+        armature: (n,) kg m^2, armature of the joints. If None, the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
     Like MuJoCo, this engine has no velocity limits, because velocity limits would hide a policy's violations.

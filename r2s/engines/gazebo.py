@@ -1,7 +1,7 @@
 """Simulate an arm in Gazebo (gz-sim Harmonic, Ionic or Jetty), in this process, through the Python bindings.
 
 Each step of 1 ms is one blocking call of `server.run`. The world contains only an arm, without sensors or graphics;
-r2s/physics/description.py describes the arm. OSRF's packages and conda-forge contain the bindings; PyPI does not.
+r2s/physics/description.py describes the arm. OSRF's packages and conda-forge contain the bindings, but PyPI does not.
 """
 
 import importlib
@@ -33,7 +33,7 @@ class GazeboEngine:
 
     Args:
         robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.
-        sim: the bindings; None: import the installed bindings.
+        sim: the Python bindings. If None, the engine imports the installed bindings.
 
     Raises:
         UserError: the bindings are not installed, or cannot load the world.
@@ -81,7 +81,7 @@ class GazeboEngine:
             raise self._error
 
     def _guarded(self, update):
-        """Return a callback that runs `update` and stores its exceptions for `_run`; bindings ignore exceptions."""
+        """Return a callback that runs `update` and stores exceptions for `_run`; the bindings ignore exceptions."""
 
         def call(info, ecm):
             try:

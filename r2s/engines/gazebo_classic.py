@@ -140,7 +140,7 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 def gzserver() -> list[str]:
     """Return the command that starts `gzserver`.
 
-    If R2S_GAZEBO_ROOT is set, the dynamic loader in that folder starts `gzserver`, because chroot needs root rights.
+    If R2S_GAZEBO_ROOT is set, the dynamic loader of this root starts `gzserver`, because chroot needs root rights.
 
     Raises:
         UserError: `gzserver` or the plugin is missing.

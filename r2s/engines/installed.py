@@ -8,7 +8,10 @@ from r2s.errors import UserError
 
 
 def installed() -> Iterator[tuple[str, str, str]]:
-    """Yield for each engine (`simulator=` value, name and version, ""), or (value, "missing", how to install it)."""
+    """Yield (`simulator=` value, name and version, "") for each installed engine.
+
+    For a missing engine, yield (`simulator=` value, "missing", how to install the engine).
+    """
     engines: dict[str, Callable[[], str]] = {
         "mujoco": lambda: f"MuJoCo {_package('mujoco')}",
         "dart": lambda: f"DART {_package('dartpy')}",

@@ -17,7 +17,7 @@ from r2s.physics.simulator import single_arm
 
 
 class Engine(Protocol):
-    """Interface of an engine that simulates one arm without gravity, as a Franka arm compensates gravity itself."""
+    """Interface of an engine that simulates one arm without gravity, because a Franka arm compensates gravity."""
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Set the joint positions q (n,) rad and velocities dq (n,) rad/s."""

@@ -77,7 +77,7 @@ def designed(
 
 
 def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Excitation:
-    """Return a motion from q_from to q_to (n,) rad along the path of `approach`; the arm stops at each corner.
+    """Return a motion from q_from to q_to (n,) rad along the path that `approach` finds, with a stop at each corner.
 
     Raises:
         UserError: no candidate path is safe.

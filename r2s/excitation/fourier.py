@@ -1,10 +1,10 @@
 """Design an excitation: a finite Fourier series that the arm follows at several speeds.
 
 The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
-T-RA 13(5), 1997. The matrix includes a prior, so that unidentifiable quantities do not dominate its determinant. Only
-motion at several speeds determines friction curves and delay, so the motion consists of rungs: sections of the series
-at 10 % to 100 % of full speed, separated by rests. Slow rungs also run backwards, so that joints reverse at low
-speed.
+T-RA 13(5), 1997. The information matrix includes a prior, so that unidentifiable quantities do not dominate the
+determinant. Only motion at several speeds determines friction curves and delay, so the motion consists of rungs:
+sections of the series at 10 % to 100 % of full speed, separated by rests. Slow rungs also run backwards, so that
+joints reverse at low speed.
 """
 
 from collections.abc import Callable
@@ -81,9 +81,9 @@ def fourier(
         duration: s, including the rests at both ends.
         seed: random seed.
         gravity: whether the recorded torque is link-side torque, with gravity; see `information`.
-        effort: number of motions that the local search tries; 0: return the first safe random series.
-        q_center: (n,) rad, center posture; default: the middle of the position range.
-        table: m, height of the table in the base frame; -inf: no table.
+        effort: number of motions that the local search tries. If 0, the motion is the first safe random series.
+        q_center: (n,) rad, center posture. If None, the middle of the position range.
+        table: m, height of the table in the base frame; -inf means no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
 
     Raises:
@@ -114,7 +114,7 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions (x, a): coefficients x (2 H, n) of a series, amplitudes a (n,) / largest amplitudes.
+    """Candidate motions (x, a): x (2 H, n) are coefficients of a series, a (n,) are amplitudes / largest amplitudes.
 
     A joint's limits determine the joint's largest amplitude; the coefficients x determine only the motion's shape.
 
@@ -195,7 +195,7 @@ class Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the 1 kHz motion, reduced until it is safe at GEOMETRY_HZ; None if an amplitude gets too small."""
+        """Return the 1 kHz motion, with `a` reduced until it is safe at GEOMETRY_HZ; None if `a` gets too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))
@@ -237,7 +237,7 @@ class Candidates:
         return q[::FINE], dq[::FINE], ddq[::FINE]
 
     def _safety(self, offset: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return safety (T,): the smaller of gap / clearance and torque reserve / (0.1 tau_max); negative: unsafe."""
+        """Return safety (T,), the smaller of gap / clearance and torque reserve / (0.1 tau_max); unsafe below 0."""
         q = self.center + offset
         torque = (TORQUE_SHARE - torque_share(self.robot, q, dq, ddq)).min(1)
         return np.minimum((self.space.gaps(q) / self.space.clearance).min(1), 10 * torque)
@@ -256,9 +256,10 @@ class Candidates:
     def _shrink(
         self, a: np.ndarray, moved: Callable[[np.ndarray], Samples], by: float, margin: float, least: float
     ) -> np.ndarray | None:
-        """Return amplitudes `a`, reduced until `_safety` is at least `margin`; None if one would be below `least`.
+        """Reduce the amplitudes `a` until `_safety` is at least `margin`, and return the reduced amplitudes.
 
-        Each round reduces the amplitude of the joint whose reduction most improves the least safe sample.
+        Each round reduces the amplitude of the joint whose reduction most improves the least safe sample. If an
+        amplitude falls below `least`, or if the safety stays too low, return None.
         """
         a = a.copy()
         for every in (5, 1):  # first every fifth sample, so that most rounds are fast
@@ -280,7 +281,7 @@ class Candidates:
 def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the time t, the argument s of the series, ds/dt and d2s/dt2, each (T,).
 
-    Between segments of different rates, ds/dt changes along a raised cosine.
+    Where the pace changes, the rate ds/dt follows a raised cosine.
     """
     t = SIM_DT * np.arange(round(duration / SIM_DT) + 1)
     levels, shares, fixed = [0.0], [0.0], [ENDS_S]  # a level lasts `fixed` s plus its share of the remaining time
@@ -303,7 +304,7 @@ def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def _rungs(duration: float) -> list[list[float]]:
-    """Return each rung's paces (speed / full speed), which rise along a ladder; slow rungs also run backwards."""
+    """Return each rung's paces (speed / full speed); a ladder starts slowly, and slow rungs also run backwards."""
     count = int(duration / RUNG_S + 0.5)
     if count < 2:
         return [list(SHORT)]

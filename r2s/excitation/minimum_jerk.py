@@ -8,7 +8,8 @@ def minimum_jerk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return position, velocity and acceleration of a motion from `start` to `end` (n,) rad in `seconds`.
 
-    The arrays are (n,) for one time t, s, and (T, n) for times t (T, 1), s. Outside [0, `seconds`] the arm rests.
+    The arrays have the shape (n,) for one time t in s, and (T, n) for times t (T, 1) in s. Outside [0, `seconds`] the
+    arm rests.
     """
     s = np.clip(t / seconds, 0.0, 1.0)
     distance = end - start

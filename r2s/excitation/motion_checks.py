@@ -48,9 +48,9 @@ def check_motion(
     Args:
         robot: limits and links.
         motion: the motion, sampled at 1 kHz.
-        table: m, height of the table in the base frame; -inf: no table.
+        table: m, height of the table in the base frame; -inf means no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
-        space: a `Space`, such as one with obstacles, that replaces table and z_min; None: `Space(table, z_min)`.
+        space: a `Space`, for example with obstacles, that replaces table and z_min. If None, table and z_min apply.
     """
     check_shape(robot, motion)
     check_limits(robot, motion)
@@ -124,7 +124,7 @@ def check_derivatives(robot: Robot, motion: Motion) -> None:
 
 
 def check_torque(robot: Robot, motion: Motion) -> None:
-    """Raise UserError if a motion's nominal torque plus `friction_margin` exceeds 80 % of tau_max."""
+    """Raise UserError if |gravity| + |dynamics| + `friction_margin`, see `torque_share`, exceeds 80 % of tau_max."""
     rows = geometry_rows(motion)
     share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
     bad = np.argwhere(~(share <= TORQUE_SHARE))
@@ -178,8 +178,9 @@ class Space:
     an arm stops beyond its `DeviationLimits`, which depend on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, smallest required distances: of the end effector above z_min (a scale for fourier.py;
-            `gaps` requires 0 m), of geoms above the table, and between the two geoms of each pair.
+        clearance: (K,) m, smallest required distances. The first element, of the end effector above z_min, is only a
+            scale for fourier.py, because `gaps` requires 0 m. Distances of geoms above the table follow, then
+            distances between the two geoms of each pair.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -223,7 +224,7 @@ class Space:
         self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
-        """Return distances minus required distances, (T, K) m, at postures q (T, n) rad; negative: too near."""
+        """Return distances minus required distances, (T, K) m, at postures q (T, n) rad; below 0 is too near."""
         distances, levers = self.measured(q)
         return distances - self._needed(levers)
 
@@ -290,7 +291,7 @@ class Space:
         return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
 
     def _apart(self) -> np.ndarray:
-        """Return the distances, m, between the geoms of each pair; above FAR_M, distances of the bounding spheres."""
+        """Return the distance, m, between the geoms of each pair, or above FAR_M between their bounding spheres."""
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         radius, place = self.model.geom_rbound, self.data.geom_xpos
         out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]

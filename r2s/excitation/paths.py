@@ -1,6 +1,6 @@
 """Find a joint-space path to a posture, and check its limits and clearance before an arm moves along the path.
 
-A path is an array of postures (k, n) rad, connected by straight lines in joint space, without speeds.
+A path is an array of postures (k, n) rad without speeds; straight lines in joint space connect the postures.
 motion_checks.py computes distances and clearances.
 """
 
@@ -92,6 +92,6 @@ def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
 
 
 def _where(leg: int, count: int, share: float) -> str:
-    """Return a text that describes the point at the fraction `share` of leg number `leg` of a path."""
+    """Describe, for an error message, the point at the fraction `share` of a path's leg number `leg`."""
     which = "" if count == 2 else f", from posture {leg + 1} to {leg + 2} of {count}"
     return f" {100 * share:.0f} % of the way{which}"

@@ -18,7 +18,7 @@ class Arm:
         torque: "without gravity" if the arm itself compensates gravity, as a Franka arm does.
         q_min, q_max, dq_max, tau_max, dtau_max: the limits of each joint, in rad, rad, rad/s, Nm, Nm/s.
         slows: (decelerations rad/s^2, offsets rad/s) of an arm such as the FR3, which limits each joint's speed to
-            sqrt(2 deceleration d) - offset at d rad before a position limit; None: the arm has no such limits.
+            sqrt(2 deceleration d) - offset at d rad before a position limit. If None, the arm has no such limits.
     """
 
     joints: Sequence[str]
@@ -64,7 +64,7 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
 
 
 def _slows(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle's speed limits near position limits are above those of `Arm.slows`."""
+    """Raise BundleError if a bundle allows a higher speed near a position limit than `Arm.slows` allows."""
     law = Driver(contract["law"], Model(contract["model"]))
     deceleration, offset = np.array(arm.slows, dtype=float)
     for way in np.linspace(0.0, 1.0, 101):  # rad before the limit

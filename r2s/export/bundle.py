@@ -59,7 +59,8 @@ def write_bundle(
     """Write the bundle of a finished training atomically into the new folder `to`.
 
     Args:
-        to: the new folder. source: run folder of the training. robot, task, policy, config: those of the training.
+        to: the new folder. source: run folder of the training.
+        robot, task, policy, config: robot, task, policy and config of the training.
         dynamics: dynamics of one arm, at the center of the training's domain randomization.
         places: names of all simulators and arms; the model card lists where the policy has not run.
 

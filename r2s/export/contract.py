@@ -66,7 +66,7 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
     Args:
         robot, task: robot and task of the training. friction: (n,) Nm, Coulomb friction, see
             `safety_filter.filter_torque`.
-        rotors: armatures (n,) kg m^2 for the safety filter; None: the armatures of `robot`.
+        rotors: armatures (n,) kg m^2 for the safety filter. If None, the armatures of `robot`.
 
     Raises:
         UserError: the task has no `observation_terms`, or the runtime of a bundle does not support the task.
@@ -168,7 +168,7 @@ def model_of(control: Controller, task: Task) -> InverseDynamics | None:
 
 
 def controller(control: Controller, task: Task) -> dict[str, Any]:
-    """Return the entry `control`: action space, parameters of the control law, and the arm model that it needs."""
+    """Return the entry `control`: action space, parameters of the law, and the arm model that the law needs."""
     kind, model = kind_of(task), model_of(control, task)
     return {
         "name": control.name,
@@ -223,7 +223,7 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
 
 
 def width(of: str, joints: int, preview: int) -> int:
-    """Return the length of an observation term that shows the signal `of` ("q", "ee", ...)."""
+    """Return the number of values of one signal in the observation; `of` is the signal's name, such as "q"."""
     own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
     own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
     return {**own, "above_target": 1}.get(of, joints)
@@ -261,7 +261,7 @@ def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, A
 
 
 def start(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the entry `start`: the start posture, and the allowed distance and speed at the start of a motion."""
+    """Return the entry `start`: the start posture, and the largest deviation and speed of a joint at the start."""
     rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
         return {"words": FIRST_ROW} | rest

@@ -1,7 +1,7 @@
 """Check start, goal and plan of a motion, run the policy in a thread, and bring the arm to rest after a signal.
 
-`r2s export` copies this module into the bundle. The policy runs in a thread, because a physical arm cannot wait for a
-policy.
+`r2s export` copies this module into the bundle. On an arm in real time, the policy runs in a thread, because the arm
+cannot wait for the policy.
 """
 
 import signal
@@ -38,7 +38,7 @@ def outside(trained: dict[str, Any], point: np.ndarray) -> str | None:
 
 
 def check_start(start: dict[str, Any], home: np.ndarray, q: np.ndarray, dq: np.ndarray) -> None:
-    """Raise BundleError unless the arm rests near the posture `home` (n,) rad, within the limits of `start`."""
+    """Raise BundleError unless the arm rests near `home` (n,) rad, as the contract's entry `start` requires."""
     if not (np.isfinite(q).all() and np.isfinite(dq).all()):
         raise BundleError("the arm's state is not finite")
     if start["within_rad"] is not None and (far := np.abs(q - home)).max() > start["within_rad"]:

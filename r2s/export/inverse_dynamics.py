@@ -1,6 +1,6 @@
 """Compute the inverse dynamics of the identified arm in NumPy, as r2s/physics/inverse_dynamics.py does.
 
-A bundle needs inverse dynamics for the setpoints of control=computed_torque and to estimate contact force.
+A bundle needs inverse dynamics for the setpoints of control=computed_torque and for the estimate of contact force.
 `r2s export` copies this module into r2s_runtime.py of a bundle.
 """
 
@@ -45,8 +45,8 @@ class InverseDynamics:
     def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
         """Return the setpoints (rows, 3 n + n n) for the first `rows` rows of a joint motion (T, n) sampled at `hz`.
 
-        A setpoint contains feedforward, Nm, q_d, dq_d and the flattened mass matrix. Computing a setpoint takes over
-        1 ms.
+        A setpoint contains the feedforward torque, Nm, q_d, dq_d and the flattened mass matrix. Computing a setpoint
+        takes over 1 ms.
         """
         n = q.shape[1]
         out = np.empty((rows, 3 * n + n * n))

@@ -112,12 +112,13 @@ class Driver:
     """Run control law, low-pass and safety filter; one call per cycle returns a torque within the arm's limits.
 
     Attributes:
-        effort: (n,) Nm, the target torque after the low-pass. stopping: why the driver stops the arm, or None.
+        effort: (n,) Nm, the target torque after the low-pass. stopping: reason for a stop, or None without a stop.
         limited: number of cycles of this motion in which the safety filter changed the torque.
 
     Args:
         law: a contract's entry `law`. model: the arm's `Model`. soft_start_s: s, time over which torque fades in.
-        control: the contract's `Control`; None: commands are torques. push: the contract's `PushLimit`, or None.
+        control: the contract's `Control`. If None, commands are torques.
+        push: the contract's `PushLimit`. If None, nothing limits the contact force.
     """
 
     def __init__(
@@ -155,7 +156,8 @@ class Driver:
 
         Args:
             q, dq: joint state (n,) rad, rad/s, in this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            command: (c,), new command; None: the previous command. placed: whether `model` is already at q.
+            command: (c,), new command. If None, the previous command applies.
+            placed: whether `model` is already at q.
         """
         j, c = self._j, self._number
         seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
@@ -229,7 +231,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the allowed torque (n,) Nm nearest to `effort` + holding torque, and whether a limit changes it."""
+        """Return the allowed torque (n,) Nm nearest to `effort` plus holding torque, and whether the two differ."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -284,7 +286,7 @@ class Driver:
         return speed
 
     def _stops(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the torques (n,) Nm to add so that ddq stays in [low, high], found by block principal pivoting."""
+        """Return the torques (n,) Nm to add so that ddq stays in [low, high]; method: block principal pivoting."""
         c = self._number
         side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))
         push = np.zeros_like(ddq)

@@ -61,9 +61,9 @@ class Follower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return {name: values} for a control step's observation (`goal`: reference position), and the `setpoint`.
+        """Return {name: values} for a control step: the values for the observation, and the controller's `setpoint`.
 
-        After the last step the reference remains at the end of the path.
+        `goal` is the reference position. After the last step, the reference remains at the end of the path.
 
         Args:
             step: number of the control step, from 0. seen: measured q, dq (n,) rad, rad/s; end-effector position `ee`

@@ -80,7 +80,7 @@ class Runtime:
 
     Args:
         folder: the bundle. arm: the arm that executes the policy. soft_start_s: s, time over which torque fades in.
-        live: whether the arm runs in real time; then the policy runs in a separate thread.
+        live: whether the arm runs in real time, so that the policy must run in a separate thread.
 
     Raises:
         BundleError: the bundle is damaged or made for another arm.
@@ -192,7 +192,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Raise BundleError if start or first goal is outside the trained region; stop the arm if a later goal is."""
+        """Raise BundleError if start or first goal is not allowed; stop the arm if a later goal is not allowed."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)
@@ -221,7 +221,7 @@ class Runtime:
         return made | {"pull": jacobian.T @ made["error"]}
 
     def observe(self, made: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the observation (d,) float32, computed from the result of `_look`."""
+        """Compute the observation (d,) float32 from the result of `_look`."""
         scaled = [made[of] if by is None else made[of] / by for of, by, _ in self._entries]
         parts = [np.tanh(x) if tanh else x for x, (_, _, tanh) in zip(scaled, self._entries, strict=True)]
         return np.concatenate(parts).astype(np.float32)

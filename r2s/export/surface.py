@@ -88,7 +88,7 @@ class SurfaceFollower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return {name: values} for the observation of a control step, and the controller's `setpoint`.
+        """Return {name: values} for a control step: the values for the observation, and the controller's `setpoint`.
 
         After the last step the target stays at the end of the plan. Call `model.place(q)` before this function.
 

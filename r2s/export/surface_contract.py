@@ -17,7 +17,7 @@ from r2s.tasks.surface_task import REGULAR, START, SurfaceTask
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
-    """Return plans (k, steps + 1, columns), one for each of k random goals of the task, the rows of `goals`."""
+    """Return plans (k, steps + 1, columns), one for each row of `goals`, which contains k goals of the task."""
     control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
     none, starts, out = np.zeros((len(t), 3)), np.zeros((len(t), robot.n)), []
     for goal in goals:

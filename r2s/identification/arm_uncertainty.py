@@ -32,11 +32,11 @@ class Arm:
 def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
     """Return correction factors (n,) for a payload's joint torques, and the factors' standard deviations (n,).
 
-    The torque of an unloaded arm determines only the product of sensor gain and masses. If the masses in the robot's
-    file are wrong, the identified gains compensate the mass error, and a payload's computed torque has the same
-    relative error as the masses. Gain errors are independent between joints, with standard deviation GAIN; all masses
-    have one relative error, with standard deviation MASSES. The most likely mass error minimizes the sum of squares
-    of gain errors and mass error, each divided by its standard deviation.
+    The torque of an unloaded arm determines only the product of sensor gain and masses. If all true masses are 1 + e
+    times the masses in the robot's file, the identified gains contain the factor 1 + e, so that a payload's computed
+    torque is 1 + e times too large. Gain errors are independent between joints, with standard deviation GAIN; all
+    masses have one relative error, with standard deviation MASSES. The most likely mass error minimizes the sum of
+    squares of gain errors and mass error, each divided by its standard deviation.
     """
     space, n = arm.space, arm.robot.n
     if "gain" not in space.blocks or LINK[0] in space.blocks:
@@ -60,11 +60,12 @@ def sliding_sign(torque: TorqueResidual) -> np.ndarray:
 def arm_directions(
     torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
 ) -> np.ndarray:
-    """Return the change (T, n, r) Nm of the residual by one standard deviation of each of r independent model errors.
+    """Return the residual's change (T, n, r) Nm for each of r independent model errors of one standard deviation.
 
     Args:
         torque: residual of the joint torque. x: (P,) parameters of the arm.
-        samples: (S, P), posterior draws of x, or None. offset_drift: (n,) Nm, standard deviation of offset drift.
+        samples: (S, P), posterior draws of x; if None, only friction and offsets have errors. offset_drift: (n,) Nm,
+            standard deviation of offset drift.
         friction_drift: standard deviation of the friction's drift since the calibration, relative to the friction.
     """
     d, n = torque.space.dynamics(x), torque.space.n

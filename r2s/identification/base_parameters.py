@@ -1,8 +1,9 @@
 """Base parameters: the fewest combinations of inertial parameters on which joint torque depends.
 
 Torque is linear in ten standard parameters per link and one per rotor, but many parameters act only in combination. A
-QR decomposition (without pivoting) of the regressor at random states selects independent columns, one per base
-parameter. A dependent column is a combination of independent columns (Gautier, J. Robotic Systems 8(4), 1991).
+QR decomposition (without pivoting) of the regressor at random states selects each column that is independent of the
+columns before it. Each selected column yields a base parameter, into which the parameters of dependent columns are
+regrouped (Gautier, J. Robotic Systems 8(4), 1991).
 """
 
 from typing import NamedTuple
@@ -24,7 +25,8 @@ DEPENDENT, NONE = 1e-9, 1e-9  # relative size below which a column is dependent,
 class BaseParameters(NamedTuple):
     """Base parameters: `matrix` (K, 10 n + n) maps 10 n link and n rotor parameters to K base parameters.
 
-    names, units, combinations: first term, unit and formula (such as "zz[2] + 0.1 my[3]") of each base parameter.
+    combinations: formula of each base parameter, such as "zz[2] + 0.1 my[3]". names: the formula's first term.
+    units: the parameter's unit.
     """
 
     names: list[str]
@@ -77,7 +79,7 @@ def base_table(space: ParameterSpace, found: ParameterEstimate, rotors: bool) ->
 
 
 def _combination(row: np.ndarray, names: list[str], first: int) -> str:
-    """Return a row of the matrix as text such as "zz[2] + 0.1 my[3]", beginning with the parameter number `first`."""
+    """Return a row of the matrix as text such as "zz[2] + 0.1 my[3]"; parameter number `first` comes first."""
     others = [k for k in np.flatnonzero(row).tolist() if k != first]
     parts = [f"{'-' if row[k] < 0 else '+'} {_factor(abs(row[k]))}{names[k]}" for k in others]
     return " ".join([names[first], *parts])

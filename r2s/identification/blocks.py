@@ -2,7 +2,7 @@
 
 Unlike noise, model error is correlated in time: torque ripple at low speed lasts seconds. Each block lasts several
 correlation times of the residual. Model error also recurs if the motion is repeated. If the residual recurs with the
-motion, a block contains all repetitions of a phase.
+motion, a block contains the same interval of all repetitions of the motion.
 """
 
 import numpy as np
@@ -23,12 +23,13 @@ def blocks_of(
     residual: np.ndarray | None = None,
     shortest_s: float = BLOCK_S,
 ) -> np.ndarray:
-    """Return the number (T,) of the block to which each row belongs, from 0 to B - 1.
+    """Return the number (T,) of the block to which each row belongs; the first block has the number 0.
 
     Args:
         t: (T,) s, times, increasing within a trajectory. q: (T, n) rad, joint angles. period: s, period of the
             motion, or None.
-        residual: (T, n), residual of a fit; None: blocks last at least `shortest_s` and differ between repetitions.
+        residual: (T, n), residual of a fit. If None, blocks last at least `shortest_s` s, and repetitions of the
+            motion are not joined.
     """
     run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of the trajectory; the clock restarts in each
     steps = np.diff(t)[np.diff(run) == 0]
@@ -48,7 +49,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return block numbers (T,) that are equal in all repetitions (`visit`, (T,)) with similar q (T, n) rad."""
+    """Return block numbers (T,) common to all repetitions (numbers `visit` (T,)) with similar angles q (T, n) rad."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -60,7 +61,8 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
     """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,) s.
 
-    The correlation time is the integral of the squared autocorrelation, also a bound for residual times Jacobian.
+    The correlation time is the integral of the squared autocorrelation. This integral is also an upper bound of the
+    correlation time of residual times Jacobian.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))
@@ -76,7 +78,7 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether residuals (T, n) at equal phases (`at`, (T,)) are similar in all repetitions (`visit`, (T,))."""
+    """Return whether a joint's residual (T, n) recurs at equal phases `at` (T,) of the repetitions `visit` (T,)."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]

@@ -2,7 +2,8 @@
 
 Two further fits assess each recording: a fit without the recording, and a fit to the recording alone. Every further
 fit starts from the fit to all recordings, so that few least-squares steps on torque suffice. The residual of a fit to
-one recording alone sets its weights, because contradicting recordings increase the residual of a common fit.
+one recording alone sets the recording's weights, because contradicting recordings increase the residual of a common
+fit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,10 +37,11 @@ class Contribution:
         label, torque, seconds: name, kind of torque and length of the recording. use: "training" or "validation".
         rmse: (n,) Nm, error of the fit to all recordings.
         left_out: (n,) Nm, error of a fit without this recording; None for a validation recording.
-        narrower: (P,), width of the 95 % intervals without this recording / width with it; None for validation.
+        narrower: (P,), width of the 95 % intervals without this recording / width with it; None for a validation
+            recording.
         alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio of sums of squares, see
             CONTRADICTS; 1 if there is only one recording. body_kg: mass on the last link that explains the
-            contradiction, or nan.
+            contradiction; nan if no such mass explains it.
     """
 
     label: str
@@ -111,7 +113,7 @@ def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the fit (P,) to the residuals in `parts` from start u (P,). prior: prior rows (B,) at u, Jacobian."""
+    """Return the fit (P,) to the residuals `parts` from start u (P,). prior: residual (B,) of the prior, Jacobian."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:
@@ -133,7 +135,7 @@ def _rmse(error: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
-    """Return the additional mass on the last link, kg, that explains a torque error (T, n) Nm, or nan."""
+    """Return the additional mass on the last link, kg, that explains a torque error (T, n) Nm; nan if none does."""
     some = data.seen.ravel()
     y = data.rigid_body_of_last_link()
     rows, tau = y.reshape(-1, y.shape[-1])[some], -error.ravel()[some]

@@ -33,10 +33,11 @@ class ExpectedWidths:
     """Expected widths of the 95 % intervals of P parameters.
 
     Attributes:
-        space: parameter space. width: (P,), expected widths, SI units. share: (P,), posterior / prior sigma.
+        space: parameter space. width: (P,), expected widths, SI units. share: (P,), ratio of posterior to prior
+            sigma.
         identifiable: (P,), whether the data will determine each parameter, by the rule of `conclude`.
-        late: s, time shift between torque and motion, and the shift's standard deviation. For commanded torque, the
-            shift is the delay of motion behind torque; for measured or motor torque, of torque behind motion.
+        late: s, time shift between torque and motion, and the shift's standard deviation. The shift is the delay of
+            motion behind commanded torque, or the delay of measured or motor torque behind motion.
     """
 
     space: ParameterSpace

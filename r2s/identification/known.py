@@ -3,7 +3,7 @@
 Prior knowledge comes from an earlier identification, with any kind of torque, or from the user (stated.py). After the
 earlier identification, friction and offsets x drift by w ~ N(0, drift^2): x_now = x_then + w. The prior covariance is
 the earlier posterior covariance plus diag(drift^2), as in the prediction step of a Kalman filter (Kalman 1960). r2s
-also estimates the drift w, from the earlier and the present recording.
+also estimates the drift w, from the earlier posterior and the present recording.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,7 +28,7 @@ class Known:
 
     Attributes:
         names: K names such as coulomb[2]. mean: (K,) in SI units; for logarithmic parameters, mean of the logarithm.
-        covariance: (K, K), including drift. drift: (K,) standard deviation of a value's drift; 0: no drift.
+        covariance: (K, K), including drift. drift: (K,) standard deviation of a value's drift; 0 means no drift.
     """
 
     names: tuple[str, ...]
@@ -60,7 +60,7 @@ class Known:
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return the joint distribution with the independent prior `other`, which alone describes common values."""
+        """Return the joint distribution with the independent prior `other`; common values follow only `other`."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)
@@ -111,11 +111,11 @@ def coordinates(names: Sequence[str], x: np.ndarray) -> np.ndarray:
 
 
 def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.ndarray) -> pd.DataFrame:
-    """Return a table of values that may drift: earlier value, present value, difference with 95 % interval, SI units.
+    """Return a table of values that may drift, in SI units: earlier and present value, difference with 95 % interval.
 
-    The difference is the drift w in x_now = x_then + w, estimated from the earlier and the present recording. With
-    x_then ~ N(m, P), Q = diag(drift^2), S = P + Q, and x_now ~ N(x, V) after the new data, the Rauch-Tung-Striebel
-    smoother (AIAA Journal 3(8), 1965) yields w ~ N(G (x - m), G V G^T + P - P S^-1 P), where G = Q S^-1.
+    The difference is the drift w in x_now = x_then + w. With x_then ~ N(m, P), Q = diag(drift^2), S = P + Q, and
+    x_now ~ N(x, V) after the new data, the Rauch-Tung-Striebel smoother (AIAA Journal 3(8), 1965) yields
+    w ~ N(G (x - m), G V G^T + P - P S^-1 P), where G = Q S^-1.
 
     Args:
         known: prior from the earlier identification. space, x, samples: parameters, values (P,) and posterior draws

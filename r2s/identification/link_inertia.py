@@ -19,7 +19,7 @@ def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np
 
     Sigma, h and m are second moment, first moment and mass (Wensing, Kim and Slotine, RA-L 3(1), 2018). The second
     moment about the center of mass is positive definite if principal moments are positive and satisfy the triangle
-    inequality; otherwise the function raises its eigenvalues.
+    inequality; otherwise the function raises eigenvalues that are too small.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)
@@ -34,12 +34,15 @@ def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np
 
 
 def _upper(j: np.ndarray) -> np.ndarray:
-    """Return the upper triangular U (..., 4, 4) with U U^T = j."""
+    """Return the upper triangular matrix U (..., 4, 4) with U U^T = j."""
     return np.linalg.cholesky(j[..., ::-1, ::-1])[..., ::-1, ::-1]
 
 
 def links(robot: Robot, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass (..., n) kg, com (..., n, 3) m, tensor about com (..., n, 3, 3) kg m^2 for theta (..., n, 10)."""
+    """Return mass, center of mass and tensor of links with the log-Cholesky parameters theta (..., n, 10).
+
+    Mass (..., n) is in kg, center (..., n, 3) in m, and the tensor (..., n, 3, 3) about the center in kg m^2.
+    """
     v = np.zeros((*theta.shape[:-1], 4, 4))
     for i in range(3):
         v[..., i, i] = np.exp(theta[..., 1 + i])
@@ -68,7 +71,8 @@ def add_point_mass(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mass (..., n) kg, com (..., n, 3) m, tensor (..., n, 3, 3) with a point mass added to the last link.
 
-    A point mass suffices: a gripper's tensor about its own center is small compared with m r^2 about the joints.
+    A point mass suffices: a gripper's tensor about its own center is small compared with m r^2, where m is the
+    gripper's mass and r its distance from a joint.
 
     Args:
         mass, com, inertia: mass, center of mass and inertia tensor of each link without the point mass.
@@ -87,5 +91,5 @@ def add_point_mass(
 
 
 def inertia_scale(inertia: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-    """Return the traces of inertia tensors (..., n, 3, 3) divided by those of the nominal tensors, (..., n)."""
+    """Return ratios (..., n) of the traces of inertia tensors (..., n, 3, 3) to the traces of nominal tensors."""
     return np.trace(inertia, axis1=-2, axis2=-1) / np.trace(nominal, axis1=-2, axis2=-1)

@@ -106,7 +106,7 @@ class ParameterSpace:
         return x[..., self.where(name)]
 
     def where(self, name: str) -> np.ndarray:
-        """Return the indices of a block in x."""
+        """Return the indices of a block in the parameter vector x."""
         at = sum(self.size(b) for b in self.blocks[: self.blocks.index(name)])
         return np.arange(at, at + self.size(name))
 
@@ -119,7 +119,7 @@ class ParameterSpace:
         return self.expand(dict.fromkeys(logarithmic(), True), False)
 
     def to_unit(self, x: np.ndarray) -> np.ndarray:
-        """Map x (..., P) from SI units into the unit cube."""
+        """Map parameter vectors x (..., P) from SI units into the unit cube."""
         low, high = self._warp(self.lower), self._warp(self.upper)
         return (self._warp(x) - low) / (high - low)
 
@@ -145,7 +145,7 @@ class ParameterSpace:
         return np.where(self._log, np.log(np.where(self._log, x, 1.0)), x)
 
     def dynamics(self, x: np.ndarray) -> Dynamics:
-        """Return the dynamics that x (..., P) describes."""
+        """Return the dynamics that parameter vectors x (..., P) describe."""
         d, blocks = self.nominal, set(self.blocks)
 
         def value(name: str, nominal: np.ndarray) -> np.ndarray:
@@ -168,7 +168,7 @@ class ParameterSpace:
         return self._with_links(replace(d, **own), x)
 
     def _with_links(self, d: Dynamics, x: np.ndarray) -> Dynamics:
-        """Return d with the links and the payload that x (..., P) describes."""
+        """Return the dynamics `d` with the links and the payload that parameter vectors x (..., P) describe."""
         blocks, lead = set(self.blocks), x.shape[:-1]
         if "inertia_scale" in blocks:
             d = replace(d, inertia=self.robot.inertia * self.block(x, "inertia_scale")[..., None, None])

@@ -29,14 +29,16 @@ class PlannedWidths:
     """Expected 95 % interval widths from planned motions.
 
     Attributes:
-        space: the parameters to identify. information: (P, P), sum over all added motions, on the unit cube.
+        space: the parameters to identify. information: (P, P), summed information of all added motions, on the unit
+            cube.
 
     Args:
         robot, nominal: the arm, and the dynamics at which the identification will start.
         settings: settings of the identification; family=auto stands for the nominal arm's friction family.
         torque: kind of torque that will be recorded.
         noise: standard deviation of torque noise at COARSE_HZ (independent samples), relative to tau_max.
-        chosen: names of the parameters, such as "offset" or "offset[3]", that `score` considers; if empty, all.
+        chosen: names of the parameters, such as "offset" or "offset[3]", that `score` considers; an empty sequence
+            means all parameters.
 
     Raises:
         UserError: a name in `chosen` is not an estimated parameter.
@@ -84,7 +86,7 @@ class PlannedWidths:
         return TorqueResidual(self.space, planned, slowest=self._slowest)
 
     def of(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return the information (B, P, P) of B motions (B, T, n) rad, rad/s, rad/s^2 at times t (T,) s."""
+        """Return the information (B, P, P) of B motions q, dq, ddq (B, T, n), rad, rad/s, rad/s^2, at t (T,) s."""
         data = self._residual(t, (q, dq, ddq))
         j = data.jacobian(self._u) * np.broadcast_to(data.scale / self._noise, data.seen.shape).reshape(-1, 1)
         j = j.reshape(len(q), -1, j.shape[-1])
@@ -100,7 +102,7 @@ class PlannedWidths:
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Score each of B candidates for the next motion: minus the mean log interval width (B,) of chosen values."""
+        """Return minus the mean log interval width (B,) of the chosen values for B candidates for the next motion."""
         some = slice(None, None, 1 + len(t) // MOST_ROWS)
         information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
         return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)

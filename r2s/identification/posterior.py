@@ -38,14 +38,14 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     """Return draws about the fit u (P,) from a normal distribution with a cluster-robust covariance.
 
     Because errors within a block are correlated, the covariance is H^-1 (sum of s s^T + prior) H^-1, with the total
-    information H and a score s per block. A block's score is its part of the gradient (White, Econometrica 48(4),
-    1980; clusters: Liang and Zeger, Biometrika 73(1), 1986) minus the blocks' mean, which is not 0 at a bound. If
-    there are few blocks, the fit makes each block's residual too small; a factor from the block's share of the
-    information corrects the score (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). For few blocks,
-    Student's t widens the draws. If one block alone determines a direction, the scatter of the scores underestimates
-    the variance in this direction, so the covariance is at least that for independent rows. A bootstrap over blocks
-    would yield unrealistic tails if few blocks determine a value, because many bootstrap samples would lack these
-    blocks.
+    information H and a score s per block. A block's score is the block's contribution to the gradient (White,
+    Econometrica 48(4), 1980; clusters: Liang and Zeger, Biometrika 73(1), 1986) minus the mean contribution of all
+    blocks, which is not 0 at a bound. If there are few blocks, the fit makes each block's residual too small; a
+    factor from the block's share of the information corrects the score (CR2 of Bell and McCaffrey, Survey Methodology
+    28(2), 2002). For few blocks, Student's t widens the draws. If one block alone determines a direction, the scatter
+    of the scores underestimates the variance in this direction, so the covariance is at least that for independent
+    rows. A bootstrap over blocks would yield unrealistic tails if few blocks determine a value, because many
+    bootstrap samples would lack these blocks.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -87,7 +87,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _resolved(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return scale (P,), eigenvalues (P,) and axes (P, P) of matrix / (scale scale^T), which has a unit diagonal.
+    """Scale a matrix to unit diagonal; return scale (P,), eigenvalues (P,), axes (P, P) of matrix / (scale scale^T).
 
     Eigenvalues below the rounding error of the largest one are replaced by this error.
     """
@@ -97,9 +97,10 @@ def _resolved(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return information (K, P, P) and score (K, P) of K blocks of data, the prior's information (P, P), and an RMS.
+    """Return sums over each of K blocks of data rows, the prior's information (P, P), and the RMS of the data rows.
 
-    The RMS of the data's residuals is in standard deviations; the function replaces an RMS below 1 by 1.
+    For residuals r with Jacobian J, the sums are the information J^T J (K, P, P) and the score J^T r (K, P). The RMS
+    is in standard deviations; the function replaces an RMS below 1 by 1.
     """
     clusters, p = problem.clusters, len(u)
     count, square, seen, row = int(clusters.max()) + 1, 0.0, 0, 0
@@ -119,7 +120,7 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return a square root (P, P) of a covariance: in each direction the larger of root root^T and least least^T.
+    """Return a square root (P, P) of the covariance that is the larger of root root^T and least least^T by direction.
 
     Comparing single values would fail, because data can determine the sum of two values far better than each value.
     """
@@ -130,10 +131,10 @@ def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
 def inside_cube(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return `steps` (S, P) with values changed so that u + steps lies in the unit cube.
 
-    Values outside the cube are clipped. All other values are adapted to minimize the sum of squares with Hessian 2 h
-    (P, P). Without this adaptation, sums of correlated values would be biased, such as an offset plus an asymmetry at
-    its bound. The value farthest outside is clipped first, because the adaptation often moves correlated values into
-    the cube.
+    Values outside the cube are clipped. Values inside the cube are adapted to minimize the sum of squares with
+    Hessian 2 h (P, P). Without the adaptation of values inside the cube, sums of correlated values would be biased,
+    such as an offset plus an asymmetry at its bound. The value farthest outside is clipped first, because the
+    adaptation often moves correlated values into the cube.
     """
     steps = steps.copy()
     for step in steps:

@@ -31,7 +31,8 @@ def prediction_errors(
 
     The entry of summary.json contains the torque RMSE of each joint. For commanded torque, the entry also contains
     position_rmse_mrad from replays of `window_s` s, and ee_error_mm from `open_loop_error` for each of the HORIZONS
-    that is not longer than the trajectories. r2s evaluates a long recording in parts spread over its length.
+    that is shorter than the longest trajectory. Of a long recording, r2s evaluates parts spread over the whole
+    length.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}
@@ -52,7 +53,7 @@ def prediction_errors(
 
 
 def open_loop_error(robot: Robot, dynamics: Dynamics, recording: Recording, nthread: int) -> dict[str, float]:
-    """Return {horizon in s: mean distance in mm between simulated and recorded end effector at the horizon}."""
+    """Return {horizon in s: mean distance in mm between simulated and recorded end effector after this horizon}."""
     errors = {}
     for horizon in HORIZONS:
         if (windows := windows_or_none(recording, horizon, MAX_WINDOWS)) is None:

@@ -34,7 +34,7 @@ class ExtraResidual(Protocol):
     """Residual rows from sources other than the data: ramps, presliding replays, or prior knowledge (`Known`)."""
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
-        """Return the residual (C, K), K rows per candidate in x (C, P), in standard deviations."""
+        """Return the residual (C, K) in standard deviations: K values for each of the C candidates x (C, P)."""
         ...
 
 
@@ -113,7 +113,7 @@ class Problem:
 
     @property
     def is_fixed(self) -> np.ndarray:
-        """(P,) whether the method `fixed` set a value's prior, by equality, because stated priors may be narrower."""
+        """(P,) whether a value's prior equals that of the method `fixed`; priors of users may be even narrower."""
         return self.sigma == FIXED * self.space.width
 
     def fixed(self, at: np.ndarray) -> "Problem":
@@ -129,7 +129,7 @@ class Problem:
         return replace(self, sigma=np.where(own, self.sigma, np.maximum(self.sigma, usual)))
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with flat priors of the values `names`, because extra residuals contain their priors."""
+        """Return the problem with flat priors for the values `names`, whose priors are extra residuals."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
@@ -141,13 +141,16 @@ class Problem:
         return self.with_torque_data(self.torque_data.reweighted(self.space.from_unit(u), fitted=True))
 
     def reweighted(self, u: np.ndarray, fitted: bool) -> "Problem":
-        """Return the problem with replays and torque rows reweighted at u (P,); see `TorqueResidual.reweighted`."""
+        """Return the problem after reweighting its residuals at the unit-cube parameters u (P,).
+
+        See `TorqueResidual.reweighted`.
+        """
         x = self.space.from_unit(u)
         out = self.with_torque_data(self.torque_data.reweighted(x, fitted))
         return replace(out, data=self.data.reweighted(x, fitted)) if self.uses_replays else out
 
     def cost(self, u: np.ndarray) -> float:
-        """Return the sum of squares at u (P,)."""
+        """Return the sum of squares of all rows at the unit-cube parameters u (P,)."""
         return float((self.residual(u[None]) ** 2).sum())
 
     def prior_cost(self, u: np.ndarray) -> float:
@@ -155,7 +158,7 @@ class Problem:
         return float((self._prior(u[None]) ** 2).sum())
 
     def residual(self, u: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + B) at u (C, P), in standard deviations: data rows, then prior and extra rows."""
+        """Return residuals (C, R + B), in standard deviations, of u (C, P): data rows, then prior and extra rows."""
         return np.concatenate([self.data(self.space.from_unit(u)), self._prior(u)], axis=1)
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -215,7 +218,7 @@ def fits_torque(search: Search) -> bool:
 
 
 def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
-    """Fit a torque problem, reweighting between rounds; return u (P,) and the problem with the last weights."""
+    """Fit a torque problem in reweighted rounds; return the solution u (P,) and the problem with the last weights."""
     rounds = MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
 
     def solve(own: Problem, u: np.ndarray) -> np.ndarray:
@@ -225,13 +228,13 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 
 
 def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
-    """Fit torque from `start` (P,) in rounds, reweighting between rounds; return u (P,) and the last round's problem.
+    """Fit torque from `start` (P,) in reweighted rounds; return the last round's solution u (P,) and problem.
 
     If values are far outside of narrow priors, a fit to link-side torque has several minima. With the first weights,
-    from the nominal arm, a fit may keep cable torque near zero and distort friction. If `start` is nominal, a second
-    fit therefore begins with priors at least as wide as the scatter among arms and ends with the problem's priors.
-    r2s uses the second fit if it is more likely than the first and clearly lowers the error of a joint. Unmodeled
-    effects may also make the second fit more likely, but they hardly lower its error.
+    which come from the nominal arm, a fit may keep cable torque near zero and distort friction. If `start` is
+    nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
+    problem's priors. r2s uses the second fit if it is more likely than the first and clearly lowers the error of a
+    joint. Unmodeled effects may also make the second fit more likely, but hardly lower its error.
     """
     u, last = _rounds(problem, start, rounds, solve)
     wide = problem.with_usual_prior() if problem.at_link and np.array_equal(start, problem.start) else problem
@@ -244,7 +247,7 @@ def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solv
 
 
 def _rounds(problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
-    """Solve a problem in rounds from u (P,), reweighting between rounds; return the last solution and problem."""
+    """Solve a problem from u (P,) in reweighted rounds; return the last round's solution and problem."""
     for k in range(rounds):
         u = solve(problem, u)
         if k < rounds - 1:
@@ -256,8 +259,8 @@ def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray
     """Return whether u (P,) has a larger posterior density than v (P,), and a clearly smaller error in some joint.
 
     The two solutions u and v have different torque noise sigma. A joint's log likelihood is -N log sigma, with N
-    independent rows. A wrong model lengthens the correlation of errors, so N uses the shorter of the two solutions'
-    correlation times.
+    independent rows and torque noise sigma. A wrong model lengthens the correlation of errors, so the number of
+    independent rows follows from the shorter of the two solutions' correlation lengths.
     """
     (length, sigma), (longer, larger) = (
         p.torque_data.noise_at(p.space.from_unit(x)) for p, x in ((one, u), (other, v))
@@ -270,8 +273,9 @@ def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     """Return whether values v (P,) explain the torque clearly worse than values u (P,) that were fitted to torque.
 
-    Even if v is correct, its estimation error raises the sum of squares by about P, the number of values. The sum of
-    squares has the relative uncertainty ALIKE, because the number of independent rows is uncertain.
+    Even if the values v are correct, their estimation error raises the sum of squares by about P, the number of
+    values. The sum of squares has the relative uncertainty ALIKE, because the number of independent rows is
+    uncertain.
     """
     fitted = problem.on_torque.cost(u)
     rise = problem.on_torque.cost(v) - fitted
@@ -299,11 +303,12 @@ def search_lag(at: np.ndarray, search: Search, problem: Problem, start: np.ndarr
 
 
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
-    """Return whether the recording comes from a simulator with implicit friction, given u (P,) fitted to torque.
+    """Return whether the recording comes from a simulator with implicit friction, given a torque fit u (P,).
 
-    Implicit integration evaluates friction that rises with speed at the velocity half a step ahead; a physical arm
-    does not. The effect of implicit friction must exceed `significant` standard deviations and have about the
-    expected size: a rotor inertia missing in the model would have a similar, but a hundred times larger effect.
+    If friction rises with speed, implicit integration evaluates friction at the velocity half a step ahead; a
+    physical arm does not. The effect of implicit friction must exceed `significant` standard deviations and have
+    about the expected size: a rotor inertia missing in the model would have a similar, but a hundred times larger
+    effect.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]

@@ -29,7 +29,8 @@ class IdentificationResult:
     Attributes:
         space: the parameter space. found: estimated values and intervals of the parameters.
         history: one row for each step or generation of a search.
-        families: {friction family: error of held-out torque relative to the best family's}; {} if the user chose it.
+        families: {friction family: error of held-out torque relative to the best family's}; {} if the user chose the
+            family.
         null_directions: pairs (ratio, {name: component}) of parameter combinations whose ratio of posterior to prior
             sigma exceeds NULL_SHARE, largest ratio first.
         unseen: names of the parameters that r2s left at nominal values, because the data hardly determine them.

@@ -1,4 +1,4 @@
-"""Read the values that a user states for an arm: prior mean and width, or a fixed value, in SI units."""
+"""Read a user's values for an arm: prior mean and prior width, or a fixed value, in SI units."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +21,8 @@ TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to
 def check_stated(stated: Stated, n: int | None = None) -> None:
     """Raise UserError for an unknown parameter or key, a wrong value, or a fixed value with a mean or width.
 
-    A value is a number, null or a list of n numbers or nulls. n: number of joints; None: do not check list lengths.
+    A value is a number, null or a list of n numbers or nulls. n: number of joints; if None, the lengths of lists are
+    not checked.
     """
     check_parameters("identify.prior", stated)
     for name, entry in stated.items():
@@ -40,7 +41,7 @@ def check_stated(stated: Stated, n: int | None = None) -> None:
 
 
 def check_family(stated: Stated, name: str) -> None:
-    """Raise UserError if the user states a friction parameter that family `name` lacks or, for auto, might lack."""
+    """Raise UserError if the user gives a friction parameter that family `name` lacks or, for auto, might lack."""
     known = {own for f in known_families() for own in f.names}
     for parameter in stated:
         if parameter not in known or (name != "auto" and parameter in family(name).names):
@@ -67,7 +68,7 @@ def _check(where: str, value: Any, count: int | None, positive: bool) -> None:
 
 
 def _values(entry: Mapping[str, Any], key: str, count: int) -> np.ndarray:
-    """Return the values (count,) that the user states for `key`, such as "mean"; nan for joints without a value."""
+    """Return the user's values (count,) for `key`, such as "mean"; nan for joints without a value."""
     value = entry.get(key)
     parts = value if isinstance(value, list | tuple) else [value]
     return np.broadcast_to(np.array([np.nan if x is None else x for x in parts], dtype=float), count).copy()
@@ -89,10 +90,11 @@ def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
 
 
 def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the user's prior (mean and width) for values in `space`; None if the user states no mean and no width.
+    """Return the user's prior (mean and width) for values in `space`; None if the user gives no mean and no width.
 
-    If the user states only a mean, the width is from `prior`; if the user states only a width, the mean is nominal.
-    Widths are standard deviations in SI units; the width of a logarithmic parameter is divided by the mean.
+    If the user gives only a mean, the width is from `prior`; if the user gives only a width, the mean is nominal. The
+    user's widths are standard deviations in SI units; for a logarithmic parameter, the function divides the user's
+    width by the mean.
 
     Args:
         space: the searched parameters. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.

@@ -73,7 +73,7 @@ def search_space(
     """Return the parameter space of the friction family and of the terms that affect the recorded kind of torque.
 
     bounds: see `scaled_bounds`; friction parameters without an entry have their friction law's bounds, in SI units.
-    stated: the user's statements (stated.py), of which only fixed values are used here.
+    stated: the user's values (stated.py), of which the function uses only fixed values.
 
     Raises:
         UserError: a parameter of a term, or every parameter of the friction family, lacks bounds.
@@ -96,7 +96,7 @@ def search_space(
 def scaled_bounds(
     bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
 ) -> dict[str, Sequence[ArrayLike]]:
-    """Convert `bounds` to SI units; bounds of torque-like parameters are relative to the largest torque.
+    """Convert `bounds` to SI units: multiply the bounds of torque-like parameters by the largest torque.
 
     Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. For motor
     torque, the bounds of torque-like parameters therefore extend at least to the largest torque.
@@ -117,8 +117,8 @@ def scaled_prior(
     """Convert the standard deviations in `prior` to SI units, and omit flat priors (None).
 
     In `prior`, values for torque-like parameters are relative to the largest torque; values for logarithmic
-    parameters have no unit. Viscous friction in the arm's file is a guess, so its standard deviation is at least this
-    guess.
+    parameters have no unit. Viscous friction in the arm's file is a guess, so the standard deviation of viscous
+    friction is at least as large as this guess.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():
@@ -132,5 +132,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return the parameters' `sizes` for the larger of each joint's torque limit and largest recorded torque."""
+    """Return `sizes` for each joint's torque limit or, if larger, the joint's largest recorded torque."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

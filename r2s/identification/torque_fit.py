@@ -77,7 +77,7 @@ class Unexplained:
         return out
 
     def gravity_shares(self) -> np.ndarray | None:
-        """Return tau's gravity torque / nominal gravity torque, for joints whose motion determines it, or None."""
+        """Return ratios of tau's to nominal gravity torque, for joints whose motion determines them, else None."""
         inertial = self.inverse_dynamics(False)
         weight, shares = self.inverse_dynamics(True) - inertial, []
         for j in self.seen:

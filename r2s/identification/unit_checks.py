@@ -51,8 +51,8 @@ class Judged:
 
     Attributes:
         clock: (n,) ratio of the change of q to the integral of dq. scale: (n,) ratio of dq to the slope of q.
-        misfit: unexplained share of the squared torque. shares: (K,) tau's gravity torque / nominal gravity torque,
-            for K joints.
+        misfit: unexplained share of the squared torque. shares: (K,) ratio of tau's gravity torque to nominal gravity
+            torque, for K joints.
     """
 
     clock: np.ndarray
@@ -147,7 +147,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints that other joints' columns fit far better, and these columns, or None; pairs: misfits [j, k]."""
+    """Return joints that other joints' columns fit far better, and the columns; else None. pairs: misfit [j, k]."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():

@@ -25,8 +25,8 @@ class BoxRandomization(UniformRandomization):
         table, friction: ranges [least, most] of the friction coefficient at the work table and at the tip. mass (kg),
             stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`. size: (3,) m, edges of
             the box.
-        spread, yaw: m, degrees, largest deviation of the box from its nominal pose. point, normal: (3,) m and (3,),
-            point and normal of the table, see `table_frame`.
+        spread, yaw: m and degrees, largest deviation of the box from its nominal pose.
+        point, normal: point (3,) m and normal (3,) of the table; if None, see `table_frame`.
 
     Raises:
         UserError: a range is malformed, the box would tilt, or the robot has no tool.

@@ -48,7 +48,8 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill the empty buffer `replay` with the saved transitions; return the state, or None without a checkpoint.
 
-        Each transition returns to its row, so a resumed training draws the same batches as an uninterrupted training.
+        Each transition returns to its row of the buffer, so a resumed training draws the same batches as an
+        uninterrupted training.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.

@@ -1,8 +1,9 @@
 """Deep Deterministic Policy Gradient (Lillicrap et al. 2016, arXiv:1509.02971).
 
 Tests verify that the losses equal the losses of `torchrl.objectives.DDPGLoss` with target networks for actor and
-critic. r2s differs from Lillicrap et al.: the critic has LayerNorm instead of batch norm, and the exploration noise
-is white. Fujimoto et al. 2018 found white noise as good as the Ornstein-Uhlenbeck process of the DDPG paper.
+critic. r2s differs from Lillicrap et al.: the critic has LayerNorm instead of batch norm, and by default the
+exploration noise is white. Fujimoto et al. 2018 found white noise as good as the Ornstein-Uhlenbeck process of the
+DDPG paper.
 """
 
 from collections.abc import Mapping

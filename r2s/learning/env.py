@@ -84,7 +84,7 @@ class TaskEnv(EnvBase):
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights in an external training loop; progress: share of the budget used so far, 0 to 1.
+        """Set the reward weights for `progress`, the share (0 to 1) of its budget that an external loop has used.
 
         As in `train`, `Reward.adapt` adapts the weights to the mean reward terms since the last call.
         """
@@ -132,7 +132,8 @@ class TaskEnv(EnvBase):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Run one step, reset truncated episodes, and return the step and the initial state of the next step.
 
-        `EnvBase.step_and_maybe_reset` also checks and copies tensors, in a fifth of a step's time with 32 arms.
+        `EnvBase.step_and_maybe_reset` also checks and copies tensors, which takes a fifth of a step's time with 32
+        arms.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)

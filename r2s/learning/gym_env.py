@@ -64,8 +64,8 @@ class ArmVectorEnv(gym.vector.VectorEnv):
 
     Observations (num_envs, d) float32 are normalized and clipped to [-10, 10]. Actions (num_envs, a) are clipped to
     [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal in m. `info["reward_terms"]` (num_envs, k)
-    contains the unweighted terms of the reward, 0 for an arm that has just restarted. Each episode is truncated after
-    `task.steps` steps.
+    contains the unweighted terms of the reward, which are 0 for an arm that has just restarted. Each episode is
+    truncated after `task.steps` steps.
 
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
@@ -105,7 +105,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.observation_space, self.action_space = (gym.vector.utils.batch_space(s, num_envs) for s in spaces)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights; progress: share of the budget used so far, 0 to 1; see `TaskEnv.set_progress`."""
+        """Set reward weights for `progress`, the used share (0 to 1) of the budget; see `TaskEnv.set_progress`."""
         self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
@@ -117,7 +117,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes of all arms, or of the arms that `options["reset_mask"]` (num_envs,) bool selects.
 
-        seed: number (arm i gets seed + i), or list of one seed per arm; None: the random generators continue.
+        seed: a number, so that arm i has `seed` + i, or one seed per arm. If None, the random generators continue.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:

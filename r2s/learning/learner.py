@@ -32,8 +32,9 @@ class Learner(nn.Module, ABC):
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
             critics hardly distinguish actions, `action_l2` favors small actions over full torque of alternating sign.
         explore_correlation: correlation of an arm's exploration noise between successive steps; 0 means white noise.
-            The noise is a first-order process of constant variance. Correlated noise moves an arm as far as white
-            noise with less acceleration (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is All You Need).
+            Exploration noise is a first-order process of constant variance. Correlated noise moves an arm as far as
+            white noise does, but with less acceleration (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is
+            All You Need).
 
     Raises:
         UserError: a setting has the wrong type or is out of range.
@@ -248,7 +249,8 @@ class EntropyLearner(Learner):
 
     Args:
         scale, action_scale, critics, shared: see `Learner`.
-        alpha_init: initial temperature. target_entropy: desired entropy of the policy; None: -(size of an action).
+        alpha_init: initial temperature. target_entropy: desired entropy of the policy; if None, minus the number of
+            values in an action.
     """
 
     entropy_goal: Tensor
@@ -274,7 +276,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Add n log(share) to the target entropy, as if `share` scaled the n standard deviations of a Gaussian."""
+        """Add n log(share) to the target entropy: the entropy change of a Gaussian in R^n scaled by `share`."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 

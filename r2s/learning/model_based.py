@@ -1,6 +1,7 @@
 """Model-based baselines: minimum-jerk joint motion, computed torque, friction compensation.
 
-A baseline has the interface, observations and rate of a policy. Its model is the center of the domain randomization.
+A baseline has the interface, observations and rate of a policy. A baseline's model of the arm is the center of the
+domain randomization.
 """
 
 import mujoco
@@ -46,7 +47,7 @@ class Oracle:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d); an effort of 0 marks a new episode."""
+        """Return actions (B, n) in [-1, 1] for observations (B, d); an arm with zero effort starts a new motion."""
         rows, n = observation.numpy().astype(np.float64), self.robot.n
         out = np.empty((len(rows), n))
         for i, row in enumerate(rows):
@@ -126,7 +127,8 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     """Return the baseline `algo=hybrid_force`: zero actions under control=hybrid.
 
-    With zero actions, the controller exerts force f on the surface in open loop: J^T f plus modeled friction torque.
+    With zero actions, the controller exerts the requested force f on the surface in open loop, by the torque J^T f
+    plus the modeled friction torque.
 
     Raises:
         UserError: the controller is not control=hybrid, or the task has no contact.

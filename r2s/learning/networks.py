@@ -56,8 +56,8 @@ class Policy(nn.Module):
     """A deterministic policy: observation (B, d) -> action (B, a), both in SI units.
 
     Args:
-        normalizer, actor: networks. scale, offset: (a,), convert actions from [-1, 1] to SI units, offset + scale x
-            action, as in `r2s.control.controller.Controller`; an offset of None means 0.
+        normalizer, actor: networks. scale, offset: (a,); offset + scale x action converts an action in [-1, 1] to SI
+            units, as in `r2s.control.controller.Controller`. If None, the offset is 0.
     """
 
     action_scale: Tensor

@@ -2,9 +2,10 @@
 
 The pusher's model is quasi-static and independent of the box's mass and friction. In this model, a frictionless push
 at a face point p along the inward normal n by a length s moves the box by s n / (1 + h^2) and turns it by
-s h / (r (1 + h^2)), where h = (p x n) / r (limit surface of r2s/physics/sliding.py). The pusher divides the errors of
-position and yaw by their tolerances. In every control period, the pusher selects the face point whose best push
-reduces the error fastest, including the time of the tip's travel to the face point.
+s h / (r (1 + h^2)), where h = (p x n) / r, and r is the ratio of friction moment to force (limit surface of
+r2s/physics/sliding.py). The pusher divides the errors of position and yaw by their tolerances. In every control
+period, the pusher selects the face point whose best push reduces the error fastest. The time of a push includes the
+tip's travel to the face point.
 """
 
 import numpy as np

@@ -40,7 +40,7 @@ class UniformRandomization:
         robot: the arm.
         center: dynamics at the center of the ranges, without a batch dimension.
         phi_relative, inertia_relative: half widths of the ranges, relative to the center; 0: no variation.
-        payload: [least, most] kg, range of each arm's payload, see `with_payloads`; None: no payload.
+        payload: [least, most] kg, range of each arm's payload, see `with_payloads`; if None, arms carry no payload.
 
     Raises:
         UserError: a half width is outside [0, 1), or the payload is not allowed.
@@ -78,7 +78,7 @@ class UniformRandomization:
 
 @dataclass(frozen=True)
 class PosteriorRandomization:
-    """Draw dynamics from an identification's posterior: a random row of `samples` (S, P) in `space` per arm.
+    """Draw the dynamics of each arm from a posterior: a random row of its `samples` (S, P) in `space`.
 
     Drawing whole rows preserves correlations. Every row is physically valid: tensor scales are positive, and the full
     inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
@@ -151,14 +151,16 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
 class ContactRandomization(UniformRandomization):
     """Draw arms as `UniformRandomization` does, and for each arm a random surface near a nominal plane.
 
-    The exponent is randomly one end of its range. Stiffness is log-uniform; damping, friction and bristle are
-    uniform. U(-place, place) shifts the plane along its normal, U(0, tilt) tilts the plane about a random axis.
+    The exponent is at random the lower or the upper end of its range. Stiffness is log-uniform; damping, friction and
+    bristle are uniform. The plane is shifted along its normal by U(-place, place), and tilted about a random axis by
+    U(0, tilt).
 
     Attributes:
-        point, normal: (3,) m and (3,), of the nominal plane; None: a work table below the tip in home posture.
+        point, normal: point (3,) m and normal (3,) of the nominal plane; if None, those of a work table below the tip
+            in home posture.
         stiffness (N/m), exponent, damping (s/m), friction, bristle (m): ranges [least, most], see `Surface`.
         place: m, largest displacement of the plane along its normal. tilt: degrees, largest tilt of the plane.
-        surface: run folder of an identified surface, whose posterior replaces the ranges; None: use the ranges.
+        surface: run folder of an identified surface, whose posterior replaces the ranges; if None, the ranges apply.
 
     Raises:
         UserError: a range is malformed or contains values that a surface cannot have, or the robot has no tool.
@@ -177,7 +179,7 @@ class ContactRandomization(UniformRandomization):
 
     @cached_property
     def _identified(self) -> Surface | None:
-        """All posterior draws of the identified surface, as a `Surface` with a batch axis; None without `surface`."""
+        """All posterior draws of the identified surface, as a batch of surfaces; None without `surface`."""
         if not self.surface:
             return None
         draws = load_contact(self.surface, "dr.surface").simulated.draws
@@ -245,10 +247,11 @@ def check_payload(payload: Sequence[float] | None, robot: Robot) -> None:
 def with_payloads(
     robot: Robot, dynamics: Dynamics, payload: Sequence[float] | None, rng: np.random.Generator, m: int
 ) -> Dynamics:
-    """Return the dynamics of m arms, each with a random payload of [least, most] kg; payload=None: no payload.
+    """Return the dynamics of m arms, each with a random payload of [least, most] kg, or unchanged if payload=None.
 
     The mass of a payload is uniform. The center of mass is uniform in a ball about the end effector, with half the
-    radius that `payload_max` allows. The tensor describes a ball of water. Gravity compensation ignores the payload.
+    radius that `payload_max` allows. The inertia tensor is that of a ball of water. Gravity compensation ignores the
+    payload.
     """
     if payload is None:
         return dynamics
@@ -260,6 +263,6 @@ def with_payloads(
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:
-    """Return (...) bool, whether each tensor (..., 3, 3) is positive definite and obeys the triangle inequality."""
+    """Return whether each tensor (..., 3, 3) is positive definite and obeys the triangle inequality, (...) bool."""
     moments = np.linalg.eigvalsh(tensor)
     return (moments[..., 0] > 0) & (moments[..., 0] + moments[..., 1] >= moments[..., 2])

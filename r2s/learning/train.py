@@ -145,9 +145,10 @@ def train(
         algo: a learner, for example r2s.learning.tqc.TQC.
         evaluate: function that runs a policy and returns `Episodes`, see r2s/learning/evaluate.py.
         loop, budget: settings of the training loop, and length of the training.
-        demonstrator: source of the actions in the first loop.learning_starts env steps; None: uniform random actions.
+        demonstrator: source of the actions in the first loop.learning_starts env steps; if None, the actions are
+            uniformly random.
         checkpoint: saves the training after every evaluation but the last. A training with a saved checkpoint resumes
-            from the checkpoint. None: no saving.
+            from the checkpoint. If None, the training is not saved.
         callbacks: functions that receive logs and progress.
 
     Raises:
@@ -183,7 +184,8 @@ class Training:
     """State of a training: arms, learner, replay buffer and counters; for the arguments, see `train`.
 
     Attributes:
-        env_steps, updates: numbers so far. next_eval: number of env steps from which the next evaluation is due.
+        env_steps, updates: numbers of env steps and updates so far. next_eval: number of env steps from which
+            the next evaluation is due.
         factor: last result of `Reward.adapt`, initially `Reward.factor`. evaluation: last row of evaluations.csv.
     """
 

@@ -29,7 +29,7 @@ class VectorArms:
         robot, task: the arm, and the task with its controller.
         dynamics: dynamics of `width` arms, or of one arm for all arms.
         nthread: number of threads; 0: all cores.
-        soft_start_s: s, time after the start of an episode in which the torque fades in from 0.
+        soft_start_s: s, time for which the torque fades in from 0 at the start of an episode.
         seed: seed of the sensor noise; the noise restarts when `place` resets all arms.
     """
 
@@ -75,7 +75,7 @@ class VectorArms:
         self.sim.push(tau)
 
     def place(self, starts: np.ndarray, first: int = 0, ids: np.ndarray | None = None) -> State:
-        """Reset the arms `ids` (None: all) to rest at angles `starts` (m, n) rad; return the state of all arms."""
+        """Reset the arms `ids` (default: all) to rest at angles `starts` (m, n) rad; return the state of all arms."""
         self.sim.reset(starts, np.zeros_like(starts), ids)
         at = slice(None) if ids is None else ids
         self._steps[at], self._limited[at] = 0, 0.0
@@ -140,7 +140,7 @@ class VectorArms:
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:
-    """Raise FloatingPointError that names arm and step, `steps` (m,), unless all `rows` (m, k) are finite."""
+    """Raise FloatingPointError with an arm and its step in `steps` (m,) unless all `rows` (m, k) are finite."""
     finite = np.isfinite(rows)
     if not finite.all():
         arm = int((~finite.all(-1)).argmax())

@@ -24,7 +24,7 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
 
     Args:
         target: Nm, target torque. filtered, effort: Nm, low-pass state and effort of the previous cycle.
-        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: length of soft start, cycles.
+        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: cycles of the soft start.
         tau_max: Nm, largest effort. step_max: Nm, largest change of the effort per cycle.
     """
     faded = target
@@ -101,8 +101,9 @@ SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    If a command arrives within a step, the previous command acts first. Motor torque m lags command u by dm/dt = (u -
-    m) / lag. From m(0) = m0, the mean of m over s steps is u + (m0 - u) (1 - exp(-s / lag)) lag / s.
+    If a command takes effect within a step, the previous command acts until then. The motor torque m follows the
+    command u: dm/dt = (u - m) / lag. If m is m0 at first, its mean over s steps is u + (m0 - u) (1 - exp(-s / lag))
+    lag / s.
 
     Args:
         line: (SLOTS, n) Nm, recent commands; row k % SLOTS is the command of cycle k. motor: (n,) Nm, motor torques.
@@ -123,7 +124,7 @@ def motor_torque(line, motor, cycle, delay, lag, out):
 
 @njit(cache=True)
 def delayed(tau, delay, lag, steps, line, motor, cycle, out):
-    """Write the motors' mean torques in each step into `out`; delay, lag: delay and lag of the motors, in steps."""
+    """Write the motors' mean torques in each step into `out`; delay and lag are in steps, as in `motor_torque`."""
     for i in range(tau.shape[0]):
         for k in range(steps):
             line[i, cycle[i] % SLOTS] = tau[i, k]
@@ -140,8 +141,8 @@ def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.n
 class Motors:
     """Convert the commands of m simulated arms to joint torques, by a pure delay and then a first-order lag.
 
-    Delay and lag act in continuous time, as on an arm. The simulation responds half a step too early (EARLY), so this
-    class adds half a step of delay.
+    Delay and lag act in continuous time, as on an arm. The simulation responds half a step too early (EARLY), so
+    `Motors` adds half a step of delay.
     """
 
     def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):
@@ -151,7 +152,7 @@ class Motors:
         self.set(delay, lag)
 
     def set(self, delay: np.ndarray | float, lag: np.ndarray | float, ids: np.ndarray | None = None) -> None:
-        """Set delay and lag, s, of the arms `ids` (all by default); delay, lag: a scalar, or (m,) for m arms."""
+        """Set delay and lag, s, of the m arms `ids` (all by default); each is one value, or an array (m,)."""
         at = slice(None) if ids is None else ids
         self._delay[at], self._lag[at] = steps_late(delay, lag)
 

@@ -26,7 +26,7 @@ class TableFrame:
     """Coordinate frame on a table, at the nominal position of a box.
 
     Attributes:
-        origin: (3,) m, in the base frame. axes: (3, 3), rows: unit vectors ahead (away from the base), left, up.
+        origin: (3,) m, in the base frame. axes: (3, 3), whose rows point ahead (away from the base), left and up.
     """
 
     origin: np.ndarray
@@ -61,7 +61,10 @@ class TableFrame:
 
 
 def table_frame(robot: Robot, point: Any = None, normal: Any = None) -> TableFrame:
-    """Return a table's frame at `point` (3,) m with `normal` (3,); point=None: below and ahead of the tip at home."""
+    """Return the frame of a table at `point` (3,) m with `normal` (3,).
+
+    If `point` is None, the frame is below and ahead of the tip at home. If `normal` is None, the table is horizontal.
+    """
     place, up = nominal_plane(robot, point, normal)
     across = place - (place @ up) * up
     size = float(np.linalg.norm(across))
@@ -86,7 +89,7 @@ def standing_box(frame: TableFrame, planar: np.ndarray, size: Any, **law: Any) -
 
 
 def check_size(name: str, size: Any, table: float) -> np.ndarray:
-    """Return a box's edges (3,) m; raise UserError if a push at PUSHED_AT times the height would tilt the box.
+    """Return a box's edges (3,) m; raise UserError for invalid edges, or if a push at PUSHED_AT would tilt the box.
 
     A push must overcome the table friction mu m g, so a push at height h tilts a box with half edge a if mu h > a.
     """

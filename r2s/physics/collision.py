@@ -1,12 +1,14 @@
-"""Compiled collision check of many arms: each arm with itself and the table.
+"""Check many arms for collisions in compiled code: each arm with itself and the table.
 
 r2s checks the geoms of the robot's file, except planes and height fields. If the file enables collision only for some
 geoms, r2s checks only these geoms. Convex hulls replace meshes, as in MuJoCo, and bounding spheres replace signed
 distance fields. The check omits some pairs:
 
-- The check ignores the table for a geom of constant height, which no joint or only vertical joint axes move.
-- The check omits pairs of geoms of neighboring links, which touch at their joint, and pairs closer than HOUSING_M at
-  q_home: geoms of one joint's housing can have links two joints apart, as in the Panda's shoulder.
+- The check omits the table for a geom of constant height: either no joint moves the geom, or only joints with
+  vertical axes do.
+- The check omits two geoms of neighboring links, because neighboring links touch at their joint.
+- The check omits two geoms closer than HOUSING_M at q_home, because one joint's housing can contain geoms of two
+  links that are two joints apart, as in the Panda's shoulder.
 """
 
 from collections.abc import Collection
@@ -35,8 +37,7 @@ class CollisionPairs:
     """Pairs of geoms whose distance the collision check computes.
 
     Attributes:
-        above: ids of geoms to check with the table. pairs: pairs of ids, beginning with pairs that contain an
-            obstacle.
+        above: ids of the geoms to check with the table. pairs: pairs of geom ids; pairs with an obstacle come first.
         link: (ngeom,) number of each geom's link, from 1; 0: the base.
     """
 
@@ -50,7 +51,7 @@ def collision_pairs(
 ) -> CollisionPairs:
     """Return the pairs of geoms to check; table: whether to check for collisions with the table.
 
-    may_touch: pairs that the check omits, each of two body names or of a body name and "table".
+    may_touch: pairs that the check omits; a pair contains two body names, or a body name and "table".
     """
     link = np.searchsorted(model.jnt_bodyid, model.body_weldid[model.geom_bodyid], side="right")
     box = np.array([model.geom(g).name.startswith(PREFIX) for g in range(model.ngeom)], dtype=bool)
@@ -87,7 +88,10 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Bodies (G, WIDTH), hull vertices (V, 3) m, bodies above the table (A,), body pairs (P, 2), table height m."""
+    """Bodies (G, WIDTH), vertices (V, 3) m of their hulls, and the height of the table, m.
+
+    above: (A,), indices of bodies to check with the table. pairs: (P, 2), indices of bodies to check with each other.
+    """
 
     bodies: np.ndarray
     vertices: np.ndarray
@@ -105,9 +109,9 @@ class CollisionCheck:
 
     Args:
         robot: the arm, whose file contains the geoms.
-        table: m, height of the table in the base frame; -inf: no table. table=None: a table at TABLE_M, or no table
-            if the arm reaches below TABLE_M at q_home, as a hanging arm does.
-        may_touch: pairs that the check omits, each of two body names or of a body name and "table".
+        table: m, height of the table in the base frame; -inf: no table. If None, the height is TABLE_M, but an arm
+            that reaches below TABLE_M at q_home, as a hanging arm does, has no table.
+        may_touch: pairs that the check omits; a pair contains two body names, or a body name and "table".
 
     Raises:
         UserError: a checked pair touches at q_home.
@@ -232,7 +236,7 @@ def body_poses(links, bodies, q, frames, poses):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
-    """Return the distance, m, of pair k, or a lower bound that exceeds `enough` m; work: (10, 3), scratch array."""
+    """Return the distance, m, of pair k, or a lower bound of it above `enough` m; work: (10, 3), scratch array."""
     bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]

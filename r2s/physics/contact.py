@@ -1,21 +1,22 @@
 """Solve a 1 ms step of a tip's contact with a surface, by a method implicit in stiffness, damping and friction.
 
-The normal force is the mean of Hunt and Crossley's force (surface.py) over the step. The mean of K d^e from depth d0
-to depth d1 is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of the potential V of K d^e (Gonzalez, J. Nonlinear
-Science 6, 1996). A discrete gradient conserves the energy of a bounce at any stiffness, even if contact begins or
-ends within the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older than positions. With
-the penetration rates rate before and rate1 after the step, d0 = d - h rate / 2 and d1 = d0 + h (rate + rate1) / 2.
+The normal force is the mean of Hunt and Crossley's force (surface.py) over the step. The mean of the elastic force, K
+d^e, from depth d0 to depth d1 is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of the force's potential V
+(Gonzalez, J. Nonlinear Science 6, 1996). A discrete gradient conserves the energy of a bounce at any stiffness, even
+if contact begins or ends within the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older
+than positions. At the depth d, and with the penetration rates `rate` before and `rate1` after the step, d0 is
+therefore d - h rate / 2, and d1 is d0 + h (rate + rate1) / 2.
 
 The stiffness of tangential bristles is proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
-1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with z_s = `bristle`. The friction
--mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest point; a sliding tip has the
-friction mu F.
+1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with the sliding velocity v and z_s
+= `bristle`. The friction -mu F (z + MICRO_DAMPING exp(-(|v| / SLIP)^2) dz/dt) / z_s acts at the sphere's deepest
+point. While the tip slides steadily, the magnitude of friction is mu F.
 
-The unknowns of a contact step are the joint velocities at its end. Normal force and friction are linearized about a
-guess of the unknowns: the constant part adds to the driving torque, the linear part adds to the mass matrix.
-stick_slip.py solves stiction together with contact, so contact can move a resting joint. `start_guess` writes the
-first guess. `add_contact`, `coming_velocity` and `next_guess` repeat until the guess is accurate, usually in one
-round. `finish_contact` ends the step.
+The unknowns of a contact step are the joint velocities at the step's end. `add_contact` linearizes normal force and
+friction about a guess of the unknowns, and adds the constant term to the driving torque and the linear term to the
+mass matrix. stick_slip.py solves stiction together with contact, so contact can move a resting joint. `start_guess`
+writes the first guess. `contact_velocity` repeats `add_contact`, `coming_velocity` and `next_guess` until the guess
+is accurate, usually once. `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -76,7 +77,7 @@ SHORT = 1e-6  # ratio |d1 - d0| / depth below which V(d1) - V(d0) is round-off; 
 def mean_force(contact, begin, rate, coming, h):
     """Return a step's mean normal force, N, and its derivative with respect to `coming`, N s/m.
 
-    begin: m, depth at the step's beginning. rate, coming: m/s, penetration rates at the step's beginning and end.
+    begin: m, penetration depth at the step's beginning. rate, coming: m/s, penetration rates at beginning and end.
     """
     middle = 0.5 * (rate + coming)
     span = h * middle
@@ -132,7 +133,7 @@ def _from_box(contact, x, y, z):
 
 @njit(cache=True, error_model="numpy")
 def near(contact, place, anchor, axis, dq, h, jacobian):
-    """Write a tip's penetration depth and Jacobian (ROWS, n); return whether the tip may touch the surface.
+    """Write a tip's depth and Jacobian (ROWS, n); return whether the tip may touch the surface in this step.
 
     Call `near` only once per step: if the tip cannot touch the box, `near` also moves a sliding box by one step.
 
@@ -218,7 +219,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Return penetration rate and sliding speed, m/s, on a box that moves at `point` (3,) m/s; update `slide`."""
+    """Return penetration rate and sliding speed, m/s, on a box with velocity `point` (3,) m/s; update `slide`."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]
@@ -267,7 +268,7 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
-    """Add the contact with a movable box; held: N, normal and negated tangential force (3) at fixed box velocity."""
+    """Add a movable box's contact force; held: N, normal and negated tangential force (3) at fixed box velocity."""
     n, at = contact[NORMAL : NORMAL + 3], np.empty(3)
     for k in range(3):
         at[k] = held[0] * n[k] - held[1 + k]
@@ -322,7 +323,10 @@ def finish_contact(contact, h, guess):
 
 @njit(cache=True, error_model="numpy")
 def _deflect(contact, slide, speed, h, terms):
-    """Write contact force and new deflection; slide: (3,) m/s, velocity. terms: force N, spring N/m, damper N s/m."""
+    """Write the contact force, and the bristle deflection after h s at the sliding velocity `slide` (3,) m/s.
+
+    speed: m/s, magnitude of `slide` or its guess. terms: normal force N, spring constant N/m and damping N s/m.
+    """
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0
     z = contact[DEFLECTION : DEFLECTION + 3]

@@ -1,15 +1,18 @@
 """Stop an arm whose tip presses on a surface: hold the contact force, release the tip, or retreat.
 
-Without a command, the elastic energy F^2 / 2k of a surface with stiffness k would push the tip off by up to F / k, or
-joint friction would sustain a contact force of up to `hidden` (push_limit.py). The driver therefore has three stops:
+If a stop only removed the command, the contact force F would push the tip off a surface of stiffness k by up to F /
+k, with the elastic energy F^2 / 2k, or joint friction would sustain a contact force of up to `hidden`
+(push_limit.py). The driver therefore has three kinds of stop:
 
-- hold: the target torque is J^T R, where R is the push limit's estimate of the initial contact force. The arm rests.
+- hold: the arm rests with the target torque J^T R; J is the tip's Jacobian, and R is the push limit's estimate of the
+  contact force at the stop's start.
 - release: the tip moves outward at the speed LEAVE until the contact force F vanishes. A velocity loop tracks the
-  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T. The feedforward contains the present R and the force h of
-  modeled joint friction at the tip; for an arm with more friction, an integral adds at most h. On a tip that moves
-  outward, joint friction exerts the inward force h, so R = F - h. The release ends when R falls to RELEASED - SLIDES
-  h. If true friction is at most h, the remaining contact force is at most RELEASED + (1 - SLIDES) h; if true friction
-  is SLIDES h, at most RELEASED.
+  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T, with the mass matrix M and the tip's effective mass m.
+  The feedforward contains the present estimate R and the modeled joint friction, which is a force h at the tip. For
+  an arm with more friction, an integral adds at most h. On a tip that moves outward, joint friction exerts the inward
+  force h, so the estimate R is F - h. The release ends when R falls to RELEASED - SLIDES h. The remaining contact
+  force is at most RELEASED if the true friction is at most SLIDES h, and at most RELEASED + (1 - SLIDES) h if the
+  true friction is at most h.
 - retreat: the arm releases the tip, then moves the tip RETREAT_M farther outward.
 
 Every stop obeys the limits of push, speed and acceleration, and every outward motion ends after LEAVES_S.
@@ -38,7 +41,7 @@ def stop_torque(limit, arm, kinematics, friction, limits, held, target):
 
     Args:
         limit, arm, kinematics, friction: see `push_bound`. limits: see `filter_limits`.
-        held: (n,) Nm, adapter torque that holds a load; `stop_torque` subtracts the load's force from R.
+        held: (n,) Nm, adapter torque that holds a load; `stop_torque` subtracts the load's force from the estimate R.
     """
     n = len(target)
     root, row, lever, ddq = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

@@ -9,8 +9,8 @@ A control law is a compiled function `law(q, dq, command, parameters, memory, ou
     out: (n,) Nm, target torque that the law computes, without gravity.
 
 Training runs a control law in MuJoCo's callback (mujoco_callback.py), and every arm runs the same law in the driver
-(r2s/arm/driver.py) or in an exported bundle. The package r2s/control selects the control law and its parameters.
-Control laws share the folder r2s/physics with MuJoCo's callback, because numba caches compiled code per folder.
+(r2s/arm/driver.py) or in an exported bundle. The package r2s/control selects the control law and its parameters. The
+control laws are in r2s/physics, the folder of MuJoCo's callback, because numba caches compiled code per folder.
 """
 
 from collections.abc import Callable
@@ -75,7 +75,7 @@ BUILT_IN = (torque_law, computed_torque_law, joint_impedance_law, cartesian_impe
 
 
 def law_number(law: Callable) -> int:
-    """Return the number by which `control_law` calls a law; a user's law is compiled first, once per process."""
+    """Return the number by which `control_law` calls a law; compile a user's law first, once per process."""
     return BUILT_IN.index(law) if law in BUILT_IN else control_address(law)
 
 

@@ -54,7 +54,7 @@ def support_point(body, vertices, pose, dx, dy, dz):
 
 @njit(cache=True, error_model="numpy")
 def separation(enough, a, pose_a, b, pose_b, vertices, work):
-    """Return the distance, m, of two bodies (0 or less: overlap) or, above `enough` m, a lower bound of it."""
+    """Return the distance, m, of two bodies, 0 or less if they overlap, or a lower bound of it above `enough` m."""
     around = a[RADIUS] + b[RADIUS]
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return np.sqrt(_segments(a, pose_a, b, pose_b)) - around
@@ -100,8 +100,8 @@ def _segments(a, p, b, r):
 def _nearest(s, count, t):
     """Return the simplex point x, y, z nearest to the origin, and the number of corners that span this point.
 
-    The number of corners is 4 if the origin is inside the simplex. s: (4, 3) m, array of `count` corners; `_nearest`
-    moves spanning corners to the front. t: scratch.
+    The number of corners is 4 if the origin is inside the simplex. s: (4, 3) m, contains the simplex corners in
+    `count` rows; `_nearest` moves the spanning corners to the front. t: scratch.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1

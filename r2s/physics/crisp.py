@@ -1,8 +1,8 @@
 """Export friction parameters to a YAML file for crisp_controllers (ROS 2), in the form of the paper's eq. (5).
 
 crisp_controllers (github.com/utiasDSL/crisp_controllers) adds fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
-fp3)) to each joint's torque. r2s fits fp1, fp2, fp3 to an arm's friction; a sigmoid without viscous term needs no
-fit.
+fp3)) to each joint's torque. r2s fits fp1, fp2 and fp3 to an arm's friction; the sigmoid law without viscous friction
+has the same form and needs no fit.
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
 
 
 def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Fit `sigmoid_law` to an arm's friction up to dq_max; return its parameters (n, 3) and RMS errors (n,) Nm."""
+    """Fit `sigmoid_law` to an arm's friction up to dq_max; return the parameters (n, 3) and RMS errors (n,) Nm."""
     share = np.geomspace(SLOWEST, 1.0, SPEEDS)
     dq = np.concatenate([-share[::-1], share])[:, None] * robot.dq_max
     true = dynamics.friction(dq, np.sign(dq))

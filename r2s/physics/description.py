@@ -1,6 +1,6 @@
 """Write an arm as MJCF, URDF or SDF, with the same links, limits and friction.
 
-Masses, centers of mass, inertia tensors, rotor inertias and friction come from `dynamics`, all other values from
+Masses, centers of mass, inertia tensors, rotor inertias and friction come from `dynamics`; all other values come from
 `robot`. In the URDF and SDF files, a link's frame is the joint's frame at angle zero, so inertia tensors need no
 rotated inertial frame. Ignition-physics 5.1 of Gazebo Fortress misreads rotated inertial frames.
 """
@@ -221,7 +221,8 @@ def write_world(
 
     The physics step is 1 ms; simulated time runs as fast as possible. The world has no gravity (libfranka's
     convention), no limits of velocity or torque (r2s enforces both), and no friction (r2s applies friction torque).
-    SDF has no rotors: the joint damping armature / 1 ms replaces them, and r2s/engines cancels the damping torque.
+    Because SDF has no rotors, a joint damping of armature / 1 ms replaces armature, and r2s/engines cancels the
+    damping torque.
 
     Args:
         path: file to write. robot, dynamics: the arm. plugin: the world's plugin element. version: SDF version.
@@ -280,7 +281,7 @@ def _polynomial(coefficients: np.ndarray) -> str:
 
 
 def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
-    """Raise UserError for a joint with nonlinear damping or spring and, if springs=False, a joint with any spring."""
+    """Raise UserError if a joint has nonlinear damping or a nonlinear spring or, with springs=False, any spring."""
     for link in links:
         nonlinear = link.damping[1:].any() or link.stiffness[1:].any()
         if nonlinear or (link.stiffness.any() and not springs):

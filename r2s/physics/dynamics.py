@@ -77,7 +77,7 @@ class Dynamics:
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
-        """Return dynamics with nominal links and rotors, friction parameters phi (..., n, K), and otherwise zeros."""
+        """Return dynamics with nominal links, nominal rotors and friction phi (..., n, K); all other arrays are 0."""
         n = robot.n
         return Dynamics(
             phi=phi,
@@ -110,7 +110,7 @@ class Dynamics:
 
     @property
     def level(self) -> np.ndarray:
-        """(..., n) Nm, the smaller of the friction magnitudes at 1 rad/s and -1 rad/s."""
+        """Friction level (..., n) Nm: the smaller of the friction magnitudes at 1 rad/s and -1 rad/s."""
         n = self.phi.shape[-2]
         return np.minimum(self.friction(np.full(n, 1.0)), -self.friction(np.full(n, -1.0))).clip(0.0)
 
@@ -143,10 +143,11 @@ def nominal_dynamics(
 ) -> Dynamics:
     """Return the dynamics that `conf/friction` and `conf/inertia` describe; a scalar value applies to all joints.
 
-    phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). With phi1=None, frictionloss and damping in
-    the robot's file are Coulomb and viscous friction; for a joint without frictionloss and damping, phi1 is PHI1
-    tau_max. family="auto" keeps the sigmoid law or, with friction from the file, the Coulomb law; any other family
-    gets the same friction at 1 rad/s. A breakaway torque of None means the file's frictionloss.
+    phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). If phi1 is None, Coulomb and viscous friction
+    are frictionloss and damping in the robot's file; for a joint without frictionloss and damping, phi1 is PHI1 times
+    tau_max. family="auto" selects the sigmoid law or, if the friction comes from the file, the Coulomb law; any other
+    family receives parameters with the same friction at 1 rad/s. If a breakaway torque is None, its magnitude is the
+    file's frictionloss.
 
     Raises:
         UserError: a list has the wrong length, or a value is out of its physical range.
@@ -189,6 +190,6 @@ def nominal_dynamics(
 
 
 def with_family(dynamics: Dynamics, name: str) -> Dynamics:
-    """Return the dynamics with the friction family `name` and the same friction at 1 rad/s."""
+    """Return the dynamics with the friction family `name`; friction at 1 rad/s stays the same."""
     named = friction_family(name)
     return replace(dynamics, family=named, phi=named.matched_to(dynamics.family, dynamics.phi))

@@ -1,10 +1,11 @@
 """Stop an arm in the driver before it touches itself or the table; the compiled check takes microseconds.
 
 The fence predicts the posture in which the arm would rest if it braked now. In the predicted posture, the bodies of
-each pair of `CollisionCheck` must be at least FENCE_M apart. At full speed, the required distance is FENCE_M (1 +
-SPREAD), because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within BRAKE_S, and
-joints lag the ramp by LAG_S. A joint at a smaller share of its allowed speed than the fastest joint begins to brake
-when the ramp has fallen to its share. The predicted posture moves continuously, so it skips no body.
+each pair of `CollisionCheck` must be at least FENCE_M apart. The required distance grows with speed, to FENCE_M (1 +
+SPREAD) at full speed, because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within
+BRAKE_S, and joints lag the ramp by LAG_S. The joint with the largest ratio of speed to allowed speed brakes first;
+every other joint begins to brake when the ramp has fallen to the joint's ratio. During a motion, the predicted
+posture changes continuously, so it cannot jump over a body.
 
 If two bodies start a motion closer than FENCE_M, the arm may move them apart: the required distance is half of their
 largest distance in the motion so far, but at most FENCE_M. The fence ignores initially overlapping bodies until they

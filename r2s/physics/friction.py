@@ -36,11 +36,11 @@ class Family:
             `sign` is tanh(dq / 0.01) or, for a law with a memory, the bristle deflection, in [-1, 1].
         native: law of a joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
             torque and its derivative at v. `memory` is the state of the joint's friction, 0 after a reset.
-        sharp: version of `native` whose torque is discontinuous at v = 0, for stiction_model="net"; None: the law is
-            continuous at rest.
+        sharp: version of `native` whose torque is discontinuous at v = 0, for stiction_model="net". If None, the law
+            is continuous at rest.
         start: function that maps friction (..., n) Nm at 1 rad/s to a list of the required parameters' start values.
         held: function that maps phi (..., n, K) to negative and positive breakaway torques (..., n, 2) Nm of a law
-            with memory; None: the law has no stiction, so that eq. (6) or stick_slip.py adds stiction.
+            with memory. If None, the law has no stiction, and eq. (6) of the paper or stick_slip.py adds stiction.
 
     Raises:
         UserError: the attributes are inconsistent.
@@ -96,19 +96,19 @@ class Family:
         Args:
             dq: (..., n) rad/s, joint velocities.
             phi: (..., n, K), parameters in the order of `names`; optional parameters may be missing.
-            bristle: (..., n), bristle deflections in [-1, 1] from `presliding`; None: tanh(dq / 0.01).
+            bristle: (..., n), deflections in [-1, 1] from `presliding`; if None, the law uses tanh(dq / 0.01).
         """
         columns = [phi[..., k] for k in range(phi.shape[-1])] + [np.zeros(())] * (len(self.names) - phi.shape[-1])
         return self.law(dq, columns, np.tanh(dq / WIDTH_DQ) if bristle is None else bristle)
 
     def level(self, phi: np.ndarray, dq_max: np.ndarray) -> np.ndarray:
-        """Return the mean magnitude of friction (..., n) Nm at plus and minus `dq_max` (..., n) rad/s."""
+        """Return the mean of the friction magnitudes (..., n) Nm at the velocities `dq_max` and -`dq_max`, rad/s."""
         return 0.5 * (self.torque(dq_max, phi) - self.torque(-dq_max, phi))
 
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
         """Return parameters (..., n, K) with the same friction at 1 rad/s as phi (..., n, K') of the family `other`.
 
-        If this family requires a viscous parameter and `phi` contains one, the parameter keeps its value.
+        If this family requires a viscous parameter and `phi` contains one, viscous friction stays unchanged.
         """
         if other == self:
             return phi
@@ -257,7 +257,7 @@ STRIBECK = Family(
 
 @njit(cache=True)
 def _bristle_native(p, v, h, memory):
-    """Return Stribeck friction with LuGre damping; z, dz/dt = (v - |v| z) / presliding (Dahl), replaces sign(v)."""
+    """Return Stribeck friction and LuGre damping; z from dz/dt = (v - |v| z) / presliding (Dahl) replaces sign(v)."""
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
@@ -305,7 +305,7 @@ def family(name: str) -> Family:
     """Return a built-in friction family by name, or import a family by dotted path.
 
     Raises:
-        UserError: the family is unknown, or has a parameter of another family with another unit or scale.
+        UserError: the family is unknown, or one of its parameters has another unit or scale in another family.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:
@@ -337,7 +337,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if the friction family `name`, given in `file`, is in a module that `trust` does not list."""
+    """Raise UserError if `family` would import `name`, which `file` contains, from a module outside of `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(
@@ -354,7 +354,8 @@ def family_path(one: Family) -> str:
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
     """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s in steps of dt s.
 
-    z replaces sign(v) and solves dz/dt = (v - |v| z) / distance (Dahl 1968) from z = 0. distance: rad, () or (n,).
+    The deflection z starts at 0, solves dz/dt = (v - |v| z) / distance for v = dq (Dahl 1968), and replaces sign(v).
+    distance: rad, () or (n,).
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 

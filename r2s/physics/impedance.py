@@ -2,15 +2,16 @@
 
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
-With the damping D = 2 zeta (M # K_q), every mode has the damping ratio zeta. Here M is the mass matrix, K_q = J^T K J
-+ N^T K_n N the joint stiffness, and M # K_q = M (M^-1 K_q)^(1/2) their geometric mean. The double diagonalization of
-Albu-Schaeffer et al. (ICRA 2003) yields the same D from eigenvectors. The null-space projector N is dynamically
-consistent (Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a potential.
-When stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs; damping
-refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al., RA-L
-2016). The feedforward cancels gravity-compensation errors and friction: bristle friction at the measured angle, other
-friction at the reference speed dq_r. A feedforward above the true friction would drive the arm. A feedforward that
-cancels a bristle stiffness k after a delay d adds damping k sin(w d) / w > 0 at frequencies w < pi / d.
+The Cartesian law has the task error e, the Jacobian J, the task stiffness K, and the null-space stiffness K_n. The
+damping D = 2 zeta (M # K_q) gives every mode the damping ratio zeta. The mass matrix M and the joint stiffness K_q =
+J^T K J + N^T K_n N have the geometric mean M # K_q = M (M^-1 K_q)^(1/2). The double diagonalization of Albu-Schaeffer
+et al. (ICRA 2003) yields the same damping D from eigenvectors. The null-space projector N is dynamically consistent
+(Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a potential. When
+stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs; damping refills
+the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al., RA-L 2016). The
+feedforward cancels gravity-compensation errors and friction: bristle friction at the measured angle, other friction
+at the reference speed dq_r. A feedforward above the true friction would drive the arm. A feedforward that cancels a
+bristle stiffness k after a delay d adds damping k sin(w d) / w > 0 at frequencies w < pi / d.
 """
 
 import numpy as np
@@ -98,7 +99,7 @@ def arm_tips(q, parameters):
 
 @njit(cache=True, error_model="numpy")
 def mass_matrix(parameters, frames, jacobian, mass):
-    """Write the mass matrix (n, n) kg m^2, rotors included: the sum of m J_v^T J_v + J_w^T I J_w over the links."""
+    """Write the mass matrix (n, n) kg m^2: rotor inertias, plus m J_v^T J_v + J_w^T I J_w of each link."""
     n = len(frames)
     moved = np.empty((n, 3))
     for i in range(n):
@@ -124,7 +125,7 @@ def mass_matrix(parameters, frames, jacobian, mass):
 
 @njit(cache=True, error_model="numpy")
 def invert(matrix, n):
-    """Replace a symmetric positive definite matrix (n, n) by the inverse, with Gauss-Jordan elimination."""
+    """Replace a symmetric positive definite matrix (n, n) by its inverse, with Gauss-Jordan elimination."""
     for k in range(n):
         pivot = 1.0 / matrix[k, k]
         matrix[k, k] = 1.0
@@ -142,8 +143,8 @@ def invert(matrix, n):
 def geometric_mean(K, mobility, out):
     """Write the geometric mean K # M = M (M^-1 K)^(1/2), (n, n), of positive definite matrices; mobility: M^-1.
 
-    From P = K and Q = M^-1, iterate P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2. Denman and Beavers' iteration (Higham,
-    Functions of Matrices, 2008, eq. 6.28) is multiplied by M here, so that all iterates stay symmetric.
+    From P = K and Q = M^-1, iterate P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2. The iteration is Denman and Beavers'
+    (Higham, Functions of Matrices, 2008, eq. 6.28), multiplied by M so that all iterates stay symmetric.
     """
     n = len(K)
     scale = 0.0  # mean squared frequency
@@ -171,11 +172,11 @@ def geometric_mean(K, mobility, out):
 
 @njit(cache=True, error_model="numpy")
 def spring(s, limit):
-    """Return the energy U, J, of a saturating spring for s = e^T K e / 2, J, and the factor on its force K e.
+    """Return a saturating spring's energy U, J, and the factor on its force K e; s: J, linear energy e^T K e / 2.
 
     The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. As U depends on s alone, U is a potential of the
-    force for every K, and U rises with K. The force is at most sqrt(2 K limit), and at most clip for limit = clip^2 /
-    (2 K_high).
+    force for every K, and U rises with K. The force is at most sqrt(2 K limit). If limit is clip^2 / (2 K_high), the
+    force is at most `clip` for every K up to K_high.
     """
     if s <= limit:
         return s, 1.0
@@ -224,11 +225,11 @@ def friction_at(v, row, load):
 def friction_ahead(v, q, j, load, parameters, memory, at):
     """Return the friction feedforward, Nm, of joint j at q rad; v: reference speed of the joint, rad/s.
 
-    With bristles, the feedforward is the deflection z times the smaller of two frictions, at reference and at
-    measured speed. The measured dq drives z: dz/dt = (dq - |dq| z) / presliding (Dahl 1968). Without bristles, the
-    feedforward is the friction at v if APPROACH is 1. Without bristles and with another APPROACH, the feedforward has
-    the sign of v, and a joint at rest receives at least the breakaway torque if |v| >> DIRECTION_DQ. load: Nm,
-    load-dependent friction. at: index of dq_r in `memory`.
+    With bristles, the feedforward is the bristle deflection z times the friction at reference or measured speed,
+    whichever is smaller. The measured joint motion drives the deflection: dz/dt = (dq - |dq| z) / presliding (Dahl
+    1968). Without bristles and with APPROACH = 1, the feedforward is the friction at v. Without bristles and with
+    another APPROACH, the feedforward has the sign of v, and a joint at rest receives at least the breakaway torque if
+    |v| >> DIRECTION_DQ. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
@@ -261,7 +262,10 @@ def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def feedforward(q, parameters, frames, jacobian, memory, at, out):
-    """Add to `out` the torques that cancel friction, gravity errors, offset and drag; at: index of dq_r in memory."""
+    """Add torques against friction, gravity-compensation errors, offset and drag to `out`.
+
+    at: index of dq_r in `memory`.
+    """
     n = len(q)
     m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all links beyond a joint
     M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # mass and first moment of these links

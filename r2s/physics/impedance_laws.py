@@ -164,7 +164,7 @@ def rotation_error(R, command, parameters, error):
 
 @njit(cache=True, error_model="numpy")
 def update(velocity, parameters, frames, jacobian, memory):
-    """Update damping D, projector N^T (n, n) and dq_r (n,) rad/s in `memory`; velocity: (3,) m/s, of the target."""
+    """Update damping D, projector N^T (n, n) and dq_r (n,) rad/s in `memory`; velocity: (3,) m/s, target velocity."""
     n, a, at = len(frames), int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     K = memory[STIFFNESS : STIFFNESS + SPRINGS]
     D = memory[at + ROWS * n : at + ROWS * n + n * n].reshape((n, n))
@@ -236,9 +236,10 @@ def normal_force(command, shift, parameters, memory):
 def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
     """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's motion.
 
-    The gradient method (Widrow and Hoff, 1960) fits the slope g in: tip speed along the normal = g . target velocity.
-    The normal velocity g . target velocity adds to `velocity` (3,) m/s. The correcting force is the sum of two
-    clamped integrals of the position error, one along the motion, where friction acts, and one across the motion.
+    The gradient method (Widrow and Hoff, 1960) fits the slope g in the equation: tip speed along the normal = g .
+    target velocity. `slide` adds this speed, along the normal, to `velocity` (3,) m/s. The correcting force is the
+    sum of two clamped integrals of the position error, one along the motion, where friction acts, and one across the
+    motion.
     """
     up, rises, fast = 0.0, 0.0, SLIDING * SLIDING
     for k in range(3):

@@ -73,7 +73,7 @@ class InverseDynamics:
 
 @njit(cache=True, error_model="numpy")
 def _rigid(links, nominal, gravity, armature, motion, out, full_gravity):
-    """Write the torque (m, n) Nm for (q, dq, ddq); full_gravity: include the gravity that the arm compensates."""
+    """Write the torque (m, n) Nm for `motion`; full_gravity: include the gravity torque that the arm compensates."""
     q, dq, ddq = motion
     m, n = q.shape
     mass, bias, compensated, at_rest = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)

@@ -34,8 +34,8 @@ class HandKinematics:
     def follow(self, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
         """Return postures (T, n) rad with the end effector at points (T, 3) m, and the largest position error, m.
 
-        The solver starts at `start` (n,) rad for the first point, and at the last point's posture for later points.
-        In the null space of the end effector, the arm moves toward home. The solver ignores position limits.
+        The solver starts at `start` (n,) rad for the first point, and at the previous point's posture for every later
+        point. In the null space of the end effector, the arm moves toward home. The solver ignores position limits.
         """
         out = np.empty((len(points), len(start)))
         return out, _follow(self.links, self._tip, self._home, start, np.ascontiguousarray(points), out)

@@ -8,8 +8,8 @@ of all other forces, which stiction (stick_slip.py) and contact (contact.py) nee
 
 A linearly implicit method integrates the friction torque tau_f. With D = d tau_f / dv >= 0 at the current velocity v,
 the callback adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. The
-method is accurate to first order, and stable even for real wrist joints with D = 3-10 Nm s/rad and 0.004-0.012 kg
-m^2.
+method is accurate to first order, and stable even for real wrist joints, with D of 3-10 Nm s/rad and inertias of
+0.004-0.012 kg m^2.
 """
 
 from collections.abc import Callable
@@ -110,7 +110,7 @@ def _first_moment(mass, xpos, xmat, h):
 
 @njit(inline="always")
 def _direction(v, net, z, user):
-    """Return the factor on load-dependent friction, in [-1, 1], and d factor / dv, s/rad; z: bristle deflection."""
+    """Return the factor on load-dependent friction, in [-1, 1], and its slope, s/rad; z: bristle deflection."""
     if user[FAMILY] == BRISTLES:  # in the coming step, without bristle damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
@@ -245,7 +245,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by the control law's torques; compiling for a constant n takes a minute longer."""
+    """Replace the applied torques by the control law's torques; n is variable, which saves a minute of compiling."""
     user = carray(as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(as_doubles(fields[0]), (n,)), carray(as_doubles(fields[1]), (n,))
     applied, kept = carray(as_doubles(fields[2]), (n,)), carray(as_doubles(fields[5]), (KEPT, n))
@@ -314,7 +314,8 @@ def _hold(forces, dq, user, joint, work, touch, touches):
     Args:
         forces: MuJoCo's M, damping, bias, applied, passive. dq: (n,) rad/s, joint velocities. user: (n, WIDTH), from
             `jnt_user`. joint: (ROWS, n), results of `_friction`. work: (2 n + 6, n), scratch array.
-        touch: arrays `contact` and `jacobian` that `near` wrote. touches: whether the tip may touch (from `near`).
+        touch: arrays `contact` and `jacobian` that `near` wrote. touches: whether the tip may touch the surface
+            (result of `near`).
     """
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]

@@ -48,14 +48,15 @@ class Payload:
 
 
 def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload") -> Payload | None:
-    """Return the payload that a setting describes as a number of kg, a mapping or a file; None for 0 kg.
+    """Return the payload that a setting describes as a number of kg, a mapping or a file; None for null or 0 kg.
 
     A number is the mass, kg, of a point mass at the end effector. A mapping contains `mass` and optionally `centre`
     (3,) m, `inertia` (xx, yy, zz or xx, yy, zz, xy, xz, yz, kg m^2 about `centre`; default: a sphere of water),
     `on_s` and `off_s`. A string is the path of an identification's payload.yaml or run folder.
 
     Args:
-        value: the setting. name: the setting's name in error messages. most: kg and m, as `Robot.payload_max`.
+        value: the setting. name: the setting's name in error messages. most: largest mass, kg, and distance, m, as in
+            `Robot.payload_max`.
 
     Raises:
         UserError: mass, centre, tensor or time is out of range, or a file is missing; the message begins with `name`.
@@ -114,7 +115,7 @@ def _of_file(name: str, path: Path) -> Any:
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
-    """Return the inertia tensor (3, 3) kg m^2 from 3 moments or 6 elements; value=None: a sphere of water.
+    """Return the inertia tensor (3, 3) kg m^2 of 3 moments or 6 elements or, if value is None, of a sphere of water.
 
     A principal moment may be at most m (2 d)^2, with the largest allowed mass m and distance d in `most`.
     """
@@ -138,7 +139,7 @@ def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np
 
 
 def sphere_inertia(mass: np.ndarray) -> np.ndarray:
-    """Return the tensors (..., 3, 3) kg m^2 of spheres of water of mass (...) kg."""
+    """Return the tensors (..., 3, 3) kg m^2 of spheres of water with the masses `mass` (...) kg."""
     radius = (3 * mass / (4 * np.pi * WATER)) ** (1 / 3)
     return (0.4 * mass * radius**2)[..., None, None] * np.eye(3)
 

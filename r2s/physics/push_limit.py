@@ -1,7 +1,7 @@
 """Limit the force with which a tool's tip presses on a surface, and the tip's closing speed at contact.
 
-A push is a force along the surface's inward normal. The tip's Jacobian J, speed v and effective mass
-m = 1 / (J M^-1 J^T) along this normal (Khatib, IEEE J. Robotics and Automation 3(1), 1987) satisfy
+A push is a force along the surface's inward normal. Along the inward normal, the tip's Jacobian J, speed v and
+effective mass m = 1 / (J M^-1 J^T) (Khatib, IEEE J. Robotics and Automation 3(1), 1987) satisfy
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
@@ -12,18 +12,20 @@ P is the push of the command, F >= 0 is the contact force, and P_f is the push o
 - Speed: dv/dt <= RATE (v_max - v). With an estimate R of F - P_f, the speed rule is P <= R + m RATE (v_max - v). The
   allowed speed v_max is `speed_near` / OVERSHOOT at the surface and grows with the tip's height.
 
-The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. In
-free motion, R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, R is P, so the speed rule
-allows P to rise. If the tip is faster than v_max or leaves the surface, the push limit caps R at 0.
+The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass filtered P - m dv/dt.
+In free motion, the estimate R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, the estimate
+R is P, so the speed rule allows the push P to rise. If the tip is faster than v_max or leaves the surface, the push
+limit caps the estimate R at 0.
 
-On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). When F
-exceeds force_max, the tip's speed is at most speed_near, and P + P_f - F < 0 brakes the tip. Surface friction mu F
-pushes a sliding tip inward with up to mu c F, where c = m |T J M^-1 J^T n| with the full Jacobian J and the
-projection T across the normal n. In the bound for a surface with friction, (1 - mu c) F therefore replaces F.
+On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). When the
+contact force F exceeds force_max, the tip's speed is at most speed_near, and the net force P + P_f - F < 0 brakes the
+tip. Surface friction mu F pushes a sliding tip inward with up to mu c F, where c = m |T J M^-1 J^T n| with the full
+Jacobian J and the projection T onto the plane with the normal n. In the bound for a surface with friction, (1 - mu c)
+F therefore replaces F.
 
 The force rule and the speed rule restrict the torque to two half-spaces with the same normal J M^-1. Of all torques
-in both half-spaces, Gauss' principle selects the one nearest to the target torque: the target torque minus J^T f.
-Regula falsi finds the force f whose torque also satisfies the acceleration bounds (safety_filter.py).
+in both half-spaces, Gauss' principle selects the one nearest to the effort: the effort minus J^T f. Regula falsi
+finds the force f for which the torque also satisfies the acceleration bounds (safety_filter.py).
 """
 
 from dataclasses import dataclass
@@ -95,9 +97,10 @@ class PushLimit:
         return mass, mass * float(np.abs(lever) @ friction)
 
     def bound(self, robot: Robot, q: np.ndarray, stiffness: float, friction: float = 0.0) -> float:
-        """Return the largest contact force, N, at q (n,) rad on a surface with stiffness, N/m, and Coulomb friction.
+        """Return the largest contact force, N, at q (n,) rad.
 
-        The result is infinite if surface friction can push a sliding tip inward without limit.
+        stiffness: N/m, of the surface. friction: friction coefficient of the surface. The result is infinite if
+        surface friction can push a sliding tip inward without limit.
         """
         jacobian = Tip(robot)(q)[1]
         moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, by a force on the tip
@@ -119,10 +122,11 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max, speed_near: N and m/s, see `PushLimit`; speed_near=None: the speed at which contact at home, with
-            1e5 N/m, causes at most 2 force_max.
-        plane: point and normal; None: a work table below the home posture's tip. asked: N, a task's largest force.
-        stop: a key of STOPS (contact_stop.py); None: "release".
+        force_max, speed_near: N and m/s, see `PushLimit`; if speed_near is None, contact with 1e5 N/m at home causes
+            at most 2 force_max.
+        plane: point (3,) m and normal (3,); if None, a work table below the tip at home. asked: N, a task's largest
+            force.
+        stop: a key of STOPS (contact_stop.py), "release" by default.
 
     Raises:
         UserError: a value is out of range, the robot has no tool, or force_max is less than the task's force plus
@@ -150,9 +154,9 @@ def push_limit(
 
 @njit(cache=True, error_model="numpy")
 def tip_motion(limit, kinematics, dq, row):
-    """Write the Jacobian J (n,) m/rad into `row`; return the tip's height, m, two speeds, m/s, and dJ/dt dq, m/s^2.
+    """Write Jacobian J (n,) m/rad to `row`; return height, m, inward and lateral speed, m/s, and dJ/dt dq, m/s^2.
 
-    The height is above the highest possible true plane. The speeds are inward and along the plane.
+    The height is the tip's height above the highest possible true plane. The lateral speed is along the plane.
     """
     position, R, anchor, axis = kinematics
     a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
@@ -194,7 +198,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
     """Return the largest allowed tip acceleration J M^-1 tau, m/s^2, into a surface; inf far from the surface.
 
     Args:
-        limit: (COLUMNS,) from `PushLimit.columns`; this function updates the estimate R and the last speed.
+        limit: (COLUMNS,) from `PushLimit.columns`; `push_bound` updates the estimate R and the last speed.
         arm: `JointDynamics` with finite values. kinematics: position (3,) m and rotation (9,) of the last link, and
             anchors (n, 3) m and axes (n, 3) of the joints, all in the base frame.
         last: (n,) Nm, the torque that the arm applied last.
@@ -232,9 +236,10 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit push and joint accelerations due to the torques `out` (n,) Nm and the contact force.
+    """Limit the torques `out` (n,) Nm to an allowed push and, with contact force as a load, allowed accelerations.
 
-    Return whether `out` changed. `push_bound` explains the arguments, `filter_torque` explains `share` and `limits`.
+    Return whether `out` changed. `filter_torque` explains `share` and `limits`; `push_bound` explains the other
+    arguments.
     """
     n = len(out)
     own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()

@@ -52,7 +52,7 @@ def regressor(
     Args:
         robot: the arm, for its kinematics.
         q, dq, ddq: (T, n) rad, rad/s, rad/s^2, joint motion.
-        gravity: (3,) m/s^2 in the base frame; None: the arm compensates gravity.
+        gravity: (3,) m/s^2, base frame. If None, the regressor excludes gravity, because the arm compensates gravity.
     """
     place, frame, anchor, axis = joint_kinematics(robot, q)
     samples, n = q.shape

@@ -45,14 +45,15 @@ class Robot:
         dq_max, ddq_max: (n,) rad/s and rad/s^2, velocity and acceleration limits.
         tau_max, dtau_max: (n,) Nm and Nm/s, limits of torque and torque rate.
         q_home: (n,) rad, home posture, in which episodes and excitations start.
-        ee_site: the site of `model` that is the end effector.
+        ee_site: name of the end effector's site in `model`.
         gravity: (3,) m/s^2 in the base frame.
         mass, com: (n,) kg and (n, 3) m, nominal mass and center of mass of each moving link, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its center of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
         damping, frictionloss: (n,) Nm s/rad and (n,) Nm, viscous and Coulomb friction in the file, 0 by default.
-        velocity_envelope: None, or deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3, whose velocity limit is
-            sqrt(2 deceleration distance + offset^2) - offset at a distance, rad, from a position limit.
+        velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3, whose velocity limit is sqrt(2
+            deceleration distance + offset^2) - offset at a distance, rad, from a position limit. If None, the
+            velocity limit does not depend on position.
         tool: the spherical tip that touches surfaces; None: no tool.
         lock: {joint: rad or m}, positions of the welded joints.
         payload_max: (2,) largest payload mass, kg, and largest distance, m, from end effector to payload center.
@@ -87,7 +88,7 @@ class Robot:
 
     @property
     def step_max(self) -> np.ndarray:
-        """(n,) Nm, largest change of a command in one cycle of 1 ms."""
+        """Largest change (n,) Nm of a command in one cycle of 1 ms."""
         return RATE_SHARE * self.dtau_max * SIM_DT
 
     @property
@@ -134,7 +135,7 @@ class Robot:
 
 
 def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
-    """Return (n,) floats from one value per joint or one for all; joints: text for the joints in error messages.
+    """Return an array (n,) from one value per joint or one for all joints; joints: their name in error messages.
 
     Raises:
         UserError: the number of values is wrong, or a value is not a number.
@@ -176,14 +177,15 @@ def load_robot(
     acceleration or torque rate. r2s ignores `gravcomp`, disabled gravity and objects on free joints in the file.
 
     Args:
-        mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; None: the Panda.
-        ee: site, body or link of the end effector; None: the only site, or the last link of a URDF.
-        q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; None: the file's value or a default.
-        gravity: (3,) m/s^2 in the base frame; None: the file's gravity or, for a URDF, gravity of an upright base.
+        mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; if None, load the Panda.
+        ee: site, body or link of the end effector; if None, use the only site, or the last link of a URDF.
+        q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; if None, from the file or a default.
+        gravity: (3,) m/s^2 in the base frame; if None, use the file's or, for a URDF, gravity of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's armature.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
         lock: {joint: rad or m}, positions at which to weld joints, such as a gripper's; None: weld no joint.
-        payload_max, payload_far: kg and m, for `Robot.payload_max`; None: estimates from torque limits and reach.
+        payload_max, payload_far: kg and m, for `Robot.payload_max`; if None, r2s estimates the value from torque
+            limits and reach.
 
     Raises:
         UserError: the file is missing or invalid, is no serial arm of hinges, or lacks limits or the end effector.
@@ -246,7 +248,7 @@ def _limits(
     q_home: list[float] | None,
     tau_max: list[float] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return checked q_min, q_max, q_home (n,) rad and tau_max (n,) Nm; None: the file's value."""
+    """Return checked q_min, q_max, q_home (n,) rad and tau_max (n,) Nm; replace None by the file's value."""
     limited = model.jnt_limited.astype(bool)
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
     high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
@@ -262,7 +264,7 @@ def _limits(
 def _payload_max(
     model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
 ) -> tuple[float, float]:
-    """Return `Robot.payload_max`; an argument None is estimated from torque limits and the reach beyond joint 2."""
+    """Return `Robot.payload_max`; estimate an argument of None from torque limits and the reach beyond joint 2."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     sites = [model.site(i).name for i in range(model.nsite)]

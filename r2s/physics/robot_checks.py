@@ -100,7 +100,7 @@ def check_limits(
     torque: np.ndarray,
     unset: list[str],
 ) -> None:
-    """Raise UserError unless position and torque limits are complete and q_home lies within them.
+    """Raise UserError unless position and torque limits are complete and q_home is within the position limits.
 
     Args:
         model, path: arm and file. low, high, home: (n,) rad, position limits, q_home. torque: (n,) Nm, torque limits.

@@ -71,7 +71,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
 
     For light joints, the filter's mass matrix has just enough added inertia (column ADDED) that the largest target
     torque of any joint is within the acceleration limit at rest. DELAY_PHASE bounds the added inertia, because added
-    inertia makes the loop faster.
+    inertia makes the control loop faster.
 
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
@@ -138,7 +138,7 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def fade(q, dq, effort, limits, out):
-    """Write the effort (n,) Nm, faded near velocity and position limits, to `out`; return whether fading acted."""
+    """Write the effort (n,) Nm to `out`, faded near speed and position limits; return whether fading reduced it."""
     kept = _torque_share(q, dq, limits)
     for j in range(len(q)):
         out[j] = kept * effort[j]
@@ -170,7 +170,8 @@ def joint_bounds(arm, share, limits, work):
 def bounded(arm, friction, limits, work, desk, out):
     """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether `out` exceeded a bound.
 
-    desk: (n, n), scratch array; if it is `work[:n]`, `bounded` overwrites the root, so the bounds serve only once.
+    desk: (n, n), scratch array; if it is `work[:n]`, `bounded` overwrites the root, so every call needs new bounds
+    from `joint_bounds`.
     """
     n, dq = len(out), arm.dq
     ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]

@@ -34,7 +34,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 
 class Simulator:
-    """Batch of `nsim` simulated arms, each with its own `Dynamics`, on `nthread` threads (0: all).
+    """Batch of `nsim` simulated arms, each with its own `Dynamics`, on `nthread` threads (0: all CPUs).
 
     The simulated motion is bit-identical for any number of threads.
 
@@ -42,7 +42,7 @@ class Simulator:
         robot: robot to simulate; a robot with a tool may touch a surface (`Dynamics.surface`).
         dynamics: one `Dynamics` for all arms, or a batch of `nsim`. nsim, nthread: numbers of arms and threads.
         dt: duration of a physics step, s.
-        control: control law that maps commands to torques; None: the caller passes torques to `rollout`.
+        control: control law that maps commands to torques; if None, the caller passes torques to `rollout`.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Simulator:
         Args:
             limits: (n, COLUMNS), limits of the safety filter, see `r2s.physics.safety_filter.filter_limits`.
             torque_limit: (n,) Nm, largest target torque. cutoff_hz: Hz, cutoff of the torque low-pass.
-            soft_start_s: s, time over which torque fades in. push_limit: push limit of a tool; None: no limit.
+            soft_start_s: s, fade-in time of torque after `reset`. push_limit: push limit of a tool; None: no limit.
         """
         u = native
         self._user[:, :, u.LIMITS : u.LIMITS + limits.shape[1]] = limits
@@ -145,7 +145,8 @@ class Simulator:
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
         """Set the commands (nsim, c) of the arms' control laws until the next call of `command`.
 
-        speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: no noise.
+        speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; if None, keep the last noise,
+        0 after `reset`.
         """
         n = self.robot.n
         self._memory[:, self._kept : self._kept + self._sizes[0]] = command

@@ -3,18 +3,19 @@
 The limit surface of table friction is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
 Tanie, IROS 1992). A box with center velocity v and spin w has the generalized velocity u = (v, r w), and the table
 friction -mu N u / |u| under the normal force N. Pressure on the base is uniform, so the ratio r of friction moment to
-force is the mean distance between the base's points and the base's center. At rest, table friction is the elastic
-force -mu N z / `RIGID`. The deflection z follows dz/dt = u - |u| z / RIGID, in backward Euler; while the box slides,
-z / RIGID equals u / |u|.
+force is the mean distance between the base's points and the base's center. On a box at rest, table friction is the
+elastic force -mu N z / `RIGID` with a deflection z. Backward Euler integrates dz/dt = u - |u| z / RIGID; while the
+box slides, z / RIGID equals u / |u|.
 
 The box is not a body of the MuJoCo model, so simulations without a box do not change. Training, twins and engines
 share one compiled law, which solves joint friction and box motion together. The box neither tilts nor lifts off
 (`check_size` in box.py). The tip does not touch the table; the tip's vertical force only changes the box's load.
 
 In a step, the contact force on the tip is F = F0 - K d, where d is the change of the tip's velocity relative to the
-box. The box's velocity after the step is linear in F, with the mobility h W at the contact. Elimination of the box's
-velocity yields the contact force in the joint equations, F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is
-the change of the tip's velocity, and d_0 is the change of the box's velocity if F is 0.
+box, F0 is the force for d = 0, and K is a resistance, N s/m. The box's velocity after the step is linear in F, with
+the mobility h W at the contact. Elimination of the box's velocity yields the contact force in the joint equations, F
+= (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is the change of the tip's velocity, and d_0 is the change of the
+box's velocity if F is 0.
 """
 
 import numpy as np
@@ -79,14 +80,20 @@ def contact_point_velocity(contact, motion, out):
 
 @njit(cache=True, error_model="numpy")
 def _grip(contact, speed, h):
-    """Return k, N/m, and c, N s/m, of table friction -(k z + c u), with z before and velocity u after a step."""
+    """Return the coefficients k, N/m, and c, N s/m, of the table friction -(k z + c u) in a step of h s.
+
+    z: m, elastic deflection before the step. u: m/s, generalized velocity after the step.
+    """
     stiff = contact[LOAD] / RIGID / (1.0 + h * speed / RIGID)
     return stiff, h * stiff
 
 
 @njit(cache=True, error_model="numpy")
 def _free_change(contact, speed, h, out):
-    """Write a box's velocity change (4,) without tip force; return changes per force s/kg and moment s/(kg m^2)."""
+    """Write a box's velocity change (4,) in a step without tip force; return `along` and `about`.
+
+    along: s/kg, change of velocity per force. about: s/(kg m^2), change of spin per moment.
+    """
     spring, damper = _grip(contact, speed, h)
     reach, strain = contact[REACH], contact[STRAIN : STRAIN + 4]
     along = h / (contact[MASS] + h * damper)
@@ -99,7 +106,7 @@ def _free_change(contact, speed, h, out):
 
 @njit(cache=True, error_model="numpy")
 def _pushed(contact, force, change, along, about, out):
-    """Write the velocity and spin (4,) of the box after a step with `force` (3,) N on the tip, -force on the box."""
+    """Write the box's velocity and spin (4,) after a step with `force` (3,) N on the tip and -force on the box."""
     up, lever = contact[UP : UP + 3], np.empty(3)
     _cross(up, contact[ARM : ARM + 3], lever)
     upwards, moment = 0.0, 0.0

@@ -4,8 +4,8 @@ A joint at rest sticks while its net torque lies between its edges, the breakawa
 direction. The net torque includes the coupling to other joints, but not the joint's own friction. If the net torque
 is beyond an edge, the joint slides in the torque's direction. Torques are constant in a step, and accelerations are
 constant between events, so each event is located exactly (event-driven integration: Pfeiffer and Glocker, Multibody
-Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at a step's end to the whole step. At
-each reversal, the impulse would then have an error of up to the friction times the step h.
+Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at a step's end to the whole step,
+and the impulse of a reversal would have an error of up to the friction times the step h.
 
 MuJoCo itself adds the forces of the joints' position limits.
 """
@@ -38,7 +38,7 @@ class JointForces(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def any_reversal(mass, damping, h, dq, net, work):
-    """Return whether any joint reverses if all joints slide under `net` (n,) Nm, the torques with friction.
+    """Return whether any joint reverses if all joints slide under the torques `net` (n,) Nm, which include friction.
 
     `coming_velocity` explains all arguments except `net`.
     """

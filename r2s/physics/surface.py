@@ -1,8 +1,8 @@
 """Define a tool's tip and the surface that the tip touches, with contact parameters.
 
-The normal force at the tip's penetration depth d is F = K d^e (1 + c d') >= 0 (Hunt and Crossley, ASME Journal of
-Applied Mechanics 1975). The stiffness k is the undamped force per depth at d = 1 mm, so K = k / (1 mm)^(e - 1). While
-the tip slides, the tangential force is mu F, opposite to the sliding velocity.
+The normal force at the tip's penetration depth d and rate d' is F = K d^e (1 + c d') >= 0 (Hunt and Crossley, ASME
+Journal of Applied Mechanics 1975). The stiffness k is the undamped force per depth at d = 1 mm, so K = k / (1 mm)^(e
+- 1). While the tip slides, the tangential force is mu F, opposite to the sliding velocity.
 """
 
 import json
@@ -42,7 +42,8 @@ class Surface:
         point: (3,) m, a point on the plane, or the center of the box.
         normal: (3,), unit vector out of the material; for a box, the box's third axis.
         stiffness: k, N/m, force per depth at a depth of 1 mm. exponent: e, from 1 (linear) to 2; 1.5: Hertz.
-        damping: c, s/m. friction: mu. bristle: m, tangential deflection at which friction is mu F (0: no deflection).
+        damping: c, s/m. friction: coefficient mu. bristle: m, tangential deflection at friction mu F; 0: no
+            deflection.
         half: (3,) m, half edges of a box; None: the surface is a plane. axes: (3, 3), the box's axes as columns.
         mass: kg, mass of a box that slides on a table when pushed (sliding.py); None: the surface is fixed.
         table: friction coefficient between a sliding box and its table.

@@ -18,7 +18,7 @@ def combined(parts: list[Inertia]) -> Inertia:
 
 
 class Bodies:
-    """Masses, centers of mass and tensors of all bodies, and the poses of welded bodies in moving bodies."""
+    """Masses, centers of mass and tensors of all bodies, and poses of welded bodies relative to moving bodies."""
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model
@@ -62,7 +62,7 @@ def about(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
-    """Return the pose (4, 4) with a position (3,), None: zero, and a rotation (3, 3), None: identity."""
+    """Return the pose (4, 4) of a position (3,), zero by default, and a rotation (3, 3), the identity if None."""
     pose = np.eye(4)
     if position is not None:
         pose[:3, 3] = position

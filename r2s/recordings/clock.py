@@ -12,7 +12,7 @@ ALIKE = 0.05  # if the joints' speed factors spread less than this (relative), t
 
 
 def speed_factors(recording: Recording) -> np.ndarray:
-    """Return speed factors (n,) = change of q / integral of dq; nan for a joint whose motion does not determine it.
+    """Return speed factors (n,), change of q / integral of dq; nan if a joint's motion does not determine its factor.
 
     In each trajectory, linear trends of q and of the integral of dq are removed, so that a bias of dq has no effect.
     """

@@ -104,7 +104,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
-    """Return the index of the joint in a column name (-1: no joint), and the remaining name in lower case."""
+    """Return the index of the joint in a column name, or -1 without a joint, and the remaining name in lower case."""
     lower = column.lower()
     cores = [re.sub(r"^joint_|_joint$", "", joint.lower()) for joint in robot_joints]
     for k in sorted(range(len(cores)), key=lambda k: -len(cores[k])):
@@ -115,7 +115,7 @@ def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
 
 
 def _by_joint(table: Table, words: Sequence[str], robot_joints: Sequence[str]) -> list[str]:
-    """Return one column per joint, named by the joint and one of `words`; [] if a column is missing."""
+    """Return one column per joint, with the joint and one of `words` in its name; [] if a joint has no column."""
     found: dict[str, dict[int, str]] = {}
     for column in table:
         joint, rest = _joint_of(column, robot_joints)
@@ -167,7 +167,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return columns such as q1, q2, ... (pattern "q{}", first=1); first=None: start at q0 or, without q0, at q1."""
+    """Return columns such as q1, q2, ... (pattern "q{}", first=1); first=None starts at q0 or, without q0, at q1."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)
@@ -181,7 +181,7 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Return the error for a missing column, with the name of a similar column or of another torque as a hint."""
+    """Return the error for a missing column; a hint names a similar column or another kind of torque in the file."""
     if field == "tau" and _match(table, "q", "ddq"):
         return UserError(
             "no torque, but ddq: this is a planned motion; let the arm follow it, and give the arm's own log"

@@ -13,7 +13,8 @@ def longest_step(steps: np.ndarray, max_gap_s: float | None = None) -> float:
     """Return the longest time step that is not a pause, s, increased by the relative tolerance SLACK.
 
     Args:
-        steps: (T,) s, time steps. max_gap_s: s, the user's limit; None: five median steps, at least 0.05 s.
+        steps: (T,) s, time steps. max_gap_s: s, the user's limit; if None, the limit is five median steps, but at
+            least 0.05 s.
 
     Raises:
         UserError: the median step exceeds `max_gap_s` (0.2 s if None), so t is probably not in seconds.

@@ -51,9 +51,9 @@ def dataset_files(folder: Path) -> list[Path]:
 def lerobot_table(folder: Path) -> Table:
     """Return t (T,) s, trajectory (T,), joint_names (m,) and, if stored, q, dq, tau, tau_J_d, current (T, m).
 
-    t is frame_index / fps, or the timestamp if both differ; `trajectory` is the episode index. A torque in `action`
-    is returned as tau_J_d. Features of a gripper, hand or pose are ignored. The entry `reader_note` names the clock
-    and features that were used.
+    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. A torque in
+    `action` is returned as tau_J_d. Features of a gripper, hand or pose are ignored. The entry `reader_note` names
+    the clock and features that were used.
 
     Raises:
         UserError: the dataset has no torque or is not version 3, or a file is damaged.

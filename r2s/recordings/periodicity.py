@@ -41,7 +41,7 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return tracks of at least OVERLAP_S s: one per stretch if `each`, else one between restarts or long pauses."""
+    """Return tracks of at least OVERLAP_S s: one per stretch if `each`, else cut at restarts and long pauses."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -77,7 +77,8 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that all joints together also perform in `training`.
 
-    A piece of motion occurs in `training` if each joint's RMS distance is below the joint's `_tolerance` in `other`.
+    A piece occurs in `training` if its RMS distance from a motion in `training` is below the `_tolerance` of `other`
+    in each joint.
     """
     tolerance, deviation = _tolerance(other), _deviation(other)
     pieces = [piece for track in other for piece in _pieces(track.q, PIECE_MOTION * deviation.max())]
@@ -150,10 +151,10 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (L,), at each lag the largest ratio over joints of RMS distance between a and b / `tolerance` (n,) rad.
+    """Return for each of L lags the largest RMS distance of a joint between a and b, divided by `tolerance` (n,) rad.
 
-    Also return the number of common rows (L,). The ratio is inf at a lag if the common rows last less than OVERLAP_S,
-    or if no joint moves by MIN_MOTION.
+    Also return the number of common rows (L,). The divided distance is inf at a lag at which the common rows last
+    less than OVERLAP_S, or no joint has a standard deviation of more than MIN_MOTION tolerances.
     """
     square, variance, count = _distances(a, b)
     counts = (count >= OVERLAP_S / STEP) & ((variance / tolerance**2).max(1) > MIN_MOTION**2)
@@ -173,7 +174,7 @@ def _own_lag(track: Track, tolerance: np.ndarray) -> int | None:
 
 
 def _lag(a: Track, b: Track, tolerance: np.ndarray) -> int | None:
-    """Return the lag, in rows, at which b repeats a (None: no lag); of several, the lag with the longest overlap."""
+    """Return the lag, in rows, at which b repeats a with the longest overlap, or None if b does not repeat a."""
     error, count = _errors(a.q, b.q, tolerance)
     runs = _runs(error < 1.0)
     if not runs:

@@ -26,7 +26,8 @@ class Ramps:
 
     Attributes:
         recording: motion with commanded torque; identification uses t, and the ramped joint's q and tau.
-        joint, sign, pose: ramped joint (from 0), direction (1, -1), posture index (from 0); each (K,) or one value.
+        joint: ramped joint, from 0. sign: direction, 1 or -1. pose: posture index, from 0. Each attribute has K
+            values; one value applies to all ramps.
 
     Raises:
         UserError: the torque is not commanded, or `joint`, `sign` or `pose` has a wrong shape or value.
@@ -77,7 +78,7 @@ def read_ramps(
         path: file of ramps.
         columns: {field: column name} of a log, see `readers.read`.
         n_joints: expected number of joints.
-        max_gap_s: s; a longer time step separates ramps; None: see `longest_step`.
+        max_gap_s: s; a longer time step separates ramps; if None, the result of `longest_step` is the limit.
 
     Raises:
         UserError: the file is missing or contains no ramps, or a joint or sign contradicts the command.

@@ -63,21 +63,24 @@ def read(
     Args:
         path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
             LeRobotDataset.
-        torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); None: as the file declares.
+        torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); if None, the file declares it.
         columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The default names
-            are in DEFAULT_COLUMNS; as a default name of tau, the name in TAU has priority. For q, dq and tau, a name
+            are in DEFAULT_COLUMNS; for tau, the name in TAU precedes the default names. For q, dq and tau, a name
             stands for one array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ...
             In a name, `{j}` (from 1) or `{i}` (from 0) stands for the joint number. A list of names has one column
             name per joint. In HDF5 a column name is the path of a dataset, such as robot/q.
         n_joints: expected number of joints.
-        max_gap_s: s, longest time step within a trajectory; None: see `longest_step`; inf: gaps end no trajectory.
+        max_gap_s: s, longest time step within a trajectory. If None, the result of `longest_step` is the limit; if
+            inf, gaps end no trajectory.
         period: s, period of the motion, see `Recording`.
-        name: name of the recording; None: the file name without its suffix.
+        name: name of the recording; if None, the file name without its suffix.
         topic: ROS topic to read from a bag, see `bag_table`.
         joints, model_joints: the robot's joint names in the file, and in the robot description. `by_names` and
             `choose_joints` select and sort the file's joints by these names.
-        torque_constant: (n,) or one value, Nm/A at the joint, with gear ratio; if set, `tau` is a motor current.
-        limits: (lowest, highest) q of the robot, (n,) rad each; angles beyond them are shifted inside by revolutions.
+        torque_constant: Nm/A, (n,) or one value: joint torque, after the gear, per motor current. If set, the column
+            of tau contains motor current.
+        limits: (lowest, highest) q of the robot, (n,) rad each; angles outside of the limits are shifted inside by
+            revolutions, if possible.
 
     Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. Clock
     restarts also separate trajectories, except in bags and in files with a column `trajectory`. Log faults with only
@@ -243,7 +246,7 @@ def files_of(path: str | os.PathLike) -> list[Path]:
 
 
 def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
-    """Return all columns of the file `path`; errors name the file; `bag` contains the arguments of `bag_table`."""
+    """Return all columns of the file `path`, and name it in errors; `bag` contains the arguments of `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")
@@ -300,7 +303,7 @@ def _load_npz(path: Path) -> Table:
 
 
 def _load_hdf5(path: Path) -> Table:
-    """Return {path: dataset} for all datasets of an HDF5 file with at most two dimensions."""
+    """Return {path: dataset} for all datasets in an HDF5 file that have at most two dimensions."""
     h5py = optional_import("h5py", "reading this file", "recordings")
     table: Table = {}
 

@@ -36,10 +36,11 @@ class Recording:
         torque: kind of `tau`: "measured" (by a link-side sensor, with gravity), "commanded" (without gravity) or
             "motor" (motor torque times gear ratio; it contains gravity, all friction and rotor inertia).
         signals: {name from `SIGNALS`: (T,) or (T, k)}, further values that the arm reported; None becomes {}.
-        trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses; None: zeros.
-        period: s, period of the motion on the clock `t` (see `split`); None: no known period.
+        trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses. If None, all
+            indices are 0.
+        period: s, period of the motion on the clock `t` (see `split`); None if no period is known.
         notes: remarks of the file reader, such as one line per repair.
-        command_period: s, time for which the arm applies each command; None: until the next row.
+        command_period: s, time for which the arm applies each command; if None, until the next row.
     """
 
     t: np.ndarray

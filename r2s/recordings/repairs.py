@@ -22,7 +22,7 @@ MOVES = 0.2  # rad, least motion of a log in which holds are removed
 
 
 def repair_rows(arrays: Arrays) -> tuple[Arrays, list[str]]:
-    """Sort rows by time; drop rows that are repeated, misread, incomplete or stamped 0; return a note per repair."""
+    """Sort rows by time; drop rows that are repeated, misread, incomplete or at time 0; return a note per repair."""
     notes: list[str] = []
     whole = all(x.dtype.kind in "iuf" and len(x) == len(arrays["t"]) for x in arrays.values())
     if not whole or arrays["t"].ndim != 1 or len(arrays["t"]) < 3:
@@ -105,7 +105,7 @@ def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) 
 
 
 def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Return q (T, n) with trajectories beyond the limits shifted by revolutions, and the list of shifted joints."""
+    """Shift trajectories beyond the limits inside by revolutions; return q (T, n) and the list of shifted joints."""
     if (q.min(0) >= low - SLACK).all() and (q.max(0) <= high + SLACK).all():
         return q, []
     out, turned = q.copy(), set()

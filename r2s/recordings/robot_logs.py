@@ -79,7 +79,7 @@ def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
 
 
 class Sample(NamedTuple):
-    """A message: header stamp, ns; bag time, ns; joint names (() if the type has no names); {field: values (n,)}."""
+    """A message: header stamp and bag time in ns, joint names (() if its type has no names), {field: values (n,)}."""
 
     stamp: int
     received: int
@@ -104,7 +104,7 @@ def bag_table(
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap file, or the folder of a ROS 2 bag.
-        topic: topic of type JointState, FrankaState or FrankaRobotState; None: the only topic of these types.
+        topic: topic of type JointState, FrankaState or FrankaRobotState; if None, the only topic of these types.
         joints, model_joints, n_joints: see `choose_joints`.
 
     Raises:
@@ -186,7 +186,7 @@ def choose_joints(
 
 
 def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
-    """Read a topic (None: the only readable topic); return the topic's name and messages."""
+    """Read `topic`, or the only readable topic if it is None; return the topic's name and messages."""
     rosbag1, rosbag2 = (optional_import(f"rosbags.rosbag{k}", "reading this file", "recordings") for k in (1, 2))
     try:
         # only this topic is decoded: other topics may have unknown message types

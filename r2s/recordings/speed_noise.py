@@ -24,7 +24,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
 
     The noise is dq minus a reference velocity, the slope of a cubic fit to q (Savitzky and Golay, Analytical
     Chemistry 36(8), 1964). At low acceleration, the fitted slope is accurate, and a delay of dq has no effect. The
-    result is the median noise of the calmest 50 ms pieces: the 10 % with the smallest acceleration, computed from q.
+    result is the median noise of the calmest 50 ms pieces: the 10 % in which acceleration, the second derivative of
+    q, is smallest.
 
     Raises:
         UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.

@@ -20,7 +20,7 @@ LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and limits 
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
-    """Draw the estimates of payload and friction in the table `rows` over time; mark the times `changes`, s."""
+    """Draw the estimates of payload and friction in `rows` over time; mark payload changes at `changes`, s."""
     t, colour = rows["t"].to_numpy(), colours(["estimate"])["estimate"]
 
     def band(axis, name: str, title: str, label: str, scale: float = 1.0) -> None:
@@ -52,7 +52,7 @@ def write_estimate_recording(
     """Write a rerun recording: the arm, the force on the arm, and each estimate with its 95 % interval.
 
     Args:
-        rows: table of stage=estimate, a row per time. wrench: table of the external force from `observe_recording`.
+        rows: table with a row per estimate. wrench: table of the external force from `observe_recording`.
     """
     stream = rr.RecordingStream(f"r2s {path.absolute().parent.name.replace('.', '-')}")
     shown = [n for n in rows.columns if n not in wrench.columns and not n.endswith("_half")]

@@ -48,8 +48,8 @@ def transfer(
 
     Args:
         run, robot: the run and its arm. episodes: {simulator or arm: episodes}. rows: {simulator or arm: measures}.
-        torque: (n,) Nm, the policy's torque limits. timing: latencies of the arm's control cycles; None: no arm.
-        stops: stops of the arm, with their reasons. halted: reason why episodes were not run; None: all episodes ran.
+        torque: (n,) Nm, the policy's torque limits. timing: latencies of control cycles; None without an arm.
+        stops: stops of the arm, with reasons. halted: reason why episodes were not run, or None if all episodes ran.
     """
     measures = measures_of(run.folder)
     shown = {label: first(e) for label, e in episodes.items()}

@@ -32,7 +32,7 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) of trials done at times `at` (K,) s, if trials that take `spent` s run in sequence.
+    """Return the best value (K,) found until the times `at` (K,) s by trials in sequence, which take `spent` s each.
 
     Pruned and failed trials use compute, but their value is nan. sign: 1 if a larger value is better, else -1.
     """
@@ -58,7 +58,7 @@ def read_grid(against: str, measure: str) -> list[Trained]:
 
 
 def against_table(trials: pd.DataFrame, measure: str, against: str | None, larger: bool) -> pd.DataFrame | None:
-    """Tabulate the best values of search and grid at `SHARES` of the search's total time; return None without a grid.
+    """Tabulate best values of search and grid at `SHARES` of the search's training time; return None without a grid.
 
     The order of a grid's jobs is arbitrary, so the grid's best value is averaged over `ORDERS` random orders.
 

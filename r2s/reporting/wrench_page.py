@@ -24,7 +24,7 @@ TOUCH, NONE = "#cc0018", "#7f8790"
 
 
 def force_of(wrench: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the force and half the width of its 95 % interval, each (T, 3) N; wrench: table of observe_recording."""
+    """Return the force and half the width of its 95 % interval, each (T, 3) N, from a table of observe_recording."""
     return wrench[FORCES].to_numpy(), wrench[[f"{name}_half" for name in FORCES]].to_numpy()
 
 
@@ -86,7 +86,8 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
     """Return the 95 % cone of the force's direction as lines: the edge of the cone, and four lines from tip to edge.
 
-    Normal to the force, the edge is half the width of the force's 95 % interval away from the end of the arrow.
+    In each direction normal to the force, the distance from the end of the arrow to the edge is half the width of the
+    force's 95 % interval.
     """
     size = max(float(np.linalg.norm(force)), 1e-9)
     across = np.linalg.svd(force[None] / size)[2][1:]

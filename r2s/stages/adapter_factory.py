@@ -15,7 +15,7 @@ BESIDE = ("calibration",)  # keys of conf/adapt that are no arguments of the ada
 
 
 def calibrated(calibration, robot, trust=()):
-    """Return identified dynamics, (space, posterior draws) or None, and recordings of the unloaded arm or None."""
+    """Return the dynamics, (space, posterior draws) and recordings without payload; missing files give None."""
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
 
@@ -29,7 +29,7 @@ def calibrated(calibration, robot, trust=()):
 
 
 def free_recordings(calibration):
-    """Return the recordings from which the arm was identified, without contact, if their files still exist.
+    """Return the recordings of motion without contact that identified the arm, if their files still exist.
 
     If the recordings do not suffice to compute a contact threshold, print the reason and return [].
     """
@@ -52,7 +52,7 @@ def free_recordings(calibration):
 
 
 def _given_recordings(folder):
-    """Return a stage=identify run's recordings from user files, with commanded torque and without payload.
+    """Return the user's recordings that a stage=identify run read, if they have commanded torque and no payload.
 
     Raises:
         UserError: a file cannot be read with the settings of the run's config.
@@ -113,7 +113,8 @@ def make_adapter(cfg, robot, source):
 def calibration_of(cfg, source):
     """Return the run folder with the adapter's model: adapt.calibration, or the calibration of the policy's training.
 
-    Prefer the identification's folder to its copy in the training, because only an identification has recordings.
+    If the training folder contains a copy of an identified model, prefer the folder of the identification, because
+    only that folder contains recordings.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)

@@ -100,7 +100,8 @@ def dynamics_of(robot, friction, inertia):
 def make_task(cfg, robot, dynamics, safety=None):
     """Return the task of conf/task with the arm's model, the controller of conf/control and the safety limits.
 
-    safety: safety settings of a transfer, which replace those in the training's config `cfg`; None: replace none.
+    safety: safety settings of a transfer, which replace safety settings in the training's config `cfg`; a setting
+    with the value None, or `safety=None`, replaces nothing.
     """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
@@ -188,13 +189,13 @@ def ends_sweep(cfg):
 
 
 def is_simulated(cfg):
-    """Return whether the arm of conf/arm is simulated from a seed: a twin, or an emulated arm with a twin."""
+    """Return whether the arm of conf/arm is simulated from a seed: a twin, or an emulated control box with a twin."""
     made = {"_target_", "seed"} <= cfg.arm.keys()
     return made and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is a twin without an emulated arm around it; such twins need no operator."""
+    """Return whether conf/arm is a twin without an emulated control box; only such a twin needs no operator."""
     return is_simulated(cfg) and "operator" not in cfg.arm
 
 
@@ -203,7 +204,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
     """Yield a `PolicyRunner` for the arm of conf/arm, or a `RealtimeRunner` if arm.live; stop the arm afterwards.
 
     Args:
-        dynamics: center of the training's domain randomization. noise: index of the stream of a twin's sensor noise.
+        dynamics: center of the training's domain randomization. noise: index of the random stream for sensor noise.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.arm.policy_runner import PolicyRunner
@@ -302,7 +303,7 @@ def make_controller(cfg, robot, task, dynamics):
 def open_run(cfg, overrides, inputs=(), parents=()):
     """Return the open run folder of this job and start the trackers; a resumed run stays in its tracker group.
 
-    inputs: files that the job reads, beyond those in the config. parents: run folders, beyond those in the config.
+    inputs, parents: files and run folders that the job reads, in addition to those that the config names.
     """
     from omegaconf import OmegaConf
 

@@ -23,10 +23,11 @@ class ArmData:
         torque: kind of the recorded torque, "commanded" or "measured".
         seconds: duration of the training motion and of the validation motion, s.
         excitation_seed: seed of the training motion; the validation motion has the next seed.
-        excitation: file of the training motion; None: r2s optimizes this motion.
-        ramp_poses: number of postures in which every joint is ramped in both directions; 0: no ramps.
-        presses: number of contact motions (press and slide), which replace all motions without contact; 0: none.
-        press_point, press_normal: nominal plane, point (3,) m and normal (3,); None: table below the tip at q_home.
+        excitation: file of the training motion; if None, r2s optimizes a training motion.
+        ramp_poses: number of postures in which r2s ramps every joint in both directions; 0 means no ramps.
+        presses: number of contact motions (press and slide), which replace all motions without contact; 0 means none.
+        press_point, press_normal: point (3,) m and normal (3,) of the nominal plane; if None, a work table below the
+            tip in the home posture.
 
     Raises:
         UserError: a value is outside its range.
@@ -114,7 +115,7 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with the hold of data.command_hz; without it, print an assumed hold above SLOW_MS."""
+        """Return the recording with the hold of data.command_hz; if unset, print an assumed hold above SLOW_MS."""
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -240,7 +241,7 @@ def check_cutoff(cutoff_hz, recordings):
 
 
 def read_user_ramps(robot, file):
-    """Return the ramps in `file.ramps`, or None if unset; `file.columns` also names the columns of the ramps."""
+    """Return the ramps in the file `file.ramps`, read with `file.columns`; return None if `file.ramps` is unset."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
 
@@ -313,7 +314,7 @@ def record_arm(cfg, robot, run, motion):
     A resumed run reads its existing recordings. timing.csv lists the cycle durations, even if the arm stopped.
 
     Args:
-        run: open run folder for the files. motion: the training motion; None: r2s optimizes a motion.
+        run: open run folder for the files. motion: training motion; if None, r2s optimizes a motion.
 
     Raises:
         Stopped: the arm stopped; <name>_until_stop.npz contains the motion up to the stop.

@@ -40,8 +40,8 @@ def reads(cfg):
 class Parts:
     """Inputs of an identification, checked before a run folder is made.
 
-    groups, ramps: recordings and ramps; unless data=recording, r2s makes them later. motion: from data.excitation.
-    earlier: from identify.from.
+    groups, ramps: the recordings and ramps of data=recording; for other data=, r2s records motion and ramps later.
+    motion: the motion in data.excitation. earlier: the identification that identify.from names.
     """
 
     robot: Any

@@ -18,7 +18,7 @@ def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
         beside: keys of the node that are not passed to the target.
 
     Raises:
-        UserError: the target does not exist or refuses these arguments.
+        UserError: the target does not exist or refuses an argument.
     """
     make = target(node, group)  # raises if the node is no mapping
     settings = {k: v for k, v in plain(node).items() if k not in ("_target_", "name", *beside)}

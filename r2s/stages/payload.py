@@ -12,7 +12,7 @@ from r2s.stages.data import check_cutoff, read_file
 
 @dataclass(frozen=True)
 class LoadedData:
-    """Recording of the loaded arm, payload (or None) in the arm's gravity compensation, and the recording's files."""
+    """Recording of the loaded arm, declared payload of the arm (or None), and files of the recording."""
 
     recording: Any
     declared: Any
@@ -23,7 +23,7 @@ def loaded_data(cfg, robot, file, torque=None):
     """Return the `LoadedData` of data.loaded, or None without data.loaded.
 
     Args:
-        file: `FileData` of the config. torque: kind of torque to use instead of data.torque; None: data.torque.
+        file: `FileData` of the config. torque: kind of torque that replaces data.torque; if None, data.torque counts.
 
     Raises:
         UserError: data.declared_payload or data.contact contradicts data.loaded, or the file is invalid.
@@ -51,7 +51,7 @@ def loaded_data(cfg, robot, file, torque=None):
 
 
 def torque_of_calibration(cfg, given):
-    """Return the kind of torque of the calibration, which a recording with a payload must have too.
+    """Return the kind of torque of the calibration; a recording with a payload must have the same kind of torque.
 
     given: value of data.torque, or None if unset.
 

@@ -36,7 +36,7 @@ ROWS = {
     REFERENCE: "hybrid control, identified model",
 }
 PATHS = 6  # number of contact motions on the surface, 8 s each; the last is for validation
-CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # adapt=: transfers
+CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # see `commands`
 WHY = {
     "calibration": "it identifies the arm itself",
     "policy": "it trains its policies itself",
@@ -169,7 +169,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     """Return the commands {label: words} of each step: identify the arm, identify a surface, train, transfer.
 
     The trainings on the identified and the nominal model differ only in the model: settings, time and computer are
-    the same. With an adapter, arm and surface are identified without changes of payload, friction and delay.
+    the same. With an adapter, the changes of the arm (CHANGES) apply only to transfers, not to identifications.
 
     Args:
         cfg: config of the pipeline. name: name of the pipeline's run folder, with which all other folder names begin.

@@ -39,7 +39,7 @@ class Earlier:
 
 
 def earlier_run(cfg, robot):
-    """Return the identification of identify.from= as an `Earlier`, or None if unset.
+    """Return the identification that identify.from= names as an `Earlier`, or None if identify.from is unset.
 
     Raises:
         UserError: the run has no identification of this robot, or calibration= is also set.
@@ -65,7 +65,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
         earlier: list of `Earlier`, whose links and payload enter the prior. An `Earlier` with the same kind of torque
             also provides all other values, the friction family and the terms, so that the old and the new model have
             equal form.
-        last: whether this kind of torque is fitted last; other fits use only the stated values of links and payload.
+        last: whether `torque` is the last kind that r2s fits; other fits use only stated values of links and payload.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings
@@ -118,7 +118,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the start of a fit: `earlier.arm`, or `nominal` with its links if the kinds of torque differ."""
+    """Return the start of a fit: `earlier.arm`, or `nominal` with the earlier links if the kinds of torque differ."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -1,7 +1,7 @@
 """Find and read the recordings for stage=identify and `r2s check`; each file has one kind of torque.
 
 `data.path` and `data.validation` each name a file, a pattern such as "logs/*.csv", a dict such as
-{path: FILE, torque: motor}, or a list of these. The keys of such a dict override the settings in `data`.
+{path: FILE, torque: motor}, or a list of these. A key of the dict overrides the setting of the same name in `data`.
 """
 
 import glob

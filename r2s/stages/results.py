@@ -1,4 +1,4 @@
-"""stage=results: reproduce a page of benchmarks/results in a clean clone of this commit; compare it with the old one.
+"""stage=results: reproduce a page of benchmarks/results in a clean clone of this commit; compare both versions.
 
 `python run.py -m +experiment=results` reproduces all pages that docs/results.md cites.
 """
@@ -21,7 +21,7 @@ CLONE = "checkout"  # name of the clone in the run folder
 
 
 def reads(cfg):
-    """Return the config keys that stage=results reads, such as the commands of one page in `results.pages`."""
+    """Return the config keys that stage=results reads; of `results.pages`, the stage reads only the chosen page."""
     return {"results.page", "results.data", f"results.pages.{cfg.results.page}"}
 
 

@@ -71,7 +71,7 @@ def checked(cfg, where, trust=None):
     `trust`.
 
     Args:
-        where: file name for error messages. trust: value of `trust=`, see `modules`; replaces the config's `trust`.
+        where: file name for error messages. trust: value of `trust=` (see `modules`) that replaces `cfg.trust`.
 
     Raises:
         UserError: the config names untrusted code, which r2s has neither imported nor called.

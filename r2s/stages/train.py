@@ -202,7 +202,7 @@ def share_threads(cfg):
 
 
 def split_algo(cfg):
-    """Return conf/algo as number of arms, env steps of demonstrations, residual_l2, `Loop`, and other settings."""
+    """Split conf/algo into number of arms, env steps of demonstrations, residual_l2, `Loop` and other settings."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}

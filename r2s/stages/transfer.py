@@ -71,7 +71,7 @@ class Request:
     Attributes:
         robot, task: robot and task of the training. center: model at the center of the randomization.
         source: run folder of the training. policy: trained policy or controller. starts, goals: one per episode.
-        draw: domain randomization; None for simulator=none. soft_start_s: s, duration of the soft start.
+        draw: domain randomization in training; None for simulator=none. soft_start_s: s, duration of the soft start.
     """
 
     robot: Any
@@ -165,8 +165,8 @@ class ArmResult:
     Attributes:
         tried: (k,) indices of the goals whose episodes began. episodes: the k episodes that began; None if k = 0.
         stops: stops that ended episodes early. timing: durations of the 1 kHz cycles; None if unknown.
-        halted: reason why the remaining episodes did not run; None: all episodes ran.
-        blocked: reason of the last episode's stop if the operator must confirm this stop; None: nothing to confirm.
+        halted: reason why the remaining episodes did not run, or None if all episodes ran.
+        blocked: reason of the last episode's stop if the operator must confirm this stop, else None.
     """
 
     tried: Any = ()
@@ -234,7 +234,7 @@ def predict(cfg, request, robot):
 def save_arm_result(run, request, name, result, predicted):
     """Write stops.txt, timing.csv and episodes_<arm>.csv with a row per episode; return the measures on the arm.
 
-    predicted: episodes that the model predicted, to compare with the arm's episodes; None: no comparison.
+    predicted: episodes that the model predicted; if None, the arm's episodes are not compared.
     """
     import pandas as pd
 

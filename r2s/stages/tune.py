@@ -37,11 +37,11 @@ class Tune:
     """Settings of the config group `tune`.
 
     Attributes:
-        trials: total number of trials. workers: number of parallel trainings with one thread each; None: `threads`.
+        trials: number of trials. workers: number of parallel trainings with one thread each; if None, `threads`.
         startup: number of random trials before TPE and the pruner start.
         measure: key of the task's measure to optimize, in the last evaluation of each training.
         space: {option: list of values, or text of a range; see `parse_range`}.
-        against: glob pattern of run folders of trainings to compare with, such as a grid; None: no comparison.
+        against: glob pattern of run folders of trainings to compare with, such as a grid; if None, no comparison.
 
     Raises:
         UserError: a number is outside its range, the space is invalid, or the pattern matches nothing.

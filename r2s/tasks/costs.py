@@ -1,11 +1,11 @@
 """Costs that a training limits in addition to the reward, with one adaptive Lagrange multiplier per cost.
 
-A training maximizes the mean reward r subject to mean costs c_k <= d_k (constrained Markov decision process, Altman
-1999). The policy maximizes r - sum_k lambda_k c_k / d_k, where the rate of the multiplier lambda_k is proportional to
-c_k / d_k - 1, and lambda_k is never negative (Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization,
-ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies by the current -lambda_k / d_k. A
-stored cost thus stays valid, and costs need no separate critic. Mean reward and mean costs are means over all
-training steps, including exploration.
+A training maximizes the mean reward r while each mean cost c_k stays within its limit d_k (constrained Markov
+decision process, Altman 1999). The policy maximizes r - sum_k lambda_k c_k / d_k, where the rate of the multiplier
+lambda_k is proportional to c_k / d_k - 1, and lambda_k is never negative (Tessler, Mankowitz and Mannor, Reward
+Constrained Policy Optimization, ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies
+by the current -lambda_k / d_k. A stored cost thus stays valid, and costs need no separate critic. Mean reward and
+mean costs are means over all training steps, including exploration.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,7 +50,7 @@ COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {
 
 
 class ConstrainedReward(Reward):
-    """A reward whose terms are the terms of `reward`, followed by costs with the weights -lambda / limit.
+    """A reward whose terms are the terms of `reward`, followed by costs with the weights -multiplier / limit.
 
     Args:
         reward: the reward to maximize. robot: the arm. limits: {name in COSTS: largest mean cost in the cost's unit}.
@@ -69,7 +69,7 @@ class ConstrainedReward(Reward):
 
     @property
     def factor(self) -> np.ndarray:
-        """(1 + K,), initial values of the factor of `reward` and of the multipliers of the K costs."""
+        """(1 + K,), the initial factor of `reward`, followed by the initial multipliers of the K costs."""
         return np.array([self._reward.factor, *np.zeros(len(self._names))])
 
     def terms(self, task: Any) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Descriptions of a task's measures: key, unit, which direction is better, and how tables and figures show them.
+"""Descriptions of a task's measures: key, unit, whether lower is better, and presentation in tables and figures.
 
 Each task class has a `measure_table`, which training and transfer write to measures.json in their run folder, so that
 tables, pages and comparisons of run folders do not need the task's class.
@@ -89,8 +89,8 @@ class MeasureTable:
         transfer: measures that compare adapters episode by episode in transfers to an arm.
         diagnostics: columns of a transfer's second table; by default COMMON.
         corner: heading of the column of row labels. description: sentence that describes what a policy does.
-        error: name, unit and scale of `Episodes.distance`. error_levels: errors that the figure of `error` marks with
-            lines.
+        error: name, unit and scale of `Episodes.distance`. error_levels: errors at which the
+            figure of the error over time has horizontal lines.
         reward: name of `Episodes.reward`.
 
     By default, `comparison`, `curves`, `scores` and `transfer` contain the measures that `selection` lists.

@@ -72,7 +72,7 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
 
 
 def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> tuple[float, ...]:
-    """Return RMS error N before the step and at the end, overshoot N and share, impact N, share in contact."""
+    """Return RMS force errors before the step and at the end, overshoot (N, share), impact N, share in contact."""
     window = round(WINDOW_S * ctrl_hz)
     error, change = force - asked, asked[-1] - asked[0]
     rmse = [float(np.sqrt((error[part] ** 2).mean())) for part in (slice(step - window, step), slice(-window, None))]

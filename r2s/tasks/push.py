@@ -62,9 +62,11 @@ class PushTask(TipTask):
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         size: (3,) m, edges of the box. away: (low, high) m, distance of a goal from the box's nominal position.
         bearing: degrees, largest angle of a goal from straight ahead. goal_yaw: degrees, largest yaw of a goal.
-        spread, first_yaw: m, degrees, largest deviation of the box's start pose from the nominal pose, for `dr=box`.
+        spread, first_yaw: m and degrees, largest deviation of the box's start pose from its nominal pose, for
+            `dr=box`.
         pose_noise: m and degrees, standard deviation of the noise of the perceived pose in simulation.
-        point, normal: nominal position of the box on the table, m, and the table's normal; None: see `table_frame`.
+        point, normal: nominal position of the box on the table, m, and the table's normal; if None, see
+            `table_frame`.
         displacement: m, distance by which an action of 1 shifts the tip's target in the default controller.
         tool, pool: see `SurfaceTask`. torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         tip_radius, frame: radius of the tip, m, and frame of the table. own, parameters: default controller and its
@@ -160,7 +162,7 @@ class PushTask(TipTask):
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) m, target of the tip at zero action: mean(`away`) straight ahead of the box's nominal position."""
+        """(3,) m, tip target at zero action: the mean of `away` straight ahead of the box's nominal position."""
         return self.table.outside(np.array([0.5 * sum(self.away), 0.0, self.height]))
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -178,8 +180,8 @@ class PushTask(TipTask):
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
         """Return random goals (count, 6 + n); the class docstring describes a goal.
 
-        A goal has distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts at
-        a distance of BEHIND from the rearmost possible corner of the box, with a random sideways shift of up to half
+        A goal has distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts
+        behind the box, with a gap of BEHIND to the rearmost possible corner and a random sideways shift of up to half
         an edge.
 
         Raises:
@@ -209,7 +211,7 @@ class PushTask(TipTask):
         return goals[:, :3]
 
     def planar(self, state: State, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return box, goal, error = goal - box, (m, 3) each, in the table frame: x m, y m, yaw rad (error: +-pi)."""
+        """Return box, goal and goal - box, (m, 3) each, in the table frame: x m, y m, yaw rad; yaw error in +-pi."""
         seen = self.table.pose(np.zeros((len(goals), 3)), 0.5 * self.size[2]) if state.box is None else state.box
         box, goal = self.table.planar(seen), self.table.planar(goals[:, POSE])
         error = goal - box

@@ -66,11 +66,11 @@ class ReachTask(BaseTask):
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         start_spread: rad, largest random deviation of a joint from q_home in a start posture.
         reach: (low, high) m, range of the distance of goals from the shoulder (the second joint, or the only joint);
-            None: quantiles MIDDLE of the end effector's distance from the shoulder in random postures.
-        height: lowest goal, m. azimuth: rad, largest angle between a goal's direction and straight ahead.
-        speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise does not react to noise, and thus does not excite oscillations of
-            elastic gears. Rigid models have no elastic oscillations (benchmarks/results/transfer.md).
+            if None, quantiles MIDDLE of the end effector's distance from the shoulder in random postures.
+        height: lowest goal, m. azimuth: rad, largest horizontal angle between a goal's direction and straight ahead.
+        speed_noise: rad/s, see `Task`; if None, SPEED_NOISE for a model with measurement noise, as identified arms
+            have, else 0. A policy trained with noise does not react to noise, and thus does not excite oscillations
+            of elastic gears. Rigid models have no elastic oscillations (benchmarks/results/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -198,7 +198,7 @@ class ReachTask(BaseTask):
 
 
 def observation_terms(torque: np.ndarray) -> list[ObservationTerm]:
-    """Return the terms of an observation in the order of the result of `observe`; torque: (n,) Nm, torque limit."""
+    """Return the observation terms in the order in which `observe` returns them; torque: (n,) Nm, torque limit."""
     return [
         ObservationTerm("q", "rad", "q"),
         ObservationTerm("dq", "rad/s", "dq"),

@@ -2,7 +2,7 @@
 
 A reward is a weighted sum of named terms. The replay buffer stores the terms without weights, and each update applies
 the current weights, so that stored transitions stay valid when a curriculum changes the weights. r2s adds three terms
-to the paper's: a bonus for precision, and penalties for motion near the goal and for a high filter rate.
+to the paper's terms: a bonus for precision, and penalties for motion near the goal and for a high filter rate.
 """
 
 from collections.abc import Sequence
@@ -109,12 +109,12 @@ class Curriculum(Reward):
     Attributes:
         smoothness, precision, stillness, filter_penalty: (before, after), weight of the term before and after the
             curriculum's change. anneal: fractions of the budget at which the change of the weights starts and ends.
-        max_filter_rate: largest filter rate in a training, exploration included; None: no limit. After the start of
-            the change, a filter rate above `max_filter_rate` raises the weight of the filter penalty. A filter rate
-            below `max_filter_rate` lowers the penalty weight, but not below the curriculum's weight. With a fixed
-            penalty, the filter rate is 1 to 6 %, depending on the seed (benchmarks/results/minutes.md). Integral
-            control adapts the logarithm of the penalty weight, as for a Lagrange multiplier (Stooke, Achiam and
-            Abbeel, ICML 2020).
+        max_filter_rate: largest filter rate in a training, exploration included; if None, no limit. Once the weights
+            have started to change, a filter rate above `max_filter_rate` raises the weight of the filter penalty. A
+            filter rate below `max_filter_rate` lowers the penalty weight, but not below the curriculum's weight. With
+            a fixed penalty, the filter rate is 1 to 6 %, depending on the seed (benchmarks/results/minutes.md).
+            Integral control adapts the logarithm of the penalty weight, as for a Lagrange multiplier (Stooke, Achiam
+            and Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.

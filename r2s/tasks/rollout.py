@@ -162,8 +162,8 @@ def measures(episodes: Episodes) -> dict[str, float]:
     success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
     of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth:
     return_paper computed from speeds without noise, because noise causes false accelerations in eq. (2).
-    time_to_reach_s: median time after which the end effector stays within 2 cm, over the episodes in which it stays
-    there. overshoot_m: mean over episodes of the largest distance beyond 2 cm after the first time within 2 cm. rest:
+    time_to_reach_s: median time after which the end effector stays within 2 cm, over the episodes that end within
+    2 cm. overshoot_m: mean over episodes of the largest distance beyond 2 cm after the first time within 2 cm. rest:
     share of episodes in which every joint is slower than REST throughout the last 0.5 s; joints can move although the
     end effector is at rest. q_left_rad: 5 % quantile over episodes of the smallest distance of a joint from its
     position limits. limited: mean filter rate. collision: share of episodes that a contact ended.

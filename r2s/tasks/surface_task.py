@@ -1,8 +1,8 @@
 """Base class of tasks on a surface: nominal plane, approach, force estimate, and functions for reward terms.
 
-The task contains only the nominal plane. The surface's true plane, stiffness and friction are part of the dynamics
-(`dr=contact`, `arm.surface`). The policy observes a force estimate from q, dq and the commanded torque. Neither
-observation nor controller uses the true force.
+The task contains the nominal plane, not the true one: the surface's true plane, stiffness and friction are part of
+the dynamics (`dr=contact`, `arm.surface`). The policy observes a force estimate from q, dq and the commanded torque.
+Neither observation nor controller uses the true force.
 """
 
 from dataclasses import dataclass, field, replace
@@ -48,14 +48,16 @@ class SurfaceTask(TipTask):
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         force: (low, high) N, range of the requested forces. force_rate: N/s, rate of change of a requested force.
-        approach_speed: m/s, speed at which the target approaches the nominal plane, and highest tip speed at contact.
+        approach_speed: m/s, speed of the target against the nominal normal; the tip meets the surface at this
+            speed or slower.
         clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of a touched point
             from `point`. place, tilt: m and degrees, largest shift and tilt of the true plane from the nominal plane.
-        point, normal: the nominal plane in the base frame, m; None: a work table below the tip in home posture.
+        point, normal: point, m, and normal of the nominal plane in the base frame; if None, those of a work table
+            below the tip in home posture.
         tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of different goals in a training.
-        stop: kind of stop in contact, a key of `r2s.physics.push_limit.STOPS`; None: "release".
+        stop: kind of stop in contact, a key of `r2s.physics.push_limit.STOPS`; if None, "release".
         model: model of the arm. own, parameters: default controller and its parameters. `with_model` sets model, own
             and parameters.
     """
@@ -214,7 +216,7 @@ class SurfaceTask(TipTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return a goal's last numbers, after the start posture, computed from `path` (k, 3) m; by default none."""
+        """Compute from `path` (k, 3) m the numbers that follow the start posture in a goal; by default none."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -224,8 +226,8 @@ class SurfaceTask(TipTask):
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, the depth of the target of the tip's center below the nominal plane at the times t (m,) s.
 
-        The depth grows at `approach_speed` until the tip touches the lowest plane, then at the speed `force_rate` /
-        stiffness.
+        The depth grows at `approach_speed` until the tip touches the lowest plane, then at `force_rate` / `spring`
+        m/s.
         """
         height, K = goals[:, HEIGHT], self.spring
         touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` refers to the tip's center
@@ -290,8 +292,8 @@ class SurfaceTask(TipTask):
     def estimate(self, state: State, normal: np.ndarray, jacobian: np.ndarray | None = None) -> np.ndarray:
         """Return (m,) N, the contact force against `normal` (m, 3), estimated from q, dq and the last command.
 
-        The estimate is quasi-static: F solves J^T F = tau - model(q, dq) by least squares. At rest, joint friction
-        causes an error of up to friction / lever arm. Errors of the arm's model bias the force estimate.
+        The estimate is quasi-static: the force F solves J^T F = tau - model(q, dq) by least squares. At rest, joint
+        friction causes an error of up to friction / lever arm. Errors of the arm's model bias the force estimate.
         """
         jacobian = self.tip(state.q)[1] if jacobian is None else jacobian
         q, dq = np.ascontiguousarray(state.q), np.ascontiguousarray(state.dq)
@@ -324,5 +326,5 @@ def near(error: np.ndarray, coarse: float, fine: float) -> np.ndarray:
 
 
 def rough(ddq: np.ndarray) -> np.ndarray:
-    """Return (m,), 0.03 sum tanh(|ddq| / 10 rad/s^2) over the joints, for ddq (m, n)."""
+    """Return (m,), 0.03 times the sum over the joints of tanh(|ddq| / 10 rad/s^2), for ddq (m, n)."""
     return 0.03 * np.tanh(np.abs(ddq) / 10.0).sum(1)

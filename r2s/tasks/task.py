@@ -34,12 +34,12 @@ class State:
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target torque after the low-pass.
         stopped: (m,), whether the arm has stopped before the end of its episode.
         limited: (m,), share of the last control period in which the safety filter changed the command.
-        noise: (m, n) rad/s, sensor noise that `measured` adds to the true speed dq; None: dq already includes sensor
-            noise, or the sensors have none.
+        noise: (m, n) rad/s, sensor noise that `measured` adds to the true speed dq; None if dq already includes
+            sensor noise, or the sensors have no noise.
         force: (m, 3) N, force that the tool exerts, in base axes: the true force in simulation and on twins, the
-            reported force on other arms; None: unknown. Rewards and measures use `force`, but observations do not.
+            reported force on other arms; None if unknown. Rewards and measures use `force`, but observations do not.
         box: (m, 6), perceived pose of the box in the base frame: the box's center, m, and the direction of the box's
-            first axis; None: the task has no box.
+            first axis; None if the task has no box.
     """
 
     t: np.ndarray
@@ -74,13 +74,14 @@ class Episodes:
     Attributes:
         t: (T,) s, time. q, dq: (E, T, n) rad, rad/s, angles and speeds. ee: (E, T, 3) m, end effector. goal: goal
             positions, (E, 3) m, or (E, T, 3) m if goals move. tau: (E, T, n) Nm, command at the end of each step.
-        distance: (E, T) m; N in task press. reward: (E, T), weighted by `Task.paper_weights`; in task reach, eq. (2).
+        distance: (E, T), distance in m, or force error in N for task press. reward: (E, T), weighted by
+            `Task.paper_weights`; in task reach, eq. (2).
         reward_smooth: (E, T), the reward computed from speeds without measurement noise.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
         collision: (E,) str, time and bodies of the contact that ended the episode; "" without contact.
-        force: (E, T, 2) N, force on the surface and requested force; None: the task touches no surface.
-        box: (E, T, 11), state of the box, see `Task.boxes`; None: the task moves no box.
+        force: (E, T, 2) N, force on the surface and requested force; None if the task touches no surface.
+        box: (E, T, 11), state of the box, see `Task.boxes`; None if the task moves no box.
     """
 
     t: np.ndarray
@@ -108,8 +109,9 @@ class ObservationTerm:
         of: signal in the term: q, dq, ee, goal, error (goal - ee), effort, pull (J^T error), control (torque of a
             controller with `observes_torque`). For tasks with a planned path, goal is the current path position, and
             further signals are ahead (next positions - ee), velocity (of the path), limited, q_off, dq_off (plan -
-            arm).
-        divided_by: divisor of the signal: a number, or one per element; None: 1. tanh: whether tanh is applied last.
+            arm). For tasks on a surface, `MORE_OF` in r2s/export/contract.py lists further signals.
+        divided_by: divisor of the signal: a number, or one per element; if None, 1. tanh: whether tanh is applied
+            last.
     """
 
     name: str
@@ -130,12 +132,12 @@ class Task(Protocol):
             `Episodes.reward`.
         pool: number of different goals in a training.
         speed_noise: rad/s; in a training, each arm's speed noise has at least a random standard deviation ~ U(0,
-            speed_noise); None or 0: no lower bound.
+            speed_noise); if None or 0, there is no lower bound.
         measure_table: the measures that `measures` returns, with their presentation (r2s/tasks/measures.py).
         may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
         touches: whether the tool touches a surface; simulated arms then need `Dynamics.surface`.
         moves_box: whether the surface is a box that the tool pushes; arms must then perceive the box (`State.box`).
-        push_limit: limit of the force and the speed of contacts; None: no limit.
+        push_limit: limit of the force and the speed of contacts, or None without a limit.
     """
 
     @property
@@ -182,7 +184,7 @@ class Task(Protocol):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "Task":
-        """Return the task with limits of contact force, N, and contact speed, m/s; friction: (n,) Nm, of joints."""
+        """Return the task with limits of contact force N and contact speed m/s; friction: (n,) Nm, of the joints."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -253,7 +255,8 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, controller: the task and its controller. goals: (m, ...). state: `observe` adds `State.noise`.
+        task, controller: the task and its controller. goals: (m, ...). state: state to which `observe` adds
+            `State.noise`.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()

@@ -27,7 +27,7 @@ class TipTask(BaseTask):
     own: Impedance | None
 
     def as_reach(self) -> ReachTask:
-        """Return a reach task with the timing, torque limit and noise of this task; raise UserError if wrong."""
+        """Return a reach task with this task's timing, torque limit and noise; raise UserError if one is wrong."""
         return ReachTask(
             self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
         )

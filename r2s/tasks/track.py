@@ -204,8 +204,8 @@ class TrackTask(BaseTask):
         This method does not check for contacts, or whether the curve resembles the paths of a training.
 
         Args:
-            robot: the arm. start: (3,) m, first end-effector position. shape: function from the arc length u (T,) m
-                to the offset (T, 3) m from `start`. pace: m/s, peak du/dt; r2s reduces an infeasible pace.
+            robot: the arm. start: (3,) m, first end-effector position. shape: function from the path parameter u (T,)
+                m to the offset (T, 3) m from `start`. pace: m/s, peak du/dt; r2s reduces an infeasible pace.
 
         Raises:
             UserError: the arm cannot follow the curve.

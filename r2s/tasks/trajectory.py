@@ -1,9 +1,10 @@
 """End-effector trajectories: curves, joint postures along the curves, and the fastest feasible timing.
 
-A curve is a position x(u) in m; u is in m too, and |dx/du| <= 1. Inverse kinematics on a grid of u and a cubic spline
-yield the postures q(u). The pace du/dt rises from 0 to v m/s along a minimum-jerk polynomial and falls likewise at
-the end. Position, velocity and acceleration of end effector and joints are thus continuous. `Paths` reduces the pace
-until torque, speed and acceleration are well within the limits of the arm and of its safety filter.
+A curve is a function x(u) from a path parameter u, in m, to a position, in m, with |dx/du| <= 1. Inverse kinematics
+on a grid of u and a cubic spline yield the postures q(u). The pace du/dt rises from 0 to its peak along a
+minimum-jerk polynomial and falls likewise to 0 at the end. Position, velocity and acceleration of end effector and
+joints are thus continuous. `Paths` reduces the pace until torque, speed and acceleration are well within the limits
+of the arm and of its safety filter.
 """
 
 from collections.abc import Callable
@@ -38,7 +39,7 @@ Curve = Callable[[np.ndarray], np.ndarray]
 
 
 def curve(kind: str, rng: np.random.Generator, size: float, axes: np.ndarray = SPACE) -> Curve:
-    """Return a function u (T,) m -> x(u) - x(0) (T, 3) m: a curve within `size` m of its center, |dx/du| <= 1.
+    """Return a curve, u (T,) m -> x(u) - x(0) (T, 3) m, within `size` m of its center and with |dx/du| <= 1.
 
     axes: (k, 3), orthonormal vectors that span the plane (k = 2) or the space (k = 3) of the curve.
     """

@@ -89,9 +89,10 @@ class WipeTask(SurfaceTask):
     def own_settings(self) -> dict[str, Any]:
         """Stiffness K, N/m, and integral rate r, 1/s, of the default controller, from the tip's effective mass.
 
-        To follow a path, the spring is as stiff as latency allows: K = m w^2, with the smallest effective mass m
-        and w of `fastest_spring`. With critical damping, the largest effective mass M has the characteristic equation
-        M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0, stable for r < r0 = 2 (K/M)^(1/2) (Routh, Hurwitz). r = STEADY r0.
+        To follow a path, the spring is as stiff as latency allows: K = m w^2, where m is the smallest effective mass
+        and w the result of `fastest_spring`. With critical damping, the largest effective mass M has the
+        characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0, stable for r < r0 = 2 (K/M)^(1/2) (Routh,
+        Hurwitz). r = STEADY r0.
         """
         masses = np.linalg.eigvalsh(self.inertia)
         K = float(masses[0] * fastest_spring(self) ** 2)
@@ -139,7 +140,7 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and requested force, N, for hybrid control; the force is linear along the path."""
+        """Return (m, 4), normal and requested force N, for hybrid control; force is linear in time along the path."""
         share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
         force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)

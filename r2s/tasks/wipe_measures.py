@@ -44,7 +44,7 @@ def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, flo
     steps within 2 N and 3 mm. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes never
     qualify. success: share of episodes with `wiped` >= SUCCESS. For episodes without a stop: force_rmse_N and
     path_rmse_mm are RMS errors; impact_N is the mean over episodes of the peak force within IMPACT_S of the first
-    touch.
+    touch, which may precede `begin`.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = ~ended[:, None]

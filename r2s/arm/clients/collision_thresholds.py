@@ -45,10 +45,11 @@ CAUTIOUS = CollisionThresholds()
 
 
 def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
-    """Return thresholds above every contact force that the push limit allows, and at least as high as CAUTIOUS.
+    """Return collision thresholds above every contact force that the push limit allows; without a limit, CAUTIOUS.
 
     On a rigid surface, the tip exerts at most the normal force F that the push limit allows, and the tangential force
-    FRICTION * F. The thresholds are the resulting torques and forces plus ERROR * CAUTIOUS for model errors.
+    FRICTION * F. The thresholds are the resulting torques and forces plus ERROR * CAUTIOUS for model errors, but at
+    least CAUTIOUS.
 
     Raises:
         UserError: the push limit needs thresholds so high that they would switch the reflexes off.

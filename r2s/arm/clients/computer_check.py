@@ -30,7 +30,7 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check for lost or late states; arm, here: (k,) s, times of the states by the arm's and the computer's clock."""
+    """Check for lost or late states, given their times (k,) s by the clocks of arm (`arm`) and computer (`here`)."""
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)

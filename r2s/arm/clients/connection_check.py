@@ -123,13 +123,13 @@ class Connection:
 
 
 def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
-    """Return the gravity torque (n,) Nm at q (n,) rad of nominal links plus `load` (4,), see `mass_and_moment`."""
+    """Return the gravity torque (n,) Nm of nominal links and load at q (n,) rad; `mass_and_moment` defines `load`."""
     rest = np.zeros((1, robot.n))
     return nominal_torque(robot, q[None], rest, rest)[0] + LoadTorque(robot)(q, load)
 
 
 def _load_of(robot: Robot, s: Any) -> np.ndarray:
-    """Return (4,): mass, kg, and first moment, kg m, of end effector plus load according to the arm's RobotState."""
+    """Return mass, kg, and first moment, kg m, of end effector plus load in the RobotState `s`, as one array (4,)."""
     place, axes = ee_pose(robot)
     tool = np.array(s.F_T_EE).reshape(4, 4).T
     flange = axes @ tool[:3, :3].T
@@ -150,7 +150,7 @@ def _posture(arm: ArmType, q: np.ndarray) -> Finding:
 
 
 def _limits(arm: ArmType, robot: Robot) -> list[Finding]:
-    """Check that the model's torque limits do not exceed the arm's, and that its position limits include q_home."""
+    """Check that the robot's torque and rate limits do not exceed the arm's, and that home is within limits."""
     step, torque = robot.dtau_max / arm.dtau_max, robot.tau_max / arm.tau_max
     i, j, home = int(torque.argmax()), int(step.argmax()), robot.q_home
     k = int(np.maximum(robot.q_min - home, home - robot.q_max).argmax())

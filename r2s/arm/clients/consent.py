@@ -13,7 +13,7 @@ class Operator(Protocol):
     """Function that asks the person watching the arm for permission to move."""
 
     def __call__(self, reason: str, /) -> bool:
-        """Return whether the arm may move again; `reason`: reason of the stop."""
+        """Return whether the arm may move again after a stop for the given reason."""
         ...
 
 

@@ -38,7 +38,7 @@ def emulated_arm(
 
     Args:
         robot: nominal model. client: 'panda' or 'fr3'. seed: random seed of the rigid twin that replaces the arm.
-        realtime: whether the emulator runs at 1 kHz; False: it waits for each command (lock-step).
+        realtime: whether the emulator runs at 1 kHz; if False, the emulator waits for each command (lock-step).
         noise, payload, declared_payload, surface: see `TwinBase`.
         operator, collision_torque, collision_force, speed_share, moves: see `Panda`.
     """

@@ -20,7 +20,7 @@ STOP_DISTANCE = 0.02  # rad, braking distance of a joint from 0.2 rad/s; at `mar
 def within_fr3(robot: Robot) -> Robot:
     """Return the robot with its limits clipped to an FR3's and with an FR3's position-dependent velocity limit.
 
-    The new position limits exclude the range in which an FR3 allows no speed, plus STOP_DISTANCE.
+    The new position limits exclude the margin in which an FR3 allows no speed, and a further STOP_DISTANCE.
     """
     margin = fr3_limits.VELOCITY_OFFSET**2 / (2 * fr3_limits.DECELERATION) + STOP_DISTANCE
     return replace(

@@ -2,7 +2,7 @@
 
 libfranka has no point-to-point motion in torque control. `move_to` follows a slow, checked joint path with the
 recorder's tracking controller, in the 1 kHz torque loop that all motions use. `move_to` needs no robot model from
-libfranka, and the same code moves an emulated arm in tests and the hardware.
+libfranka, and the same code moves the hardware and, in tests, an emulated arm.
 """
 
 import weakref
@@ -51,8 +51,9 @@ class Franka:
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked: see `Operated`. A reflex, the stop button (even if a person has released it), a rejected
-            command and a failed `move_to` set `blocked`; a successful `stop` does not. hold: see `Holds`.
+        operator, blocked: see `Operated`. Every stop sets `blocked`, for example a reflex, the stop button (even if a
+            person has released it), a stop by the driver, a rejected command or a `move_to` that failed in motion.
+            Only a successful call of `stop` does not set `blocked`. hold: see `Holds`.
         findings: results of comparing the arm with `connection`.
         realtime: whether motions run in a `realtime_section`. In real time, r2s rejects recordings and episodes in
             which less than 99 % of the commands arrive in time.
@@ -60,10 +61,10 @@ class Franka:
     Args:
         robot: limits and nominal model.
         client: connection to the arm through libfranka.
-        operator: function that is called with a stop's reason before the arm moves again. Without an operator (None),
-            `move_to` raises NotCleared after a stop until a new connection finds the arm ready.
+        operator: function that receives a stop's reason and returns whether the arm may move again. Without an
+            operator (None), `move_to` raises NotCleared after a stop until a new connection finds the arm ready.
         collision: external torque and force at which the arm stops itself.
-        connection: properties that the arm must have; None skips this check.
+        connection: properties that the arm must have; if None, r2s does not check the arm.
         speed_share: factor on all allowed speeds in every motion.
 
     Raises:
@@ -103,15 +104,17 @@ class Franka:
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Move the arm to q (7,) rad at up to a fifth of the speed limits; do nothing if already within 2 mrad of q.
+        """Bring the arm to rest at q (7,) rad at up to a fifth of the speed limits.
 
-        The arm follows the first path of r2s/excitation/paths.py that respects the limits and clearances.
+        The arm follows the first path of r2s/excitation/paths.py that respects the limits and clearances. If the arm
+        is already within 2 mrad of q, the arm does not move.
 
         Raises:
             NotCleared: after an earlier stop, no operator agreed that the arm may move.
             StopRequested: a signal requested a stop, or the policy's process ended; the arm is at rest.
-            ArmStopped: q is outside the limits, the arm is not ready, no path exists, the arm stopped itself, the arm
-                deviated from the path by 0.1 rad (less near obstacles), or the arm came to rest over 10 mrad from q.
+            ArmStopped: before the motion, q is outside the limits, the arm is not ready, or no path exists; in the
+                motion, the arm stopped itself, the driver stopped the arm, the arm deviated from the path by 0.1 rad
+                (less near obstacles), or the arm came to rest over 10 mrad from q.
 
         """
         q = np.array(q, dtype=float)
@@ -151,7 +154,7 @@ class Franka:
         self._send(tau)
 
     def stop(self) -> None:
-        """Damp the motion for at most 0.5 s, then end the motion; keep an earlier reason in `blocked`."""
+        """Damp the motion for at most 0.5 s, then end the motion; do not overwrite an earlier reason in `blocked`."""
         if self._damping:  # the command loop calls `stop` while it damps
             return
         for part in (self._damp, self._end):  # `_end` also runs if damping failed
@@ -167,7 +170,7 @@ class Franka:
             self._stopped = "stop was called"
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of the arm at rest for `seconds`; return times (k,) s of the arm's and the computer's clock."""
+        """Read states of a resting arm for `seconds`; return their times (k,) s by the clocks of arm and computer."""
         return self._client.watch(seconds)
 
     def close(self) -> None:
@@ -229,7 +232,7 @@ class Franka:
         return found
 
     def _read_idle(self) -> None:
-        """Read the state between motions; set tau_J_d to 0, because it is a torque of the arm's own controller."""
+        """Read the state between motions, and replace tau_J_d, a torque of the arm's own controller, by 0."""
         s = self._client.idle()
         self._begun = _ms(s)
         sample = self._sample(s)

@@ -23,7 +23,7 @@ class Client:
     If libfranka reports an error, the called method raises ArmStopped with libfranka's message.
 
     Attributes:
-        name: name of the option `arm=` and of the extra to install. package: name of the Python module.
+        name: value of the setting `arm=`, and name of the extra to install. package: name of the Python module.
         version: version of the arm's FCI.
 
     Args:
@@ -58,7 +58,7 @@ class Client:
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of an arm at rest for `seconds`; return times (k,) s of the arm's and the computer's clock."""
+        """Read states of a resting arm for `seconds`; return their times (k,) s by the clocks of arm and computer."""
         times, begun = [], time.perf_counter()
         while time.perf_counter() < begun + seconds:
             times.append((self._call(self._robot.read_once).time.to_sec(), time.perf_counter()))

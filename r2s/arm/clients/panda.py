@@ -77,7 +77,7 @@ class _Motion:
         return state  # the state is None only after the answer None
 
     def answer(self, tau: np.ndarray | None) -> None:
-        """Answer the last state from `next` with the command tau (7,) Nm; None ends the motion."""
+        """Answer the last state from `next` with the command tau (7,) Nm; if tau is None, end the motion."""
         self._answers.put(tau if tau is None else tau.tolist())
 
     def join(self) -> None:
@@ -132,7 +132,8 @@ class Panda(Franka):
         realtime: whether to require a real-time kernel and priority; True for hardware, False for the emulator.
         collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
         declared_payload: payload that the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
-            `payload_of`. r2s does not move an arm that assumes another mass. moves: see `Connection`.
+            `payload_of`. r2s does not move an arm whose gravity compensation assumes another mass.
+        moves: see `Connection`.
 
     Raises:
         UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the connected arm

@@ -143,7 +143,7 @@ class Control:
         self._sense()
 
     def cycle(self, tau: np.ndarray | None) -> None:
-        """Advance the arm by 1 ms under tau (7,) Nm; without an answer (None), the last torque continues to act."""
+        """Advance the arm by 1 ms under tau (7,) Nm; if tau is None (no answer), the last torque continues to act."""
         if self._has("late"):
             tau = None
         self._answered.append(tau is not None)
@@ -186,7 +186,7 @@ class Control:
             self._place(self._arm.read().q)
 
     def idle(self, ms: int) -> None:
-        """Let `ms` pass between two motions; the arm becomes idle when the stop button is released."""
+        """Let `ms` milliseconds pass between two motions; the arm becomes idle when the stop button is released."""
         if self._mode == fci.USER_STOPPED and self._pressed_ms > 0:
             self._pressed_ms -= ms
             if self._pressed_ms <= 0:

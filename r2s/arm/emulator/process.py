@@ -1,4 +1,4 @@
-"""Emulate a Franka control box, to which libfranka's clients connect on loopback, in a separate process.
+"""Emulate, in a separate process, a Franka control box to which libfranka's clients connect on loopback.
 
     with Emulator(partial(RigidTwin, robot, 3), version=5) as address:
         arm = Panda(robot, address, operator=lambda reason: True)
@@ -32,9 +32,9 @@ class Emulator:
     """Runs a `Server` in a child process, which ends when the context or the parent process ends.
 
     Args:
-        make_arm: picklable function that creates the arm in the child process: `partial(RigidTwin, robot, 3)`.
+        make_arm: picklable function that creates the arm in the child process, like `partial(RigidTwin, robot, 3)`.
         version: FCI version: 5 for libfranka 0.9 (Panda), 10 for libfranka 0.18 and later (FR3).
-        realtime: whether the emulator runs at 1 kHz; False: it waits for each command (lock-step).
+        realtime: whether the emulator runs at 1 kHz; if False, the emulator waits for each command (lock-step).
         faults: faults that the emulator injects.
         max_missed: consecutive unanswered cycles after which the arm stops. desk: settings of the box, see `Control`.
     """

@@ -34,7 +34,7 @@ class BoxModel:
         self._place, self._axes = ee_pose(robot)
 
     def pose(self, q: np.ndarray, tool: np.ndarray) -> np.ndarray:
-        """Return a frame's pose (4, 4) in the base frame at q (n,) rad; tool: (4, 4), pose in the flange frame."""
+        """Return the base-frame pose (4, 4), at q (n,) rad, of a frame with the flange-frame pose `tool` (4, 4)."""
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         flange = np.eye(4)
@@ -43,9 +43,10 @@ class BoxModel:
         return flange @ tool
 
     def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that best fits J^T wrench = torque (n,) Nm.
+        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that best explains joint torque (n,) Nm.
 
-        Near a singularity the wrench is zero, as in libfranka.
+        The wrench F minimizes |J^T F - torque| with the frame's Jacobian J. Near a singularity the wrench is zero, as
+        in libfranka.
         """
         place, j = self.pose(q, tool)[:3, 3], self._jacobian
         mujoco.mj_comPos(self._model, self._data)
@@ -61,6 +62,6 @@ class BoxModel:
         return self._data.qfrc_bias + self._load(q, self._carried(s), s["O_ddP_O"])
 
     def _carried(self, s: np.ndarray) -> np.ndarray:
-        """Return (4,): mass, kg, and first moment, kg m, of end effector plus load, in the last link's frame."""
+        """Return mass, kg, and first moment, kg m, of end effector plus load in the last link's frame, as (4,)."""
         parts = ((s["m_ee"], s["F_x_Cee"]), (s["m_load"], s["F_x_Cload"]))
         return np.sum([np.append(m, m * (self._place + self._axes @ x)) for m, x in parts], axis=0)

@@ -38,7 +38,7 @@ class Server:
         self._reset()
 
     def serve(self, parent: int) -> None:
-        """Serve clients until the parent process ends; parent: file descriptor that signals this end."""
+        """Serve clients until the file descriptor `parent` signals that the parent process has ended."""
         with realtime_section() if self._realtime else contextlib.nullcontext():
             self._serve(parent)
 
@@ -204,7 +204,7 @@ class Server:
             self._finish(self._control.aborted_as)
 
     def _tick(self) -> None:
-        """Send the state that is due, in real time after running an unanswered cycle; schedule the next state."""
+        """Send the state that is due, and schedule the next state; in real time, first run an unanswered cycle."""
         assert self._due is not None
         if self._started and self._realtime:
             if not self._ahead:

@@ -36,7 +36,7 @@ def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw 8 parameters per joint (8, n): torque offset, Nm; 4 arguments of `drag`; noise of q, dq and tau_J.
+    """Draw rows (8, n) of torque offset, Nm, 4 arguments of `drag`, and standard deviations of noise on q, dq, tau_J.
 
     Args:
         robot: the arm. rng: random number generator. hold: (n,) Nm, lower bound of each joint's stiction.

@@ -91,7 +91,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
 
 @njit(cache=True)
 def _active(line, cycle, t, delay):
-    """Return the row in `line` of the newest command in effect at time t, in cycles; -1: no such command."""
+    """Return the row in `line` of the newest command in effect at time t, in cycles, or -1 if none is in effect."""
     slots, arrival = len(line), line.shape[1] - 1
     for k in range(cycle, max(cycle - slots, -1), -1):
         if line[k % slots, arrival] + delay <= t:
@@ -112,7 +112,7 @@ def _commanded(line, cycle, begin, end, delay, i):
 
 @njit(cache=True)
 def compensate(p, s, gravity):
-    """Write to row ADDED the torque that the arm adds to a command: gravity (n,) Nm plus part of the friction."""
+    """Write to row ADDED the torque that the arm adds to a command: `gravity` (n,) Nm and friction compensation."""
     for i in range(s.shape[1]):
         dq = s[DQ_MEASURED, i]
         s[ADDED, i] = gravity[i] + p[HELP, i] * np.tanh(dq / p[HELP_WIDTH, i]) + p[HELP_VISCOUS, i] * dq
@@ -126,7 +126,7 @@ def advance(p, s, arm, line, cycle, steps, age):
         p: joint parameters (ROWS, n). s: joint states (STATES, n), updated in place.
         arm: (links, gravity, touch) of the true arm; touch contains the attributes contact, jacobian, frames, axes
             and there of `Touch`.
-        line: (slots, n + 1), the last commands, Nm, and the arrival time of each, cycles. cycle: index of this cycle.
+        line: (slots, n + 1), the last commands, Nm, and their arrival times in cycles. cycle: index of this cycle.
     """
     links, gravity, touch = arm
     n, h = s.shape[1], SIM_DT / steps
@@ -183,7 +183,7 @@ def _touch(s, links, touch, h, out):
 
 @njit(cache=True)
 def _external_forces(p, s, f, line, cycle, begin, end, h):
-    """Write to `f` motor and spring torques, friction factors and velocities of a step; begin, end: times, cycles."""
+    """Write to `f` a step's motor and spring torques, friction factors and velocities; begin, end: times, cycles."""
     for i in range(s.shape[1]):
         target = s[ADDED, i] + _commanded(line, cycle, begin, end, p[DELAY, i], i)
         change = (target - s[MOTOR, i]) * -np.expm1(-h / p[LAG, i])

@@ -62,8 +62,9 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
     """Apply a command; return passive torque (n,) Nm and implicit damping (n,) Nm s/rad for the engine's step.
 
     Gauss-Seidel iteration solves the coupled implicit equation mass (w - v) / h + bias + f(w) = drive for the next
-    velocity w. Each joint's equation has an exact solution, because the bristle's backward Euler step
-    z' = (z + h w) / (1 + k |w|), k = h s0 / g, makes the equation quadratic in w, with one root of the right sign.
+    velocity w; v is the present velocity, h the time step and f the friction. Each joint's equation has an exact
+    solution, because the bristle's backward Euler step z' = (z + h w) / (1 + k |w|), k = h s0 / g, makes the equation
+    quadratic in w, with one root of the right sign.
 
     Args:
         p: joint parameters. s: joint states. line: (slots, n) Nm, the last commands. cycle: index of this cycle.
@@ -157,7 +158,8 @@ def sense(p, s, mass, noise):
     """Update bristles, friction, bias torque and sensor values after the engine has taken its step.
 
     Args:
-        p: joint parameters. s: joint states; Q, V: angle and velocity after the step; V_BEFORE: velocity before.
+        p: joint parameters.
+        s: joint states; Q, V: angle and velocity after the step; V_BEFORE: velocity before the step.
         mass: (n, n) kg m^2, mass matrix. noise: (3, n), standard normal, for the sensors of q, dq and tau_J.
     """
     n, h, v, before = s.shape[1], SIM_DT, s[V], s[V_BEFORE]

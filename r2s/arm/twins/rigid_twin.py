@@ -7,8 +7,9 @@ determines the robot's parameters, which only the twin reads. Seeds 0-9 are for 
 for final evaluation.
 
 In each cycle, delay and lag act on the command first. lugre_joints.py then solves the next step implicitly for joint
-velocities, friction and contact force. DART integrates the step with this contact force and with the friction,
-linearized about the computed velocities. Finally the sensors measure the new state.
+velocities, friction and contact force. DART integrates the step with the contact force and friction that
+lugre_joints.py has computed; the friction is linearized about the computed velocities. Finally the sensors measure
+the new state.
 """
 
 from typing import Any

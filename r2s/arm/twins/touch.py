@@ -121,9 +121,9 @@ class Touch:
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
     """Draw a random surface near the nominal pose that the setting `surface` describes.
 
-    False: no surface. True: a work table below the tip of the home posture. {point: m, normal}: a plane through the
-    point. box: a box with edges `r2s.physics.box.SIZE` on a work table ahead of the tip. {box: [3 edges, m]}: a box
-    with the given edges; if point and normal are also given, the box stands at the point.
+    False: no surface. True: a work table below the tip of the home posture. {point: (3,) m, normal: (3,)}: a plane
+    through the point. box: a box with edges `r2s.physics.box.SIZE` on a work table ahead of the tip. {box: (3,) m}: a
+    box with the given edges; if point and normal are also given, the box stands at the point.
 
     Raises:
         UserError: `surface` is invalid, the robot has no tool, or the surface contains the home posture's tip.

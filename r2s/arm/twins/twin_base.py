@@ -29,7 +29,7 @@ class TwinBase:
     A variant implements `_start(q)` (place the arm), `_advance(tau)` (run a cycle with a command), `_attach(payload)`
     (change the payload at once) and `_sensors()` (return q, dq and tau_J). A variant sets `_cycle`, `_tau_J_d`, `_q`
     and `_dq`; the reflexes check `_q` and `_dq`. A variant multiplies its friction by `_friction_scale`, and
-    applies the contact force of `_touch` to its links. `_link_q` are the angles of the links.
+    applies the contact force of `_touch` to its links. `_link_q` (n,) rad contains the angles of the links.
 
     Attributes:
         robot, declared_payload: see Args.
@@ -39,7 +39,7 @@ class TwinBase:
         payload: carried body, a point mass in kg or a mapping, see `r2s.physics.payload.payload_of`.
         declared_payload: payload that the arm's gravity compensation assumes (libfranka's setLoad), in the format of
             `payload`; None: no payload.
-        stiffness: Nm/rad, gear stiffness of the strongest joints; a gear's stiffness is proportional to tau_max.
+        stiffness: Nm/rad, gear stiffness of the strongest joints; each gear's stiffness is proportional to tau_max.
         noise: stream number of the sensor noise; two recordings of one robot need different numbers.
         friction_scale: factor on the drawn friction, except on its load-dependent part; below 1 for a warm arm.
         extra_delay_s: s, delay of commands in addition to the twin's own delay; a whole number of ms.

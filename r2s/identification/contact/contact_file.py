@@ -1,4 +1,4 @@
-"""Write and read contact.yaml and contact_posterior.npz, an identified surface for other stages and programs."""
+"""Write and read contact.yaml and contact_posterior.npz, which pass an identified surface to other programs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,8 @@
 """Identify a surface that an arm has pressed: stiffness, exponent, damping, friction and plane, with intervals.
 
 If an arm's encoders are on the motors, the gears' deflection adds to the penetration of the surface. r2s estimates
-the surface first with rigid gears, then with compliant gears, whose prior may use a stated stiffness.
+the surface first with rigid gears, then with compliant gears. If the user gives the gears' stiffness, the prior of
+the compliance uses this stiffness.
 """
 
 from collections.abc import Callable
@@ -45,13 +46,15 @@ class ContactEstimate:
 
     Attributes:
         surface: the estimate; `surface.point` is the mean of the tip centers in contact, projected onto the plane.
-        draws: posterior draws {name: (S, ...)} of the parameters, point and normal of a `Surface`; `slope`: slope of
-            the force curve at LOAD, N/m; `gears`: (S, n) rad/Nm, compliance of the gears.
+        draws: posterior draws {name: (S, ...)} of the parameters, point and normal of a `Surface`, of the force
+            curve's `slope` at LOAD, N/m, and of the compliance (S, n) rad/Nm of the `gears`.
         identifiable: {name: whether the data determine this value}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
-        training: predicted and measured forces of fitted presses. validation: forces of other presses, or None.
-        gears: (n,) rad/Nm, compliance of the gears, if encoders are on the motors; 0: rigid gears or encoders on
-            links. For a hardly loaded joint, the ratio of deflection to mean deflection keeps its prior value.
+        training: predicted and measured forces of fitted presses. validation: forces of presses that were not fitted;
+            None if there are no such presses.
+        gears: (n,) rad/Nm, compliance of the gears, for encoders on the motors; 0 for rigid gears or encoders on the
+            links. For a joint with little load, the ratio of its deflection to the mean deflection remains at the
+            prior mean.
         stated: whether the user stated the stiffness of the gears.
         tau_max: (n,) Nm, largest torques of the joints.
         rigid_gears: the estimate for simulations with rigid gears; its surface includes the compliance of the gears.
@@ -110,9 +113,9 @@ def identify_contact(
 
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
-        held_out: presses on the same surface for validation; None: validate on the last press, after a refit without
-            it.
-        gears: prior of the gears' deflection; None: the prior for gears of unknown stiffness.
+        held_out: presses on the same surface for validation; if None, the last press validates a refit without this
+            press.
+        gears: prior of the gears' deflection; if None, the prior is that for gears of unknown stiffness.
         seed: seed of the posterior's draws. report: function that receives the completed share and the next step.
 
     Raises:
@@ -135,7 +138,7 @@ def identify_contact(
 
 
 def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | None, refit: Fit) -> Press | None:
-    """Return forces in unfitted presses: all presses in `other`, else the last press after a refit without it.
+    """Return the forces of all presses in `other` or, if None, of the last press after a refit without this press.
 
     Return None if `other` is None and there are fewer than two presses.
     """
@@ -149,11 +152,11 @@ def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | No
 
 
 def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
-    """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution for rigid gears u (8,).
+    """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution u (8,) for rigid gears.
 
     The weights remain those of the fit with rigid gears. Weights from the smaller residual of elastic gears would
-    ignore the friction law's error: on the elastic twins 0 to 9, 23 of 80 intervals (not 9) would miss the true
-    value.
+    ignore the friction law's error: on the elastic twins 0 to 9, the number of intervals that miss the true value
+    would rise from 9 to 23 of 80.
     """
     return _fitted(problem, problem.space.with_gears(u))
 

@@ -2,7 +2,8 @@
 
 MuJoCo's contact force is d (aref - a0) / A with impedance d, reference acceleration aref, inverse mass A and free
 acceleration a0 (MuJoCo documentation, Computation: Constraint model). For a small impedance d, a contact is a spring
-and damper with coefficients solref / A (N/m, Ns/m). A high `impratio` makes friction stiff although d is small.
+and damper with coefficients solref / A (N/m, Ns/m). A high `impratio` makes friction stiff although the impedance d
+is small.
 """
 
 import xml.etree.ElementTree as ET
@@ -43,7 +44,8 @@ def inverse_mass(robot: Robot) -> float:
 def mujoco_contact(surface: Surface, inverse_mass: float) -> dict[str, Any]:
     """Return MuJoCo's parameters of the contact between the plane and a body with `inverse_mass`, 1/kg.
 
-    solref is (-stiffness, -damping). The plane must be fixed, and body and plane must have equal contact parameters.
+    solref is (-stiffness, -damping). The plane must be fixed, and both geoms, of body and plane, must have these
+    contact parameters.
     """
     slope, damping, deeper = linearized(surface)
     share = (1.0 - IMPEDANCE) * inverse_mass

@@ -28,15 +28,16 @@ PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least-squares problem in u (U,) of surface and gears, and in model errors w (r,) ~ N(0, I) of the arm.
+    """Least-squares problem for a vector u (U,) of surface and gears, and the arm's model errors w (r,) ~ N(0, I).
 
     Each of the residual's R rows is a mean over a window in which a joint slides in one direction (see
     `TorqueResidual`). Resting joints have no rows, because their friction may have any value between the breakaway
-    torques. Because the residual is linear in w, a closed form eliminates w (variable projection: Golub and Pereyra,
-    SIAM J. Numer. Anal. 10, 1973).
+    torques. Because the residual is linear in the model errors w, a closed form eliminates w (variable projection:
+    Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
-    Encoders on the motors do not measure the gears' deflection by gravity (`sag`) and contact. In contact, gears and
-    surface are springs in series. Presses with different lever arms distinguish the stiffness of gears and surface.
+    Encoders on the motors do not measure the gears' deflection, neither by gravity (`sag`) nor by contact. In
+    contact, gears and surface are springs in series. Presses with different lever arms distinguish the gears'
+    stiffness from the surface's.
 
     Attributes:
         torque: torque residual without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
@@ -73,7 +74,7 @@ class ContactProblem:
         return np.unique(self.torque.clusters[self.rows.ravel()], return_inverse=True)[1]
 
     def contact(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return joint torque (F, n) Nm, normal force (F,) N, depth (F,) m and its rate (F,) m/s for u (U,)."""
+        """Return joint torque (F, n) Nm, normal force (F,) N, depth (F,) m, depth rate (F,) m/s at vector u (U,)."""
         tip = self.tip
         if len(u) > SURFACE:
             soft = self.space.compliance(u)
@@ -81,21 +82,21 @@ class ContactProblem:
         return tip.contact_of(*self.space.plane(u), self.space.law(u))
 
     def contact_torque(self, u: np.ndarray) -> np.ndarray:
-        """Return the joint torque (T, n) Nm of contact for u (U,), averaged over each window."""
+        """Return the joint torque (T, n) Nm of contact for the surface vector u (U,), averaged over each window."""
         return self.motion.filtered(self.contact(u)[0])
 
     def data(self, u: np.ndarray) -> np.ndarray:
-        """Return the residual (R,), in standard deviations, for u (U,) and model errors w = 0."""
+        """Return the residual (R,), in standard deviations, for the surface vector u (U,) and model errors w = 0."""
         return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
 
     def slope(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivative (R, U) of `data` with respect to u (U,)."""
+        """Return the derivative (R, U) of `data` with respect to the surface vector u (U,)."""
         h, here = np.where(u > 0.5, -STEP, STEP), self.data(u)
         return np.stack([(self.data(stepped) - here) / s for stepped, s in zip(u + np.diag(h), h, strict=True)], 1)
 
     @cached_property
     def arm(self) -> np.ndarray:
-        """Derivative (R, r) of the scaled residual with respect to the arm's errors w."""
+        """Derivative (R, r) of the scaled residual with respect to the arm's model errors w."""
         return (self.directions / self.sigma[..., None])[self.rows]
 
     @cached_property
@@ -103,7 +104,7 @@ class ContactProblem:
         return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
 
     def best_arm(self, u: np.ndarray) -> np.ndarray:
-        """Return the errors w (r,) of the arm's model that minimize the cost for a given u (U,)."""
+        """Return the arm's model errors w (r,) that minimize the cost for a given surface vector u (U,)."""
         return self._gain @ self.data(u)
 
     def _projected(self, rows: np.ndarray) -> np.ndarray:
@@ -111,7 +112,7 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + r + U) of vectors u (C, U): data rows at the best w, prior rows of w and u."""
+        """Return residuals (C, R + r + U) of vectors u (C, U): data at the best model errors w, priors of w and u."""
         center, weight = self.space.prior(trials.shape[1])
         return np.stack([np.concatenate([self._projected(self.data(u)), weight * (u - center)]) for u in trials])
 
@@ -120,12 +121,12 @@ class ContactProblem:
         return np.concatenate([self._projected(self.slope(u)), np.diag(self.space.prior(len(u))[1])])
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-        """Return the vector u (U,) of a local minimum near u, and the sum of squares at this minimum."""
+        """Return the vector u (U,) of a local minimum near the given u, and the sum of squares at this minimum."""
         u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with row weights from the size and the correlation of the residual at u (U,)."""
+        """Return the problem with row weights from the size and correlation of the residual at a vector u (U,)."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))
@@ -135,7 +136,7 @@ class ContactProblem:
         return replace(self, torque=self.torque.within(kept))
 
     def whole(self, u: np.ndarray) -> np.ndarray:
-        """Return u (U,) and the best w (r,) for u in one vector (U + r,) on the unit cube, for `linearize`."""
+        """Return the vector u (U,) and the best model errors w (r,) as one vector (U + r,) on the unit cube."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -155,7 +156,7 @@ def contact_problem(
 
     Args:
         space: parameter space of an arm with a tool. x: (P,), values of the arm's parameters.
-        samples: (S, P), posterior draws of x; None: the arm's uncertainty is only the drift DRIFT.
+        samples: (S, P), posterior draws of x; if None, the arm's only uncertainty is the drift DRIFT.
         recording: recording with commanded torque. surfaces: the space of the unknown surface.
     """
     torque = TorqueResidual(space, recording, slowest=SLOWEST)

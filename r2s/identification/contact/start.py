@@ -56,7 +56,7 @@ def first_guesses(
 def _starts(
     surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield a start vector u for each normal (3,) and exponent; a line fit to height over force yields stiffness."""
+    """Yield a start vector u for each normal (3,) and exponent; stiffness is from a line fit to height over force."""
     for normal in normals:
         height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
         slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0
@@ -71,7 +71,7 @@ def _starts(
 def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return tip center (T, 3) m, force on the tip (T, 3) N, and (T,) whether the force is certainly above 0.
 
-    The force is a weighted fit to joint torques below 10 Hz, with low weights where joints rest (unknown friction).
+    The force is a weighted fit to joint torques below 10 Hz; resting joints have low weights (unknown friction).
     """
     space, motion = torque.space, torque.motion
     d = space.dynamics(x)

@@ -61,7 +61,7 @@ def unknown_gears(n: int) -> Gears:
 def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float = 0.1) -> Gears | None:
     """Return the prior of gears of known stiffness, or None if `stiffness` is None.
 
-    Half of the stiffness's variance is an error that all gears have in common, such as an error of the data sheet.
+    Half of the variance of the stiffness is common to all gears, for example due to an error in the data sheet.
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints.
@@ -94,8 +94,9 @@ class SurfaceSpace:
     """The space of surfaces near a plane through `origin` (3,) m with unit normal `normal` (3,).
 
     A vector u contains two tilts of the plane about axes through `origin`, the tip's height along the normal under
-    the force LOAD, and five values of the force law. If the gears are elastic, u also contains their mean
-    deflection at the largest torques, and each joint's relative deviation from this mean times `Gears.shape`.
+    the force LOAD, and five values of the force law. If the gears are elastic, u also contains the gears' mean
+    deflection at the largest torques, and for each gear the relative deviation of its deflection from this mean times
+    `Gears.shape`.
 
     Attributes:
         tau_max: (n,) Nm, largest torques of the joints. gears: prior of the gears' deflection.
@@ -114,7 +115,7 @@ class SurfaceSpace:
         return np.stack([first, np.cross(self.normal, first)])
 
     def plane(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a point (..., 3) m and the normal (..., 3) of the plane that u (..., U) describes."""
+        """Return a point (..., 3) m and the normal (..., 3) of the plane that the vector u (..., U) describes."""
         p = LOWER + u[..., :SURFACE] * WIDTH
         normal = self.normal + p[..., :2] @ self.axes
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -122,13 +123,13 @@ class SurfaceSpace:
         return self.origin + height[..., None] * normal, normal
 
     def law(self, u: np.ndarray) -> np.ndarray:
-        """Return the force law's five values (..., 5) for u (..., U), in the order that `contact_law` returns."""
+        """Return the force law's five values (..., 5) for vectors u (..., U), in the order of `contact_law`."""
         p = LOWER + u[..., :SURFACE] * WIDTH
         K = LOAD / (LOAD * p[..., 4] / np.exp(p[..., 3])) ** p[..., 4]
         return np.stack([K, p[..., 4], p[..., 5], p[..., 6], np.exp(p[..., 7])], -1)
 
     def compliance(self, u: np.ndarray) -> np.ndarray:
-        """Return the joint compliance (..., n) rad/Nm of the gears in u (..., U), 0 if u has only surface values."""
+        """Return the gears' compliance (..., n) rad/Nm in vectors u (..., U), or 0 if u contains no gear values."""
         if u.shape[-1] == SURFACE:
             return np.zeros((*u.shape[:-1], len(self.tau_max)))
         relative = 1.0 + FARTHEST * (2.0 * u[..., SURFACE + 1 :] - 1.0)
@@ -145,7 +146,7 @@ class SurfaceSpace:
         return self.with_gears(np.full(SURFACE, 0.5))[:count], weight[:count]
 
     def surface(self, u: np.ndarray) -> Surface:
-        """Return the surface that u (U,) describes."""
+        """Return the surface that the vector u (U,) describes."""
         point, normal = self.plane(u)
         K, *rest = self.law(u).tolist()
         return Surface(point, normal, K * UNIT_DEPTH ** (rest[0] - 1.0), *rest)
@@ -155,6 +156,6 @@ class SurfaceSpace:
         return self.axes @ (normal / (normal @ self.normal)) / WIDTH[:2]
 
     def unit(self, height: float, slope: float, exponent: float, friction: float) -> np.ndarray:
-        """Return u (8,) of an untilted plane, given the tip's height, m, and the force's slope, N/m, under LOAD."""
+        """Return vector u (8,) of an untilted plane, given the tip's height, m, and the force slope, N/m, at LOAD."""
         p = np.array([0.0, 0.0, height, np.log(slope), exponent, 0.0, friction, np.log(2e-4)])
         return np.clip((p - LOWER) / WIDTH, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Compute a tool tip's motion in a recording, and the joint torque of its contact with a surface."""
+"""Compute a tool tip's motion in a recording, and the joint torque of the tip's contact with a surface."""
 
 from dataclasses import dataclass, field
 
@@ -41,7 +41,7 @@ class TipMotion:
 
     @staticmethod
     def of(robot: Robot, q: np.ndarray, dq: np.ndarray, step: float, starts: np.ndarray, play: float) -> "TipMotion":
-        """Return the motion of the tip of `robot.tool` at q, dq (F, n) rad, rad/s."""
+        """Return the motion of the tip of `robot.tool` for joint motion q, dq (F, n) rad, rad/s."""
         assert robot.tool is not None
         links = links_of(robot, robot.mass, robot.com, robot.inertia)
         place, axes_of_site = ee_pose(robot)
@@ -87,9 +87,10 @@ def _frames(links, q, frames, axes):
 def _contact(motion, settings, point, normal, law, tau, out):
     """Write joint torque into tau (F, n); write normal force, penetration depth and depth rate into out (3, F).
 
-    Friction is mu F z with the bristle deflection z (Dahl 1968 in two dimensions): dz = (dx - |dx| z) / bristle. In
-    dx, x is the tip's deepest point, projected onto the surface. Encoder noise of a resting tip adds up in |dx| and
-    would relax the bristles, so a path shorter than `play` only bends bristles elastically.
+    The friction of a normal force F is mu F z, with friction coefficient mu and bristle deflection z (Dahl 1968 in
+    two dimensions): dz = (dx - |dx| z) / bristle, where x is the tip's deepest point, projected onto the surface.
+    Encoder noise of a resting tip adds up in the path |dx| and would relax the bristles, so a path shorter than
+    `play` only bends bristles elastically.
 
     Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
     with Jacobian J, normal n, compliances C and contact force F g = F (n - mu z). `bristle` includes the gears'
@@ -154,7 +155,7 @@ def _contact(motion, settings, point, normal, law, tau, out):
 
 @njit(cache=True, error_model="numpy")
 def _in_series(soft, K, exponent, damping, depth, rate):
-    """Return force, depth and depth rate of a surface in series with a spring (`soft`, m/N) by Newton's method.
+    """Compute force, depth and depth rate of a surface in series with a spring (`soft`, m/N) by Newton's method.
 
     depth, rate: m, m/s, total deflection of spring and surface, and its rate. The returned rate of the surface's
     depth neglects damping.

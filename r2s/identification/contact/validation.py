@@ -30,7 +30,7 @@ class Press:
     row_s: float
 
     def summary(self) -> dict[str, float]:
-        """Return the entry of summary.json: compared time, s, and force RMSE, N, in total, loading and unloading."""
+        """Return the entry of summary.json: compared time, s, and force RMSE, N (total, in loading, in unloading)."""
         sides = {"loading": 1.0, "unloading": -1.0}
         errors = {f"{name}_force_rmse_N": self.rmse(side) for name, side in sides.items()}
         return {"seconds": len(self.t) * self.row_s, "force_rmse_N": self.rmse(), **errors}
@@ -42,7 +42,7 @@ class Press:
 
 
 def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
-    """Return a mask (T,) for each press on a surface u (U,), in order of time, including GUARD_S before and after."""
+    """Return a mask (T,) for each press on a surface u (U,), in order of time, extended by GUARD_S at both ends."""
     motion = problem.motion
     at = motion.instants[_depth(problem, u) > 0]
     if not len(at):

@@ -3,20 +3,22 @@
 A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). At the end of a ramp, the
 joint has accelerated for 10 to 150 ms, and the command exceeds the breakaway command. Before breakaway, a physical
 joint also creeps: bristles bend by millirads, at a growing rate. Neither a threshold nor a parabola separates creep
-from breakaway. In the model that r2s fits, a joint at x creeps at first, and slides when the command u exceeds U:
+from breakaway. In the model that r2s fits, a joint at position x creeps at first, and slides when the command u
+exceeds the breakaway command U:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
-The command u at the joint is positive in the ramp's direction, and kappa is the inverse inertia. Below the command U,
-stiction balances u, and bristles bend over the creep length z (Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976). At
-breakaway, friction falls from U to a lower value (0 in the paper's eq. 6, where z = 0); `jump` is this decrease times
-kappa. The fit without `Slide` estimates all parameters of the equation and needs no model of the arm.
+The command u at the joint is positive in the ramp's direction, and kappa is the inverse inertia. Below the breakaway
+command U, stiction balances the command u, and bristles bend over the creep length z (Dahl, J. Dyn. Sys. Meas.
+Control 98(4), 1976). At breakaway, friction falls from U to a lower value (0 in the paper's eq. 6, where z = 0);
+`jump` is this decrease times kappa. The fit without `Slide` estimates all parameters of the equation and needs no
+model of the arm.
 
 If friction falls over a range of velocities (Stribeck), motion begins slowly, and the sudden `jump` makes the fit
 without `Slide` overestimate U (by 4 to 22 mNm on an arm with known U). The fit with `Slide` uses parameters of an
-identified arm and replaces `jump` by jump (1 - exp(-(v / fall)^2)). On the arm with known U, the error of the fit
-with `Slide` was below 0.2 mNm. r2s uses the fit with `Slide` if it explains the motion as well as the fit without
-`Slide`.
+identified arm and replaces `jump` by jump (1 - exp(-(v / fall)^2)), with velocity v and Stribeck velocity `fall`. On
+the arm with known U, the fit with `Slide` erred by less than 0.2 mNm. r2s uses the fit with `Slide` if it explains
+the motion as well as the fit without `Slide`.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,7 +36,7 @@ MOVED = 5e-3  # rad, largest motion of the rows in a fit; joints creep 1 to 3 mr
 MIN_ROWS = 10  # least number of rows in a fit
 ENCODER = 2e-5  # rad, standard deviation of position residuals: encoder noise of a Panda
 DIFFERENCE = 1e-3  # finite-difference step, relative to the scale of each parameter
-RELEASE_S = 2e-3  # s, accuracy of the fitted time of breakaway
+BREAKAWAY_S = 2e-3  # s, accuracy of the fitted time of breakaway
 STEP = 1e-3  # s, longest integration step
 # bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), rest (rad) and drift (rad/s)
 LOW = np.log(1e-5), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
@@ -59,7 +61,7 @@ class Breakaway:
         spread: (n, 2) Nm, standard deviation of the breakaway command over ramps; NaN for fewer than two ramps.
         count: (n, 2), number of ramps with a breakaway. ramped: (n, 2), number of all ramps.
         held: (n, 2) Nm, largest command without motion if the joint broke away in no ramp; 0 otherwise.
-        resolution: (n, 2) Nm, accuracy of a ramp's breakaway command: `RELEASE_S` times the ramp's rate.
+        resolution: (n, 2) Nm, accuracy of a ramp's breakaway command: `BREAKAWAY_S` times the ramp's rate.
         value: (K,) Nm, breakaway command of each ramp; NaN without breakaway.
         misfit: (K,) rad, RMS difference between measured and fitted positions. A misfit well above the encoder noise
             (or above 5e-5 rad for physical stick-slip) shows that the model does not describe the joint's motion.
@@ -95,9 +97,9 @@ class Slide:
 
     Attributes:
         kappa: (K,) rad/s^2 per Nm, inverse inertia of the ramped joint while the other joints rest.
-        level: (K,) Nm, command that sustains slow sliding, above `fall`: Coulomb friction minus other torques.
+        level: (K,) Nm, command that sustains slow sliding above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad, viscous friction.
-        fall: (K,) rad/s, Stribeck velocity: friction falls from breakaway to `level` as exp(-(v / fall)^2).
+        fall: (K,) rad/s, Stribeck velocity: friction falls to `level` as exp(-(v / fall)^2) with the speed v.
         misfit: (K,) rad, `Breakaway.misfit` of the fits without `Slide`, see WORSE.
     """
 
@@ -113,14 +115,15 @@ def estimate_breakaway(
 ) -> Breakaway:
     """Estimate, from t, q and tau of the ramps, the commands at which joints broke away.
 
-    The estimate is NaN if the joint moves less than MOVED rad in the ramp's direction, or before the command rises.
+    The estimate is NaN if the joint moves by less than MOVED rad in the ramp's direction, or if the joint moves
+    before the command rises.
 
     Args:
-        ramps: recorded ramps at any rate, in which the command rises from rest (falls for sign -1). For an encoder
-            noise of 2e-5 rad, the estimate's error is the ramp's rate times 0.5 ms (small inertia) to 3 ms (large
-            inertia).
-        delay, lag: s, dead time and time constant between command and torque; r2s adds half of the hold to `delay`.
-        slide: motion after breakaway of an identified arm; None: use only the fit that needs no model of the arm.
+        ramps: recorded ramps at any rate; in a ramp, the joint starts at rest and the command rises (falls for sign
+            -1). For an encoder noise of 2e-5 rad, the estimate's error is the ramp's rate times 0.5 ms (small
+            inertia) to 3 ms (large inertia).
+        delay, lag: s, delay and lag between command and torque; r2s adds half of the command's hold to `delay`.
+        slide: an identified arm's motion after breakaway; if None, r2s uses only the fit without `Slide`.
 
     Raises:
         UserError: delay or lag is out of range.
@@ -143,9 +146,9 @@ def estimate_breakaway(
             known = slide.kappa[k], slide.level[k], slide.viscous[k], slide.fall[k]
             value[k], misfit[k] = _fit_slide(*seen, *known)
         if np.isnan(value[k]) or (slide is not None and misfit[k] > WORSE * slide.misfit[k]):
-            value[k], misfit[k] = _fit_release(*seen)
+            value[k], misfit[k] = _fit_breakaway(*seen)
         value[k] *= ramps.sign[k]
-        blur[k] = RELEASE_S * (u[end - 1] - u[end // 2]) / (t[end - 1] - t[end // 2])
+        blur[k] = BREAKAWAY_S * (u[end - 1] - u[end // 2]) / (t[end - 1] - t[end // 2])
     return _summarize(ramps, value, misfit, held, blur)
 
 
@@ -180,7 +183,7 @@ def _summarize(
 
 
 def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:
-    """Return the command (T,) Nm that acts on the joint at t (T,) s, after delay and lag; before t[0], use u[0]."""
+    """Return the command u (T,) Nm after delay and lag, at times t (T,) s; before t[0], the command is u[0]."""
     late = np.interp(t - delay, t, u)
     if lag == 0:
         return late
@@ -193,8 +196,8 @@ def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarr
     return out
 
 
-def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Fit all parameters to x (T,) rad under commands u (T,) Nm; return U, Nm (NaN if near u[0]), and misfit, rad."""
+def _fit_breakaway(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
+    """Return breakaway command, Nm (NaN near u[0]), and misfit, rad, from motion x (T,) rad, commands u (T,) Nm."""
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -227,7 +230,7 @@ def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, fl
 def _fit_slide(
     t: np.ndarray, x: np.ndarray, u: np.ndarray, kappa: float, level: float, viscous: float, fall: float
 ) -> tuple[float, float]:
-    """Fit U to the motion x (T,) rad under commands u (T,) Nm, with known `Slide`; return U, Nm, and misfit, rad."""
+    """Return breakaway command, Nm, and misfit, rad, from motion x (T,) rad, commands u (T,) Nm and known `Slide`."""
     span = u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -256,7 +259,7 @@ def _solve(
     high: np.ndarray,
     scale: np.ndarray,
 ) -> Any:
-    """Minimize `residuals`, a function (C, P) -> (C, R), with all finite differences in one call."""
+    """Minimize `residuals`, a function (C, P) -> (C, R); one call computes all finite differences."""
 
     def at(p: np.ndarray) -> np.ndarray:
         return residuals(p[None])[0]
@@ -287,7 +290,7 @@ def _slides(t, u, U, kappa, z, damping, jump, fall):
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Return positions x (T,) rad from the module docstring's equation; fall = 0: friction falls at once at U.
+    """Return positions x (T,) rad from the module docstring's equation; if fall = 0, friction falls at once.
 
     The integration is implicit in velocity, and therefore stable even for creep lengths far below the encoder noise.
     """

@@ -2,9 +2,9 @@
 
 The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
 bristles bend, so replays determine the presliding distance. The torque fit determines all parameters except the
-presliding distance. However, only reversals distinguish some parameters, such as offset and asymmetry. The last steps
-of the search therefore vary the parameters in WITH and the presliding distance together, but r2s keeps only the
-distance.
+presliding distance. However, only reversals distinguish some parameters from each other, such as offset and
+asymmetry. The last steps of the search therefore vary the parameters in WITH and the presliding distance together,
+but r2s keeps only the distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -126,7 +126,7 @@ def _part(space: ParameterSpace, dynamics: Dynamics, names: Sequence[str]) -> Pa
 
 
 class Presliding:
-    """Residual of the log presliding distance about the result of `estimate_presliding`, in standard deviations."""
+    """Deviation of the log presliding distance from the result of `estimate_presliding`, in standard deviations."""
 
     def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
         self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)

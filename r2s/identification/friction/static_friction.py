@@ -43,7 +43,7 @@ class StaticFriction:
         return self.command + pull - left
 
     def slide(self, d: Dynamics) -> Slide:
-        """Return each ramp's parameters of motion after breakaway (NaN: no breakaway), for Stribeck friction."""
+        """Return each ramp's parameters of motion after breakaway, for Stribeck friction; NaN without breakaway."""
         phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
         sign = np.where(self.side, 1.0, -1.0)
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
@@ -56,7 +56,7 @@ class StaticFriction:
         return Slide(kappa, level, viscous, fall, self._misfit)
 
     def breakaway(self, d: Dynamics) -> np.ndarray:
-        """Return mean net torques (n, 2) Nm at breakaway; directions without breakaway keep `d.breakaway`."""
+        """Return mean net torques (n, 2) Nm at breakaway, or `d.breakaway` for directions without breakaway."""
         net, out = self.net_torque(d), d.breakaway.copy()
         for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
             out[j, side] = net[(self.joint == j) & (self.side == side)].mean()

@@ -36,8 +36,9 @@ def choose_stiction(
 ) -> dict[str, np.ndarray | float]:
     """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm}, fitted to replayed stops.
 
-    largest: largest breakaway torque of the scan, relative to the identified friction; None: no scan, because ramps
-    determine breakaway torques. If all trajectories are shorter than a window, the values of `dynamics` are returned.
+    largest: largest breakaway torque of the scan, relative to the identified friction. If None, r2s does not scan,
+    because ramps determine the breakaway torques. If all trajectories are shorter than a window, the values of
+    `dynamics` are returned.
     """
     windows = windows_or_none(recording, HORIZON, WINDOWS)
     scanned = largest is None or windows_or_none(recording, window_s, 1) is not None
@@ -73,10 +74,10 @@ def scan_breakaway(
 ) -> np.ndarray:
     """Return the breakaway torques (n, 2) Nm with which `dynamics` replays the recording best.
 
-    A gradient search would fail: the replay error jumps if a joint starts to slide one step sooner. In each pass,
-    every candidate changes one breakaway torque, and r2s minimizes this joint's replay error. Coarse passes scan from
-    0 to `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, because joints affect each
-    other.
+    A gradient search would fail: the replay error jumps if a joint starts to slide one step sooner. In each pass, a
+    candidate changes the breakaway torque of one joint, and r2s minimizes the replay error of this joint. Coarse
+    passes scan from 0 to `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, because joints
+    affect each other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

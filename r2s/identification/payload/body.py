@@ -24,7 +24,7 @@ class BodySpace:
 
     Attributes:
         heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the center's coordinates.
-        gyration: m, r / sqrt(5) for a ball of water with radius r and about the body's mass.
+        gyration: m, r / sqrt(5), where r is the radius of a ball of water with about the body's mass.
     """
 
     heaviest: float
@@ -49,7 +49,7 @@ class BodySpace:
         return -reach, reach + HEAVIEST * self.heaviest * np.eye(10)[0]
 
     def body(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mass (...) kg, center (..., 3) m and tensor about the center (..., 3, 3) kg m^2 for z (..., 10)."""
+        """Return mass (...) kg, center (..., 3) m, tensor about center (..., 3, 3) kg m^2 of bodies z (..., 10)."""
         v = np.zeros((*z.shape[:-1], 3, 3))
         for i in range(3):
             v[..., i, i] = np.exp(z[..., 4 + i])
@@ -63,7 +63,7 @@ class BodySpace:
         return LinkInertia(mass, centre, tensor).standard()
 
     def slope(self, z: np.ndarray) -> np.ndarray:
-        """Return the derivative (10, 10) of `standard` at z (10,)."""
+        """Return the derivative (10, 10) of `standard` at the body z (10,)."""
         h = STEP * np.diag(np.subtract(*self.bounds[::-1]))
         return ((self.standard(z + h) - self.standard(z - h)) / (2 * h.diagonal()[:, None])).T
 

@@ -31,7 +31,8 @@ class PayloadEstimate:
         draws: posterior draws {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)}; inertia in the order of ELEMENTS.
         identifiable: {name: bool, or one bool per element}, whether the recording determines the value.
         t: (T,) s, sample times. measured: (T, n) Nm, filtered recorded torque. without, predicted: (T, n) Nm, torque
-            of the identified arm without and with payload. seen: (T, n) bool, whether the fit uses a measured torque.
+            of the identified arm without and with payload. seen: (T, n) bool, whether the fit uses this sample of a
+            joint's torque.
     """
 
     mass: float
@@ -108,7 +109,8 @@ def identify_payload(
     """Estimate the payload of an arm from a recording of the arm with the payload.
 
     Args:
-        arm: the arm, identified without payload from the same kind of torque; model errors widen the intervals.
+        arm: the arm, identified without payload from the recording's kind of torque; errors of its model widen
+            intervals.
         recording: motion of the arm with the payload.
         declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: seed of the random posterior draws.

@@ -38,9 +38,9 @@ class Rows:
     """Residual of a recording with a payload, in standard deviations: error + body @ phi + arm @ w.
 
     Attributes:
-        error: (R,), residual without payload. body: (R, 10), derivative for the payload's standard parameters phi
-            about the end effector. arm: (R, r), derivative for the arm's model errors w ~ N(0, I). clusters: (R,),
-            block of each row.
+        error: (R,), residual without payload. body: (R, 10), derivative with respect to the payload's standard
+            parameters phi about the end effector. arm: (R, r), derivative with respect to the arm's model errors w ~
+            N(0, I). clusters: (R,), block number of each row.
     """
 
     error: np.ndarray
@@ -50,14 +50,14 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10), constant (r,): for a given phi (10,), w = gain @ phi + constant has the least cost."""
+        """Gain (r, 10), constant (r,): for a payload phi (10,), model errors w = gain @ phi + constant cost least."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,): the cost at the best w is |slope @ phi + constant|^2 plus a fixed number."""
+        """Slope (K, 10), constant (K,): a payload phi costs at least |slope @ phi + constant|^2 + a fixed number."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -77,7 +77,7 @@ class LoadedTorque:
     """The torque residual of an arm with an unknown payload.
 
     Args:
-        arm: the arm, identified without payload from the same kind of torque. recording: motion with payload.
+        arm: the arm, identified without payload from the recording's kind of torque. recording: motion with payload.
         declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque.
     """
@@ -129,7 +129,7 @@ class LoadedTorque:
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Linearize the residual at `payload`, parameters phi (10,); weights omit the torque of errors w (r,)."""
+        """Linearize the residual at `payload` (phi (10,)); the weights omit the torque of the model errors w (r,)."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

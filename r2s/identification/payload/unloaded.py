@@ -19,7 +19,7 @@ def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff
     of the payload. Commands do not contain a declared payload's weight, because gravity compensation adds it.
 
     Args:
-        payload: the known payload. cutoff_hz: the identification's cutoff for torque; that for acceleration is
+        payload: the known payload. cutoff_hz: the identification's cutoff for torque; the cutoff for acceleration is
             higher.
     """
     grid = recording.resample(SIM_DT)

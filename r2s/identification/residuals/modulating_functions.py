@@ -153,7 +153,8 @@ class SlidingMotion:
     def command(self, delay: float, lag: float) -> np.ndarray:
         """Return window means (T, n) Nm of the command after the hold, the `delay` in s and the `lag` in s.
 
-        The result is the mean of u(t - delay - hold - x): hold is uniform over a step, x exponential with mean `lag`.
+        The result is the mean of the command u(t - delay - hold - x), where `hold` is uniform over a step and x is
+        exponential with mean `lag`.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
@@ -166,7 +167,7 @@ class SlidingMotion:
 
 
 def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
-    """Fit polynomials of order <= 4 to at most `most` rows of q each; return the `order`-th derivative (T, n)."""
+    """Return the `order`-th derivative (T, n) of q from polynomials of order <= 4, each fitted to <= `most` rows."""
     out = np.zeros_like(recording.q)
     for s in recording.stretches:
         rows = min(most, s.stop - s.start - (s.stop - s.start + 1) % 2)

@@ -26,15 +26,15 @@ BAYES_ROUNDS = 30  # fixed-point iterations of `_random_effects`
 class ReplayResidual:
     """Immutable, whitened replay residual of angles averaged over `stride` ms.
 
-    The error of a window is modeled as Z b + e. For each joint, b ~ N(0, diag(d)) contains the errors of start angle
-    and start velocity, and an unexplained torque that is constant over the window; e ~ N(0, s^2) is encoder noise.
-    The covariance of Z b + e whitens the error. Finite differences yield Z. The first d and s come from the
-    recording, later d and s from a fit. `clusters` (R,): block number of each row; before a fit, each window is a
-    block.
+    The error of a window is modeled as Z b + e, with encoder noise e ~ N(0, s^2) and unknown b ~ N(0, diag(d)). For
+    each joint, b contains the errors of start angle and start velocity, and an unexplained torque that is constant
+    over the window. The covariance of Z b + e whitens the error. Finite differences yield the matrix Z. The first
+    variances d and s^2 come from the recording, later variances from a fit. `clusters` (R,): block number of each
+    row; before a fit, each window is a block.
 
     Args:
         space: parameters to estimate. recording, windows: see `cut_windows`. stride: ms, averaging time of angles.
-        batch: number of candidates that are simulated at once. nthread: number of threads; 0: all cores.
+        batch: number of candidates that are simulated at once. nthread: number of threads; 0 uses all cores.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class ReplayResidual:
         return other
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "ReplayResidual":
-        """Return a copy with Z computed at x (P,) and, if x was `fitted`, with d and s estimated from the errors."""
+        """Return a copy with the matrix Z at x (P,) and, if x was `fitted`, with d and s^2 from the errors at x."""
         other = copy(self)
         other._reweigh(x, fitted)
         return other
@@ -171,9 +171,9 @@ def _random_effects(
     """Estimate the standard deviations of b (K,) and e (n,) in error (W, R') = z b + e by maximum evidence.
 
     MacKay's fixed-point iteration (Neural Computation 4(3), 1992) starts at `sigma` and `noise`. The variance of b is
-    the sum of squared estimates of b over the number of well-determined estimates. First, the estimates' mean over
-    windows is subtracted, because a wrong parameter (mostly an offset) causes this mean. The standard deviation of b
-    is >= `min_sigma`.
+    the sum of squared estimates of b, divided by the number of well-determined estimates. First, the estimates' mean
+    over windows is subtracted, because a wrong parameter (mostly an offset) causes this mean. The standard deviation
+    of b is at least `min_sigma`.
     """
     _, rows, k = z.shape
     n = len(noise)

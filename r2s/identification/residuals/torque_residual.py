@@ -110,7 +110,7 @@ class TorqueResidual:
         return self._with(space=space).reweighted(space.start, fitted=False)
 
     def with_lead(self, lead_s: float) -> "TorqueResidual":
-        """Return a copy for a simulator with implicit friction; lead_s: s, see `_friction`."""
+        """Return a copy for a simulator with implicit friction; `_friction` explains the time `lead_s` in s."""
         return self._with(lead_s=lead_s)
 
     def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
@@ -136,7 +136,8 @@ class TorqueResidual:
     def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return the torque (T, n) Nm of rigid bodies, rotors, friction and other terms at the measured motion.
 
-        known: torques of an earlier evaluation; a torque is reused if the parameters on which it depends are equal.
+        known: torques of an earlier evaluation; a torque is reused if the parameters on which it depends have not
+        changed.
         """
         d, own = dynamics, self._known(dynamics, known)
         # a link-side sensor's gain does not scale friction
@@ -147,9 +148,9 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None, links: np.ndarray | None = None) -> "_Known":
-        """Return the torques that are slow to compute; torques in `like` are reused if their parameters are equal.
+        """Return the torques that are slow to compute; torques in `like` with unchanged parameters are reused.
 
-        links: (T, n) Nm, torque of the links of `d`; None: compute this torque.
+        links: (T, n) Nm, torque of the links of `d`; if None, the method computes this torque.
         """
         m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
         if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
@@ -239,8 +240,9 @@ class TorqueResidual:
         """Return the torque error (T, n) at x, and [(parameter block, indices in x, change from x to `stepped`)].
 
         `change` is a change of torque (T, n) or, for L link parameters, of standard parameters (n, 10 n, L). Changes
-        of standard parameters need no evaluation, because torque is linear in standard parameters. A joint's friction
-        or offset affects only this joint's torque, so one evaluation changes the values of all joints.
+        of standard parameters need no evaluation, because torque is linear in standard parameters. Other parameters
+        of a joint, such as its friction, affect only this joint's torque, so one evaluation changes the values of all
+        joints.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -280,9 +282,10 @@ class TorqueResidual:
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
         """Return a copy with rows divided by their standard deviation, estimated from the error at x (P,).
 
-        A joint's standard deviation is the RMS error times the square root of the correlation length, halved unless
-        x was `fitted`. For means over windows, the standard deviation also contains encoder noise, which is
-        larger in short windows. If x was `fitted`, the correlation of the error determines the length of blocks.
+        A joint's standard deviation is the RMS error times the square root of the correlation length; unless x was
+        `fitted`, this product is halved. For means over windows, the standard deviation also contains encoder noise,
+        which is larger in short windows. If x was `fitted`, the correlation of the error determines the length of
+        blocks.
         """
         r = self._seen_errors(x)
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}

@@ -61,7 +61,8 @@ class Windows:
     def bristles(self, d: Dynamics) -> np.ndarray:
         """Return the presliding state (..., W, n) at the start of each window, for dynamics with batch axes (...).
 
-        The state starts at 0 in each trajectory and follows recorded velocity; without friction memory, it is 0.
+        The presliding state starts at 0 in each trajectory and follows recorded velocity; without friction memory, it
+        is 0.
         """
         if not d.family.has_memory:
             return np.zeros((len(self.at), self.dq.shape[1]))
@@ -195,7 +196,7 @@ class StartState:
         return StartState(noise, kernel, np.sqrt(((kernel * size[:, None]) ** 2).sum(-1)).T)
 
     def __call__(self, grid: Recording, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return q, dq (W, n) rad, rad/s at the row indices `at` (W,), HALF rows or more from a trajectory's ends."""
+        """Return start states q, dq (W, n) rad, rad/s at rows `at` (W,), HALF rows or more from trajectory ends."""
         rows = at[:, None] + np.arange(STATE_SAMPLES) - HALF
         seen = np.concatenate([grid.q[rows], grid.dq[rows]], 1)
         q, dq = np.einsum("nks,wsn->kwn", self.kernel, seen)

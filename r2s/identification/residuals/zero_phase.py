@@ -59,7 +59,8 @@ class SmoothMotion:
     ) -> "SmoothMotion":
         """Resample to 1 kHz, filter forward and backward, differentiate, remove EDGE_S at ends, sample at `rate_hz`.
 
-        rate_hz: rows per second, at most FRICTION_HZ. late: delay of dq, which is corrected; None: no delay.
+        rate_hz: rows per second, at most FRICTION_HZ. late: lateness of dq, which r2s corrects; if None, dq needs no
+        correction.
 
         Raises:
             UserError: no trajectory is longer than 2 EDGE_S.
@@ -124,7 +125,7 @@ class SmoothMotion:
         return x
 
     def command(self, delay: float, lag: float) -> np.ndarray:
-        """Return the command (T, n) Nm after the hold, `delay` and `lag`, in s; a short lag acts like a delay."""
+        """Return the command (T, n) Nm after hold, `delay` (s) and `lag` (s); a short lag acts like a delay."""
         return self.earlier(delay + lag + HOLD_STEPS * SIM_DT)
 
     def earlier(self, seconds: float) -> np.ndarray:

@@ -64,7 +64,7 @@ class CrossValidation:
         bounds, prior: bounds and prior of the parameters, see `search_space` and `Problem.of`.
         folds: number of folds.
         cutoff_hz: cutoff of the zero-phase filter.
-        report: function that receives progress rows. stated: the user's values; only fixed ones are used.
+        report: function that receives progress rows. stated: the user's values, of which only fixed values are used.
     """
 
     robot: Robot

@@ -20,8 +20,9 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
 
     r2s selects a family with more parameters only if it predicts torque clearly better. Rows of slow motion show
     whether friction falls with velocity, but the low-pass mixes friction at rest into these rows. If `slowest` > 0
-    (rad/s) and the best family has no memory, r2s compares the families without memory again, over windows in which
-    joints are faster than `slowest` (modulating_functions.py), and returns the new errors.
+    (rad/s) and the best family has no memory, r2s therefore compares the families without memory a second time, in
+    windows in which a joint is faster than `slowest` (modulating_functions.py). The errors and the best family of the
+    second comparison replace those of the first; each comparison divides by its own least error.
 
     Raises:
         UserError: the recording is too short to hold out motion.

@@ -4,7 +4,7 @@ The log alone determines the lateness of dq relative to q (r2s/recordings/latene
 fit. If an arm filters torque and dq alike, they are equally late and need no correction, because inertial torque and
 friction refer to the same time; a correction of only dq would increase the error. On a physical Panda, dq is 5.3 ms
 late and torque about 2 ± 0.5 ms. Correcting only the Panda's dq raised the error on held-out motion of the training
-data, which the training residual did not reveal.
+data; the residual of the fit did not reveal this increase.
 """
 
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
 
 
 def torque_delay(cv: CrossValidation, terms: Sequence[str]) -> tuple[float, float]:
-    """Fit `terms`, which include the delay of torque; return its absolute value and standard deviation, s."""
+    """Fit `terms`, which include the delay of torque; return the delay's absolute value and standard deviation, s."""
     space = cv.space(terms)
     recording = cv.recording if cv.recording.period else cv.recording.in_phase()  # repetitions share blocks
     data = TorqueResidual(space, recording, cutoff_hz=cv.cutoff_hz, rate_hz=RATE_HZ)

@@ -1,7 +1,7 @@
 """Compare adapters by their transfers, in tables with a row per adapter and a column per condition of the arm.
 
-Each mean is taken over arms and episodes. The bootstrap is paired: each draw resamples arms, and episodes of each
-arm, and uses this sample for all rows of a condition.
+Each mean is taken over arms and episodes. The bootstrap is paired: each draw resamples the arms and the episodes of
+each arm, and all rows of a condition use the same resampled episodes.
 """
 
 import os
@@ -24,15 +24,15 @@ COUNTS = ["stopped", "asked", "episodes", "arms"]
 
 @dataclass(frozen=True)
 class AdapterComparison:
-    """Scores of adapters, in rows: a row is one adapter, or one adapter with one policy (see `rows_of`).
+    """Scores of adapters; a row stands for one adapter, or for one adapter with one policy (see `rows_of`).
 
     Attributes:
         measures: {key: compared measure}. headline: the measure that summarizes a row.
         scores: a line per measure, condition and row: `mean`, 95 % interval `low` to `high`; `difference` from the
             row `reference` (None: no reference); 95 % interval `worse_low` to `worse_high` of how much worse the row
             is; counts of `stopped` episodes, episodes common to all rows (`asked`), averaged `episodes`, and `arms`.
-        losses: table with a line per condition and row. The columns `value` and `nominal` are means of the headline
-            measure in the condition and, over the same arms and episodes, in the nominal condition.
+        losses: table with a line per condition and row. The column `value` is the mean of the headline measure in the
+            condition; the column `nominal` is its mean over the same arms and episodes in the nominal condition.
         costs: table with a line per row. The column `us` is the adapter's computing time per cycle, microseconds.
         runs: {row: its transfers}. key: lines that explain policy names. left_out: lines on omitted episodes.
     """
@@ -96,7 +96,7 @@ def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return the table `AdapterComparison.losses`; `shared`: the joined outputs of `in_common` for all conditions."""
+    """Return the table `AdapterComparison.losses` from `shared`, the outputs of `in_common` for all conditions."""
     key = ["row", "arm", "goal"]
     values = shared.rename(columns={measure: "value"})
     nominal = values.loc[values["condition"] == NOMINAL, [*key, "value"]].rename(columns={"value": "nominal"})
@@ -173,7 +173,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return {path: short path}. A short path contains only as many last components as distinguish all paths."""
+    """Return {path: short path}: the last k components of each path, with the least k that tells the paths apart."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -182,7 +182,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the row to compare `name` with: adapt=none with the same policy, else the only adapt=none, else None."""
+    """Return the reference of row `name`: adapt=none with its policy, else the only adapt=none row, else None."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]
@@ -190,7 +190,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Return text on a row: its headline measure in its worst condition, and where it is worse than its reference."""
+    """Describe a row: headline measure in its worst condition, and what is significantly worse than the reference."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:

@@ -18,7 +18,8 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     """Return the settings of conf/arm that differ from their nominal values, such as {"payload": 1.0}.
 
     Args:
-        arm: config of the arm. typed: overridden config keys; those that begin with "arm." also count as settings.
+        arm: config of the arm. typed: config keys that the user overrides; a key that begins with "arm.", such as
+            arm.live, also counts as a setting, unless IDENTITY contains the key.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
@@ -36,7 +37,7 @@ def in_words(settings: Mapping[str, Any]) -> str:
 
 
 def order(settings: Mapping[str, Any]) -> tuple:
-    """Return a sort key for a `condition`: number of settings (nominal: 0), then each setting's name and value."""
+    """Return a sort key for a `condition`: the number of its settings (0 if nominal), then their names and values."""
     keys = list(SETTINGS)
     each = [(keys.index(k) if k in keys else len(keys), k, _size(v), str(v)) for k, v in settings.items()]
     return len(each), each

@@ -27,8 +27,8 @@ def group(runs: Sequence[Trained]) -> Groups:
     """Group the runs by their settings, so that the runs of a group differ only in their seeds.
 
     A group's label is the algorithm and the overrides of settings that differ among groups. A setting that the label
-    omits is default or equal in all groups. A label longer than LONGEST letters is replaced by the algorithm and a
-    number, such as "tqc #1" (`Groups.key`).
+    omits has its default value, or the same value in all groups. The algorithm and a number, such as "tqc #1",
+    replace a label longer than LONGEST letters (`Groups.key`).
     """
     sets: dict[str, list[Trained]] = {}
     for run in runs:
@@ -71,7 +71,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: settings that differ}: algo.* among the algorithm's runs, other settings among all runs."""
+    """Return {algorithm: settings that differ}: algo.* within the algorithm, other settings across all algorithms."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}
@@ -82,7 +82,7 @@ def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys with values that differ between the settings, or that some settings omit."""
+    """Return the keys whose values differ among the mappings `settings`; a missing key counts as None."""
     keys = dict.fromkeys(k for s in settings for k in s)
     return [k for k in keys if len({repr(s.get(k)) for s in settings}) > 1]
 

@@ -46,7 +46,7 @@ def comparison_page(
         others: {folder without a finished training: reason}.
 
     Returns:
-        {"scores": table, "improvement": table, "sensitivity": table}, which scores.py describes.
+        {"scores": table, "improvement": table, "sensitivity": table}; scores.py describes the columns of the tables.
     """
     groups, measures = grouped.members, measures_in(grouped.members)
     tables = {"scores": summary_table(groups), "improvement": improvement_table(groups)}
@@ -96,7 +96,7 @@ def _sections(
 
 
 def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]:
-    """Return a report section for each heading in `parts`, {heading: {run: reason}}, that has runs."""
+    """Return the report sections for `parts`, {heading: {run: reason}}; a heading without runs has no section."""
     return {heading: [[f"{k}: {v}" for k, v in why.items()]] for heading, why in parts.items() if why}
 
 

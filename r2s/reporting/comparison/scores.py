@@ -36,7 +36,7 @@ def summary_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def improvement_table(grouped: Grouped) -> pd.DataFrame:
-    """Return the probability that a run of one group beats a run of another group, for each ordered pair."""
+    """Return a row per measure and ordered pair of groups: probability that a run of the first group is better."""
     rows, table = [], measures_in(grouped)
     pairs = [(first, second) for first in grouped for second in grouped if first != second]
     for first, second in pairs:
@@ -53,13 +53,14 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
     """Return how much a measure depends on the settings of an algorithm, for each algorithm with several settings.
 
     `best`, `median` and `worst` are the best, median and worst interquartile mean of all settings. `best` is
-    optimistic, because the same seeds select and score the setting. `held_out` is the mean over seeds of a seed's
-    score with the setting that is best at the other seeds. `spread` is the mean over seeds of how much this score is
-    better than the median score of all settings; `low` and `high` are its 95 % interval. Fewer than two common seeds
-    give nan. An algorithm with a small `spread` needs little tuning.
+    optimistic, because the same seeds select and score the setting. For `held_out`, each seed scores the setting that
+    is best at the other seeds; `held_out` is the mean of these scores. `spread` says by how much `held_out` is better
+    than the mean over seeds of the median score of all settings; `low` and `high` limit the 95 % interval of
+    `spread`. With fewer than two seeds common to all settings, `held_out` and `spread` are nan. An algorithm
+    with a small `spread` needs little tuning.
 
     Args:
-        grouped: groups of trainings. measure: key of the measure; None: the last measure of `MeasureTable.selection`.
+        grouped: groups of trainings. measure: key of the measure; if None, the last of `MeasureTable.selection`.
     """
     table = measures_in(grouped)
     rows, measure = [], measure or table.selection[-1]
@@ -80,7 +81,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return, for S seeds, the score (S,) of the setting that is best at the other seeds, and the median score (S,).
+    """Return, for S seeds, the score (S,) of the setting best at other seeds, and all settings' median score (S,).
 
     Args:
         settings: {seed: score} of each setting; a larger score is better. Only seeds common to all settings are used;
@@ -95,7 +96,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line per algo or reward setting whose best value is the smallest or largest of three or more tried."""
+    """Return a line per algo or reward setting with its best value at an end of three or more tried values."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -119,7 +120,7 @@ def is_number(value: object) -> bool:
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return a matrix of strings from an `improvement_table`: probability that the row's group beats the column's."""
+    """Tabulate an `improvement_table` as strings: the probability that the row's group beats the column's group."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}
@@ -129,9 +130,9 @@ def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid of x (points,), and (3, points) the interquartile mean, minimum and maximum of y over the seeds.
+    """Return a grid of x (points,), and interquartile mean, minimum and maximum of y over seeds as (3, points).
 
-    The curves of all seeds are interpolated over their common range of x.
+    The curves of all seeds are interpolated to the grid, which covers their common range of x.
     """
     curves = [r.curve for r in group]
     grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)

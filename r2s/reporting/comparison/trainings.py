@@ -1,4 +1,4 @@
-"""Read finished trainings from their run folders, and select comparable ones."""
+"""Read finished trainings from their run folders, and select comparable trainings."""
 
 import json
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -37,7 +37,7 @@ class Trained:
         folder, seed, algo: run folder, random seed, name of the algorithm.
         settings: config values that the training used, such as {"algo.lr": 5e-4, "dr.phi_relative": 0.1}.
         alike: config values that comparable runs share, such as {"task.ctrl_hz": 50, "evaluation.episodes": 200}.
-        origin: commit, machine, threads, device from meta.json, or None; of a model-based controller only the commit.
+        origin: {key of ORIGIN: value in meta.json, None if unknown}; a model-based controller has only the commit.
         typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether the run used +experiment=toy, a training too short for the policy to learn.
         minutes: budget of the run in minutes; None if the run has a budget in env_steps.
@@ -144,7 +144,7 @@ def _read(folder: Path) -> Trained:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    """Return commit, machine, threads and device of a run; a resumed run can have several of each ("A and B")."""
+    """Return commit, machine, threads and device of a run; several values of a resumed run become "A and B"."""
     found: dict[str, set[str]] = {key: set() for key in ORIGIN}
     for part in parts_of(json.loads((folder / "meta.json").read_text())):
         git, machine = part["git"] or {}, part["machine"] or {}
@@ -187,10 +187,10 @@ def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, di
 def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
     """Return the largest set of comparable runs, and {run: reason} for all other runs.
 
-    Runs are comparable if they agree in robot, task, number of episodes and all keys of ORIGIN, and if the ratio of
-    their budgets is at most `MOST_BUDGETS`. Of sets of equal size, sets without +experiment=toy have priority, then
-    sets with more env steps. Only the first run with given settings and seed is kept, because a repetition adds no
-    evidence.
+    Runs are comparable if robot, task, number of evaluation episodes, use of +experiment=toy and all keys of ORIGIN
+    agree, and if the ratio of their budgets is at most `MOST_BUDGETS`. Of sets of equal size, sets without
+    +experiment=toy have priority, then sets with more env steps. Only the first run with given settings and seed is
+    kept, because a repetition adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -209,7 +209,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why a run is not comparable with `first`, the run of a set with the least budget; "" if comparable."""
+    """Return why `run` is not comparable with `first`, a set's run with the least budget; "" if it is comparable."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]
@@ -231,7 +231,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """List names as ["a, b (failed)", "c (unfinished)"]: up to `most` names per reason, of up to `width` letters."""
+    """List names as ["a, b (failed)", "c (unfinished)"]: up to `most` names per reason, cut to `width` letters."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

@@ -33,7 +33,7 @@ class Transferred:
         arm: name such as "twin, rigid, seed 0". condition: output of `condition`. robot: robot config in training.
         measures: measures of the task. length: episode length and rate, as "4 s at 100 Hz". goals: number of goals.
         us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
-        episodes: table with a row per episode, indexed by goal; columns: `MeasureTable.transfer`, path gap,
+        episodes: table with a row per episode, indexed by goal, and columns for `MeasureTable.transfer`, path gap and
             arm_stopped (0 or 1).
     """
 

@@ -60,14 +60,14 @@ def joint_panels(path: Path, n: int, title: str) -> AbstractContextManager[list[
 
 
 def label_axis(axis: Axes, m: Measure) -> None:
-    """Set the title of a measure's panel; for a percentage, also limit the y axis to 0 to 100 %."""
+    """Set the title of a measure's panel; if the measure is a percentage, let the y axis show about 0 to 100 %."""
     axis.set_title(m.heading, loc="left")
     if m.unit == "%":
         axis.set_ylim(-3, 103)
 
 
 def log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Make the y axis logarithmic; label the multiples `ticks` of powers of ten, without exponents."""
+    """Make the y axis logarithmic, with labels such as 0.1, 0.2 and 0.5: the multiples `ticks` of powers of ten."""
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(subs=ticks))
     axis.yaxis.set_major_formatter("{x:g}")

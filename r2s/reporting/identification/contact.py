@@ -43,7 +43,7 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def press_table(found: ContactEstimate) -> pd.DataFrame:
-    """Tabulate the RMS difference of normal force between model and joint torques, in fitted and held-out contact."""
+    """Tabulate the RMSE of modeled normal force against joint torques, for fitted presses and the held-out press."""
     parts = {"fitted presses": found.training, "held-out press": found.validation}
     cells = {
         name: [f"{part.summary()['seconds']:.1f}", *(number(part.rmse(side), "{:.2f}") for side in (0.0, 1.0, -1.0))]

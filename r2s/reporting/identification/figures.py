@@ -27,7 +27,7 @@ CLOUD: dict[str, Any] = {"marker": "o", "linestyle": "", "color": "#6e7781", "ma
 def torque_figure(
     path: Path, t: np.ndarray, measured: np.ndarray, predicted: Mapping[str, np.ndarray], title: str
 ) -> Path:
-    """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s (figure 4 of the paper).
+    """Draw measured torque (T, n) Nm and predicted torque {label: (T, n) Nm} over times t (T,) s (paper, figure 4).
 
     The figure shows the first `LONGEST` seconds, with shortened pauses. The RMSE in the titles covers all rows.
     """
@@ -57,9 +57,10 @@ def torque_figure(
 def position_figure(
     path: Path, windows_q: np.ndarray, predicted: Mapping[str, np.ndarray], dt: float = SIM_DT
 ) -> Path:
-    """Draw the open-loop error |q - windows_q| in mrad; predicted: {label: q (W, S, n) rad}; windows_q: measured.
+    """Draw the open-loop error |q - windows_q|, mrad, of predicted joint angles {label: q (W, S, n) rad}.
 
-    `dt` is the time step of the S rows, s. Lines are medians over the W windows; bands contain 90 % of the windows.
+    `windows_q` (W, S, n) rad contains the joint angles that were measured in W windows of S rows, `dt` s apart. Lines
+    are medians over the windows; bands contain 90 % of the windows.
     """
     colour, t = colours(predicted), dt * np.arange(1, windows_q.shape[1] + 1)
     title = f"open-loop error over {len(windows_q)} windows: median and 90 % band"
@@ -127,7 +128,7 @@ def friction_figure(
 def _band(
     axis: Axes, speed: np.ndarray, torque: np.ndarray, limits: tuple[float, float], colour: str, label: str
 ) -> tuple[float, float]:
-    """Draw the 95 % band of S torque draws (T, S); return y limits that cut off a wide band for readable curves."""
+    """Draw the 95 % band of S torque draws (T, S) Nm; return y limits that cut a wide band but show the curves."""
     low, high = limits
     bottom, top = np.quantile(torque, [0.025, 0.975], axis=1)
     axis.fill_between(speed, bottom, top, label=f"95 % band, {label}", color=colour, alpha=0.25, linewidth=0)
@@ -136,7 +137,7 @@ def _band(
 
 
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw the cost of each search over time, divided by its cost at the start; shade the searches in SCANS.
+    """Draw each search's cost over time, relative to its first cost; for searches in SCANS, shade the time instead.
 
     Costs are comparable only within one search, because each search uses new weights of the residuals.
     """

@@ -10,7 +10,7 @@ MOST_LINES = 10  # largest number of listed null directions
 
 
 def identifiability(found: IdentificationResult) -> list[Item]:
-    """Return sentences about parameters at nominal values or bounds, and combinations that data do not determine."""
+    """Return sentences on parameters at nominal values or bounds, and undetermined combinations of parameters."""
     space = found.space
     count, total = int(found.found.identifiable.sum()), len(space.names)
     items: list[Item] = [
@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """List combinations that only the prior determines; combinations of parameters kept nominal are only counted."""
+    """List up to MOST_LINES parameter combinations that only the prior determines; count all other combinations."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}
@@ -60,7 +60,7 @@ def _place(name: str) -> tuple[str, str, str]:
 
 
 def _grouped(names: Sequence[str], n: int = 0) -> str:
-    """Join names such as phi3[1] to text such as "phi3 of joints 1, 4; alpha of all links"; n: number of joints."""
+    """Join names such as phi3[1] to text for an arm with n joints: "phi3 of joints 1, 4; alpha of all links"."""
     groups: dict[tuple[str, str], list[str]] = {}
     for name in names:
         block, kind, at = _place(name)
@@ -73,7 +73,7 @@ def _grouped(names: Sequence[str], n: int = 0) -> str:
 
 
 def _combination(parts: Mapping[str, float]) -> str:
-    """Return a combination as "0.81 d1 of link 3 - 0.57 d2 of link 3"; negate it if its first term is negative."""
+    """Return a combination as "0.81 d1 of link 3 - 0.57 d2 of link 3"; flip all signs if the first is negative."""
     flip = -1.0 if next(iter(parts.values())) < 0 else 1.0
     terms = [f"{'-' if flip * part < 0 else '+'} {abs(part):.2f} {_grouped([name])}" for name, part in parts.items()]
     return " ".join(terms).removeprefix("+ ")

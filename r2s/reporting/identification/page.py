@@ -55,7 +55,7 @@ class Evidence(NamedTuple):
     """Content of an identification's page that `IdentificationResult` does not contain.
 
     Attributes:
-        pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, 99.5 % quantile of each joint's speed.
+        pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, 99.5 % quantile of each joint's speed in validation.
         whiteness: result of `whiteness_table` for the validation motion. base: result of `base_table`.
         window_s: length of a replay, s. cutoff_hz: cutoff frequency of the low-pass in the torque fit, Hz.
     """

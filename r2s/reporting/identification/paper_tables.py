@@ -89,7 +89,7 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
 
 
 def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
-    """Tabulate the base parameters, with a row per link; a combination is in the column of its first parameter."""
+    """Tabulate the base parameters by link (row) and by the first parameter of their combination (column)."""
     columns: dict[str, list[str]] = {}
     rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
     for first, row in zip(base["parameter"], rows.tolist(), strict=True):
@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return a cell per link: the value of `get`, marked identifiable if all its parameters in `blocks` are."""
+        """Return a cell per link with the value of `get`, and ? unless all `blocks` of the link are identifiable."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]

@@ -17,7 +17,7 @@ NARROWER = 1.02  # least ratio of interval widths, without over with a recording
 
 
 def contribution_table(parts: Sequence[Contribution], names: Sequence[str]) -> pd.DataFrame:
-    """Return a row per recording: use, torque, seconds, RMSE, RMSE of a fit without it, and effect on intervals."""
+    """Return per recording: use, torque, seconds, RMSE, RMSE of a fit without the recording, effect on intervals."""
     rows = {}
     for p in parts:
         cells = {"": p.use, "torque": p.torque, "s": number(p.seconds), "RMSE, Nm": number(np.nanmean(p.rmse))}

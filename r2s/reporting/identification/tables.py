@@ -43,7 +43,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
 def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
     """Return a parameter's row heading and a cell per joint: value, ± half the interval's width, and nominal value.
 
-    A nominal value that all joints share is in the heading instead of the cells.
+    If all joints have the same nominal value, the heading contains this value instead of the cells.
     """
     unit = units()[block]
     if unit == "rad":

@@ -1,6 +1,6 @@
 """Implement tracker=mlflow: write to an SQLite store next to the run folders, or to a server.
 
-The command `mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows the SQLite store. The command needs the
+The command `mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows the SQLite store. `mlflow ui` needs the
 package mlflow; r2s[trackers] installs only mlflow-skinny, which writes the store but cannot show it.
 """
 

@@ -20,7 +20,7 @@ class Tracked:
     """Information about a run for its trackers.
 
     Attributes:
-        folder: runs/<stage>/<name>. stage: the run's stage. group: name of the run's group; None: no group.
+        folder: runs/<stage>/<name>. stage: the run's stage. group: name of the run's sweep or pipeline, or None.
         config: composed config as nested dicts. meta: content of meta.json (git commit, versions, machine).
         resumed: whether the run continues a stopped run.
     """
@@ -62,9 +62,10 @@ class Tracked:
 
 
 class Tracker(Protocol):
-    """Interface to a tool that shows runs; r2s makes a tracker before the run folder and calls it from one thread.
+    """Interface to a tool that shows runs.
 
-    After an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
+    r2s makes a tracker before the run folder and calls the tracker from one thread. After an exception in a tracker,
+    the run prints one warning, does not call the tracker again, and continues.
     """
 
     def start(self, run: Tracked) -> None:

@@ -15,8 +15,8 @@ class Wandb(LoggerTracker):
     """Tracker that logs a run of a W&B project.
 
     Args:
-        project, entity: W&B project and team; entity None: your account. offline: store the run on this computer
-            only.
+        project: W&B project. entity: W&B team; if None, W&B uses your account. offline: store the run only on this
+            computer.
     """
 
     def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):

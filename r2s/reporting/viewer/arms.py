@@ -70,7 +70,7 @@ def log_arms(
 def log_moving_robot(
     stream: rr.RecordingStream, robot: Robot, base: str, colour: str, t: np.ndarray, q: np.ndarray
 ) -> None:
-    """Log the links of one arm at `base`, and their poses at q (T, n) rad over t (T,) s."""
+    """Log the links of one arm below the entity path `base`, and their poses at angles q (T, n) rad over t (T,) s."""
     stream.log(base, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     model, index = robot.model(gravity=False), rr.TimeColumn("time", duration=t)
     for body, (position, quaternion) in _poses(model, q).items():
@@ -173,7 +173,7 @@ def _height(model: mujoco.MjModel) -> float:
 
 
 def _poses(model: mujoco.MjModel, q: np.ndarray) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return {body: (position (T, 3) m, quaternion (T, 4) x y z w)} in the base frame at q (T, n) rad."""
+    """Return {body: (position (T, 3) m, quaternion (T, 4) x y z w)} in the base frame at angles q (T, n) rad."""
     data = mujoco.MjData(model)
     position, quaternion = np.empty((len(q), model.nbody, 3)), np.empty((len(q), model.nbody, 4))
     for k, angles in enumerate(q):

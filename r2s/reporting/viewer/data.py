@@ -23,7 +23,7 @@ class Episode:
 
     Attributes:
         t: (T,) s, time. q: (T, n) rad, joint angles. ee: (T, 3) m, end effector. tau: (T, n) Nm, commanded torque.
-        goal: (3,) m, or (T, 3) m on a path. box: (T, 11), the pushed box, see `Task.boxes`; None: no box.
+        goal: (3,) m, or (T, 3) m on a path. box: (T, 11), rows of `Task.boxes`, or None without a pushed box.
     """
 
     t: np.ndarray
@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """Those of the task's measures for learning curves and comparisons that are columns of `curves`."""
+        """The task's measures for learning curves and comparisons, if `curves` has their columns."""
         table = self.measures
         if table is None:
             return []

@@ -31,7 +31,7 @@ def side_by_side(folder: Path, robot: Robot, runs: Mapping[str, Path]) -> list[P
     The recording and the figures show the measures of the first run that has learning curves or episodes.
 
     Returns:
-        Paths of figures (PNG) of the same episodes, torques and learning curves.
+        Paths of the figures (PNG) of the episodes, torques and learning curves.
 
     Raises:
         UserError: no run has episodes, torques or evaluations.
