@@ -140,10 +140,7 @@ class State:
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Return the parameters of each ramp's motion after breakaway, as `arm` predicts them.
-
-        Return None if there are no ramps, or if the friction family has bristles or lacks the Stribeck effect.
-        """
+        """Predict ramps' motion after breakaway; None without ramps, with bristles, or without Stribeck effect."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)
@@ -236,10 +233,9 @@ def draw_full_model(s: State) -> dict[str, np.ndarray]:
     """Return unit-cube draws (S, P) of the selected model's values, from a posterior with all terms and wide priors.
 
     Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
-    compensates for a removed one; for example, a payload compensates for the error of a link's mass. The main fit's
-    priors are chosen for prediction; where they are narrower than the scatter among arms, they narrow intervals
-    further. For the result's intervals, draws of the full and the selected model have equal weight (Hoeting et al.,
-    Statistical Science 14(4), 1999).
+    compensates for a removed one, such as a payload for the error of a link's mass. Where the main fit's priors,
+    chosen for prediction, are narrower than the scatter among arms, they narrow intervals further. For the result's
+    intervals, draws of the full and the selected model have equal weight (Hoeting et al., Stat. Sci. 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
     u, problem = fit_torque(full.problem.with_usual_prior())

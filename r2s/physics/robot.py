@@ -184,8 +184,7 @@ def load_robot(
         armature: kg m^2, rotor inertia at the joints; None: the file's armature.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
         lock: {joint: rad or m}, positions at which to weld joints, such as a gripper's; None: weld no joint.
-        payload_max, payload_far: kg and m, for `Robot.payload_max`; if None, r2s estimates the value from torque
-            limits and reach.
+        payload_max, payload_far: kg and m, for `Robot.payload_max`; if None, from torque limits and reach.
 
     Raises:
         UserError: the file is missing or invalid, is no serial arm of hinges, or lacks limits or the end effector.
