@@ -405,6 +405,18 @@ def test_ramps_of_a_users_own(tmp_path, suffix):
         np.testing.assert_allclose(estimate_breakaway(ramps).value, [0.4, 0.4, -0.4, 0.4, 0.4], atol=4e-3)
 
 
+def test_joints_of_a_log_are_put_in_the_order_of_the_robot(tmp_path):
+    """A file that names its joints may list them in any order; `joint` counts in the robot's order."""
+    columns, names, order = own_ramps(), ["shoulder", "elbow", "wrist"], [1, 2, 0]
+    mixed = {k: x[:, order] if x.ndim == 2 else x for k, x in columns.items()}
+    path = in_file(tmp_path / "ramps.npz", mixed | {"joint_names": np.array(names)[order]})
+    ramps = read_ramps(path, n_joints=3, model_joints=names)
+    plain = read_ramps(in_file(tmp_path / "plain.npz", columns), n_joints=3)
+    np.testing.assert_array_equal(ramps.recording.q, plain.recording.q)
+    np.testing.assert_array_equal(ramps.recording.tau, plain.recording.tau)
+    assert ramps.joint.tolist() == plain.joint.tolist()
+
+
 def test_where_a_ramp_ends(tmp_path):
     """At a clock that starts anew, a trajectory, a pause; joint and sign may be given once per ramp."""
     columns = own_ramps()

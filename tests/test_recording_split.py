@@ -44,6 +44,16 @@ def test_several_trajectories_are_held_out_whole():
     assert len(r.split(0.999)[0].t) == 400
 
 
+@pytest.mark.parametrize("pause", [40, 4960])
+def test_a_pause_near_an_end_does_not_choose_what_is_held_out(pause):
+    """The boundary would leave 1 % on one side; the longer trajectory is cut instead, with a gap."""
+    r = sine(np.arange(5000) * 1e-3, trajectory=(np.arange(5000) >= pause).astype(int))
+    train, validation = r.split(0.25)
+    assert len(validation.t) == 1250
+    assert len(train.t) == pytest.approx(3750 - 1e3 * SPLIT_GUARD_S, abs=2)
+    assert validation.t[0] - train.t[train.t < validation.t[0]][-1] > SPLIT_GUARD_S - 1e-9
+
+
 def test_one_trajectory_is_cut_once_with_a_gap():
     train, validation = sine(np.arange(5000) * 1e-3).split(0.2)
     assert validation.t[0] - train.t[-1] > SPLIT_GUARD_S

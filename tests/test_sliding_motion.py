@@ -38,6 +38,18 @@ def test_no_window_reaches_a_turn(motion):
             np.testing.assert_allclose(means.data[own].sum(), 1.0, rtol=1e-12)
 
 
+def test_no_window_crosses_from_a_trajectory_to_the_next():
+    """Even if the first trajectory is shorter than the margin without windows at its two ends."""
+    r = swinging()
+    cut = Recording(r.t, r.q, r.dq, r.tau, r.torque, trajectory=np.digitize(r.t, [0.03, *np.arange(0.8, 8.0, 0.8)]))
+    found = SlidingMotion.of(cut, 100.0, 0.02)
+    trajectory = np.cumsum(found.starts)
+    for means in found.means[0]:
+        own = [trajectory[means.indices[a:b]] for a, b in zip(means.indptr, means.indptr[1:], strict=False) if b > a]
+        assert len(own) > 50
+        assert all(len(set(rows)) == 1 for rows in own)
+
+
 def test_a_window_starts_where_the_joint_has_slid_far_enough(motion):
     """`slid` rad from where it turned, at 0.3 rad; rows are lost by it and none is new."""
     later = SlidingMotion.of(swinging(), 100.0, 0.02, slid=0.02)

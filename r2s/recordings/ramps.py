@@ -1,15 +1,15 @@
 """Read and save recorded torque ramps of the breakaway protocol, each with joint, direction and posture."""
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from r2s.errors import UserError, nearest
 from r2s.recordings import readers
-from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, find_columns, listed
+from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, by_names, find_columns, listed
 from r2s.recordings.gaps import longest_step
 from r2s.recordings.readers import Options, scalar
 from r2s.recordings.recording import FIELDS, Recording, save_npz
@@ -67,18 +67,23 @@ def read_ramps(
     columns: Mapping[str, Spec] | None = None,
     n_joints: int | None = None,
     max_gap_s: float | None = None,
+    joints: Sequence[str] | None = None,
+    model_joints: Sequence[str] | None = None,
+    limits: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Ramps:
     """Read ramps from a file that `Ramps.save` wrote, or from a log in any format of `readers.read`.
 
     A log needs columns t (s), q (rad), tau_J_d or tau (commanded torque, Nm), optionally dq (rad/s), and columns
-    `joint` (from 1) and `sign` (1 or -1) with a value per row or per ramp. A new ramp begins where the value of
-    `joint`, `sign`, `trajectory` or `segment` changes, where t restarts, and after a gap in t.
+    `joint` (from 1, in the robot's order) and `sign` (1 or -1) with a value per row or per ramp. A new ramp begins
+    where the value of `joint`, `sign`, `trajectory` or `segment` changes, where t restarts, and after a gap in t.
 
     Args:
         path: file of ramps.
         columns: {field: column name} of a log, see `readers.read`.
         n_joints: expected number of joints.
         max_gap_s: s; a longer time step separates ramps; if None, the result of `longest_step` is the limit.
+        joints, model_joints, limits: names of the log's joints, names and position limits of the robot's joints, see
+            `readers.read`.
 
     Raises:
         UserError: the file is missing or contains no ramps, or a joint or sign contradicts the command.
@@ -88,7 +93,9 @@ def read_ramps(
     try:
         if table.keys() >= OWN and table["torque"].ndim == 0:
             return _saved(table)
-        return _from_columns(table, dict(columns or {}), n_joints, max_gap_s, path.stem)
+        table = by_names(table, joints, model_joints, n_joints)
+        how = Options("commanded", dict(columns or {}), n_joints, max_gap_s, name=path.stem, repair=False)
+        return _from_columns(table, replace(how, robot_joints=model_joints, limits=limits))
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
 
@@ -100,10 +107,9 @@ def _saved(table: Table) -> Ramps:
     return Ramps(motion, table["joint"], table["sign"], table["pose"])
 
 
-def _from_columns(
-    table: Table, columns: dict[str, Spec], n_joints: int | None, gap: float | None, name: str
-) -> Ramps:
+def _from_columns(table: Table, how: Options) -> Ramps:
     """Return the ramps in the columns of a log."""
+    columns = how.columns
     for field in ("joint", "sign"):
         if field not in table:
             raise UserError(
@@ -120,7 +126,7 @@ def _from_columns(
     for mark in marks:
         cut[1:] |= mark[1:] != mark[:-1]
     steps = np.diff(t)
-    longest = longest_step(steps, gap)
+    longest = longest_step(steps, how.max_gap_s)
     ramp = np.cumsum(cut)
     joint, sign = (_per_row(field, table[field], ramp) for field in ("joint", "sign"))
     cut[1:] |= steps > longest
@@ -129,8 +135,8 @@ def _from_columns(
     dropped = ("joint", "sign", *DEFAULT_COLUMNS["trajectory"])
     table = {k: v[rows] if len(v) == len(t) else v for k, v in table.items() if v.ndim and k not in dropped}
     table["trajectory"] = np.unique(trajectory[rows], return_inverse=True)[1]
-    how = Options("commanded", columns | {"trajectory": "trajectory"}, n_joints, name=name, repair=False)
-    motion = readers.from_table(table, how)
+    columns = dict(columns) | {"trajectory": "trajectory"}
+    motion = readers.from_table(table, replace(how, columns=columns, max_gap_s=np.inf))
     first = [s.start for s in motion.stretches]
     joint, sign = joint[rows][first], sign[rows][first]
     for k, number in enumerate(joint):

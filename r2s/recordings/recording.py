@@ -288,13 +288,12 @@ class Recording:
         """Return (train, validation) without common motion; validation has about `validation_fraction` of the rows.
 
         1. If the motion has a period (argument or attribute), validation is the end of each period: the rows with the
-           largest phase, `t` modulo period. A chronological split could put the same motion in training and
-           validation; for example, gaz2019 has a period of 13.33 s, and its segment 1 partly repeats segment 0.
-        2. Without a period, but with several trajectories, validation consists of the last trajectories.
-        3. Without a period and with one trajectory, validation is the end of the recording.
+           largest phase, `t` modulo period. A chronological split would put repeated motion on both sides.
+        2. Otherwise, validation consists of the last trajectories, if these have about `validation_fraction` of the
+           rows: at least half of this fraction, and at most twice this fraction or half of the rows.
+        3. Otherwise, validation is the end of the recording.
 
-        Except in case 2, which separates whole trajectories, training has no rows within 0.1 s of a validation row.
-        Trajectories of a single row are dropped from training and validation.
+        Except in case 2, training has no rows within 0.1 s of a validation row. Single-row trajectories are dropped.
         """
         if not 0 < validation_fraction < 1:
             raise UserError(f"validation_fraction: expected a number in (0, 1), got {validation_fraction}")
@@ -307,10 +306,13 @@ class Recording:
             after = (phase - stop) % period
             train = ~validation & (before > SPLIT_GUARD_S) & (after > SPLIT_GUARD_S)
         elif len(self.stretches) > 1:
-            first_rows = np.array([s.start for s in self.stretches[1:]])
-            first = first_rows[np.abs(first_rows - (1 - validation_fraction) * len(self.t)).argmin()]
-            validation = np.arange(len(self.t)) >= first
-            train = ~validation
+            count, share = len(self.t), validation_fraction
+            first = min((s.start for s in self.stretches[1:]), key=lambda row: abs(row - (1 - share) * count))
+            if not 0.5 * share <= 1 - first / count <= max(2 * share, 0.5):  # as in a log with one early pause
+                first = round((1 - share) * count)
+            close = (self.trajectory == self.trajectory[first]) & (self.t > self.t[first] - SPLIT_GUARD_S)
+            validation = np.arange(count) >= first
+            train = ~validation & ~close
         else:
             start = self.t[-1] - validation_fraction * self.duration
             validation = self.t >= start

@@ -159,15 +159,20 @@ def read_file(robot, file, path, torque=None):
 
     file = file if torque is None else replace(file, torque=torque)
     keys = ("torque", "torque_constant", "columns", "period", "max_gap_s", "topic", "joints")
-    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     how = {k: getattr(file, k) for k in keys}
     if path != file.path and file.path and is_bag(Path(file.path)) and not is_bag(Path(path)):
         how |= {"topic": None, "joints": None}
-    limits = robot.q_min, robot.q_max
-    out = read(path, **how, n_joints=robot.n, model_joints=names if all(names) else None, limits=limits)
+    out = read(path, **how, **of_joints(robot))
     for note in out.notes:
         print(f"{path}: {note}")
     return file.held(out)
+
+
+def of_joints(robot):
+    """Return the arguments of `readers.read` that describe the robot's joints: number, names and position limits."""
+    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
+    limits = robot.q_min, robot.q_max
+    return {"n_joints": robot.n, "model_joints": names if all(names) else None, "limits": limits}
 
 
 def read_episodes(path):
@@ -244,13 +249,15 @@ def read_user_ramps(robot, file):
     """Return the ramps in the file `file.ramps`, read with `file.columns`; return None if `file.ramps` is unset."""
     from r2s.identification.checks import check_ramps
     from r2s.recordings.ramps import read_ramps
+    from r2s.recordings.readers import is_bag
 
     if not file.ramps:
         return None
     columns = dict(file.columns)
     if file.torque != "commanded":
         columns["tau"] = None  # ramps need commanded torque, which this column of the recording does not contain
-    ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
+    how = of_joints(robot) | {"columns": columns, "max_gap_s": file.max_gap_s}
+    ramps = read_ramps(file.ramps, joints=None if is_bag(Path(file.path)) else file.joints, **how)
     check_ramps(robot, ramps)
     return replace(ramps, recording=file.held(ramps.recording))
 

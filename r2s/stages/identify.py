@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, check_number
+from r2s.errors import UserError, check_number, choices
 from r2s.files import located
 from r2s.stages.build import base_dynamics, check_source, console, make_robot, open_run
 from r2s.stages.contact import (
@@ -77,13 +77,24 @@ def make_parts(cfg):
     if cfg.data.kind == "recording":
         files, validation = recording_files(cfg), recording_files(cfg, "validation")
         file = replace(files[0], ramps=cfg.data.ramps and str(located(cfg.data.ramps)))
-        contact, loaded = contact_data(cfg, robot, file), loaded_data(cfg, robot, file)
+        loaded = loaded_data(cfg, robot, file)
         how = cfg.identify.validation_fraction, cfg.identify.cutoff_hz
         groups = read_groups(robot, files, validation, *how)
         for group in groups:
             check_cutoff(cfg.identify.cutoff_hz, (*group.train.values(), *group.validation.values()))
             settings = make_settings(cfg, group.torque, [earlier] if earlier else [], group is groups[-1])
             check_known(robot, nominal, whole(group.train), settings)
+        kinds = [group.torque for group in groups]  # commanded torque is the last
+        contact = contact_data(cfg, robot, replace(file, torque=kinds[-1]))
+        if loaded and loaded.recording.torque not in kinds:
+            raise UserError(
+                f"data.loaded: expected {choices(kinds)} torque as in data.path, got {loaded.recording.torque}"
+            )
+        if file.ramps and "commanded" not in kinds:
+            raise UserError(
+                f"data.ramps: ramps determine the breakaway torques of commands, and data.path has only {kinds[-1]} "
+                "torque; leave data.ramps out"
+            )
         ramps = read_user_ramps(robot, file)
         paths = [path for f in (*files, *validation) for path in f.files] + ([file.ramps] if file.ramps else [])
         paths += [f for more in (contact, loaded) if more for f in more.files]
@@ -159,12 +170,13 @@ def identify(cfg, overrides):
             group = Group(train.torque, {"train": train}, {"validation": validation})
             made = replace(made, groups=(group,), ramps=ramps)
         judge_recordings(cfg, run, made)
-        earlier, kinds = [made.earlier] if made.earlier else [], dict[str, Any]()
+        earlier, kinds, arms = [made.earlier] if made.earlier else [], dict[str, Any](), dict[str, Arm]()
         for group in made.groups[:-1]:  # the result of each fit is a prior of the next fit
             fit = fit_group(cfg, run, made, group, earlier, run.folder / group.torque)
             space, found = fit.found.saved
             earlier.append(Earlier(str(run.folder / group.torque), group.torque, space, found.x, found.samples))
             kinds |= {group.torque: fit.summary}
+            arms[group.torque] = Arm(fit.found.space, fit.found.x, fit.found.found.samples)
         fit = fit_group(cfg, run, made, made.groups[-1], earlier, run.folder)
         summary, found, nominal = fit.summary | kinds, fit.found, fit.nominal
         found.history.to_csv(run.folder / "metrics.csv", index=False)
@@ -182,7 +194,8 @@ def identify(cfg, overrides):
         if made.contact:
             run.summary(summary | {"contact": identify_surface(cfg, run, arm, made.contact)})
         if made.loaded:
-            run.summary(summary | {"payload": identify_load(cfg, run, arm, made.loaded)})
+            load = identify_load(cfg, run, arms.get(made.loaded.recording.torque, arm), made.loaded)
+            run.summary(summary | {"payload": load})
     print(f"written: {run.folder}")
 
 

@@ -28,7 +28,7 @@ def loaded_data(cfg, robot, file, torque=None):
     Raises:
         UserError: data.declared_payload or data.contact contradicts data.loaded, or the file is invalid.
     """
-    from r2s.identification.checks import check_motion
+    from r2s.identification.checks import check_recording
     from r2s.physics.payload import payload_of
 
     if not file.loaded:
@@ -39,7 +39,7 @@ def loaded_data(cfg, robot, file, torque=None):
         raise UserError("data.loaded: identify the payload first, then the surface of data.contact in a second run")
     path = located(file.loaded)
     recording = read_file(robot, file, path, torque=torque)
-    check_motion(robot, recording)
+    check_recording(robot, recording)
     check_cutoff(cfg.identify.cutoff_hz, (recording,))
     if file.declared_payload is not None and recording.torque != "commanded":
         raise UserError(

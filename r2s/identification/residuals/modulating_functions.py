@@ -101,9 +101,9 @@ class SlidingMotion:
         own, kept, at = (np.concatenate(parts) for parts in (instants, moments, places))
         if not len(kept):
             raise too_short(recording)
-        inside = np.zeros(len(own), dtype=bool)
+        inside = np.zeros(len(own), dtype=bool)  # false near the ends of a trajectory
         for begin, part in zip(np.cumsum([0, *map(len, instants)]), instants, strict=False):
-            inside[begin + edge : begin + len(part) - edge] = True
+            inside[begin + edge : max(begin + len(part) - edge, begin)] = True
         q, way = smooth.q[own], np.where(slides[own] & inside[:, None], np.sign(dq[own]), 0.0)
         found = [_windows(q[:, j], way[:, j], at, slid) for j in range(q.shape[1])]
         means, half = tuple(m for m, _ in found), np.stack([w for _, w in found], 1)
