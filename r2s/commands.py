@@ -201,7 +201,6 @@ def convert(typed: Namespace) -> None:
     from r2s.recordings.ros_bag import write_mcap
     from r2s.stages.build import make_dynamics, make_robot
     from r2s.stages.data import file_data, read_episodes, read_file, read_reference
-    from r2s.stages.run_config import run_config
 
     if typed.to.suffix not in ("", ".mcap"):
         raise UserError(f"to: expected FILE.mcap, or a folder for a LeRobotDataset, got {typed.to}")
@@ -209,8 +208,12 @@ def convert(typed: Namespace) -> None:
         raise UserError(f"to: {typed.to} exists")
     sys.path.append(os.getcwd())  # a user's robot is a module of the working folder
     cfg = composed("convert", ["data=recording", *typed.override], CONVERTED)
-    if (typed.file.parent / "config.yaml").is_file() and not any(w.startswith("robot") for w in typed.override):
-        cfg.robot = run_config(typed.file.parent, typed.trust).robot
+    groups = {w.lstrip("+~").split("=")[0].split(".")[0] for w in typed.override}
+    if (typed.file.parent / "config.yaml").is_file() and "robot" not in groups:
+        own = arm_config(typed.file.parent, typed.trust)
+        for group in ("robot", "friction", "inertia"):  # a robot's friction and inertia have a value per joint
+            if group in own and group not in groups:
+                cfg[group] = own[group]
     robot = make_robot(cfg)
     dynamics, more = make_dynamics(cfg, robot), None
     if typed.file.name.startswith("episodes_") and typed.file.suffix == ".npz":
@@ -246,12 +249,24 @@ def viewable(folder: Path) -> Path:
     raise UserError(f"look: '{folder}' is no run folder{nearest_file(folder)}")
 
 
+def arm_config(folder: Path, trust: str | None = None) -> Any:
+    """Return the config that describes the robot of a run: the training's for a transfer, else the run's own.
+
+    Raises:
+        UserError: the file cannot be read or names an untrusted module.
+    """
+    from r2s.stages.run_config import checked, loaded
+
+    path = folder / "policy.yaml"  # of stage=transfer, whose config.yaml has the default robot
+    path = path if path.is_file() else folder / "config.yaml"
+    return checked(loaded(path), path, trust)
+
+
 def robot_of(folders: Sequence[Path], trust: str | None = None):
     """Return the robot of the runs; raise UserError if the runs have different robots or untrusted modules."""
     from r2s.stages.build import make_robot
-    from r2s.stages.run_config import run_config
 
-    configs = [run_config(folder, trust) for folder in folders]
+    configs = [arm_config(folder, trust) for folder in folders]
     for folder, cfg in zip(folders, configs, strict=True):
         if cfg.robot != configs[0].robot:
             raise UserError(f"look: {folder} has another robot than {folders[0]}; view them one by one")

@@ -12,7 +12,7 @@ from test_comparison import write_run
 
 from r2s.reporting.comparison.adapter_comparison import compare_adapters, score, verdict
 from r2s.reporting.comparison.adapter_comparison_page import lines, tables
-from r2s.reporting.comparison.arm_conditions import condition, in_words, order
+from r2s.reporting.comparison.arm_conditions import condition, in_words, order, without_common
 from r2s.reporting.comparison.statistics import paired
 from r2s.reporting.comparison.transfers import comparable, read_transfers
 from r2s.tasks.measures import Measure, MeasureTable, write_measures
@@ -306,6 +306,28 @@ def test_conditions_in_order():
     asked = [{"friction_scale": 0.8}, {"payload": 1.5}, {}, {"payload": 0.5}]
     assert sorted(asked, key=order) == [{}, {"payload": 0.5}, {"payload": 1.5}, {"friction_scale": 0.8}]
     assert in_words(condition({"soft_start_s": 0.5}, ["arm.soft_start_s"])) == "soft_start_s=0.5"
+
+
+def test_what_all_transfers_set_is_no_condition():
+    """Such as the address of an arm, or its surface; a payload of all remains, because none is the nominal value."""
+    arms = [{"address": "172.16.0.2", "surface": True, "payload": kg} for kg in (0.0, 1.0)]
+    both = [condition(arm, ["arm.address", "arm.surface"]) for arm in arms]
+    assert without_common(both) == [{}, {"payload": 1.0}]
+    assert without_common(both[1:]) == [{"payload": 1.0}]
+    assert without_common([*both, {"surface": "box"}]) == [*both, {"surface": "box"}]
+
+
+def test_arms_at_two_addresses_are_two_nominal_arms(tmp_path):
+    """Each has its losses, from a column *nominal* and a column with a payload."""
+    for at in ("172.16.0.2", "172.16.0.3"):
+        for kg in (0.0, 1.0):
+            carry(tmp_path, f"{at}_{kg}", [1.0 + kg, 3.0], address=at, payload=kg, surface=True)
+    for run in tmp_path.iterdir():
+        (run / "overrides.yaml").write_text("[arm.address=x, arm.surface=true]\n")
+    found = made(tmp_path)
+    assert {r.arm for r in found.runs["none"]} == {f"twin, rigid, seed 0, 172.16.0.{k}" for k in (2, 3)}
+    assert found.losses["condition"].tolist() == ["nominal", "1.0 kg"]
+    assert "in its worst condition, 1.0 kg" in verdict(found, "none")
 
 
 @pytest.mark.long

@@ -1,17 +1,21 @@
 """No arm touches itself or the table: plans leave room for deviations, and the driver stops an arm in time."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from conftest import conf
+from omegaconf import OmegaConf
 
 import r2s
 from r2s.arm.clients.emulated import emulated_arm
 from r2s.arm.clients.franka import SPEED, _slow_path
 from r2s.arm.driver import DQ_INSIDE, Driver, DriverBatch
 from r2s.arm.interface import ArmState
+from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.recorder import record
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.tracking_controller import MAX_DEVIATION, TrackingController
@@ -20,14 +24,18 @@ from r2s.excitation.deviation import DeviationLimits, deviation_weights
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
 from r2s.excitation.motion_checks import CLEARANCE_M, DEVIATION, Space, check_space
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.model_based import Oracle
 from r2s.physics.actuation import Motors
 from r2s.physics.collision import CollisionCheck
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.fence import FENCE_M, first_breaches
 from r2s.physics.robot import SIM_DT, load_robot
-from r2s.physics.safety_filter import filter_limits
+from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
 from r2s.physics.simulator import Simulator
+from r2s.stages.transfer import driver_limits, predict
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rollout import gap, rollout
 
 PANDA = load_robot(**conf("robot/panda"))
 TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
@@ -201,6 +209,22 @@ def test_ways_and_recordings_keep_the_speed_share():
         record(arm, fast)
     out = record(arm, way(PANDA.q_home, PANDA.q_home + 0.5 * JOINT[0], 2.0))
     assert np.abs(out.dq / PANDA.dq_max).max() < 0.3
+
+
+def test_the_prediction_of_a_transfer_keeps_the_speed_share():
+    """An arm with the model's dynamics moves as predicted; its links are nominal, as in the driver's filter."""
+    task, same, share = replace(TASK, episode_s=1.0), nominal_dynamics(PANDA, **conf("friction/paper")), 0.3
+    starts, goals = fixed_episodes(PANDA, task, 1)
+    cfg = OmegaConf.create({"threads": 1, "arm": {"speed_share": share}})
+    policy = Oracle(PANDA, task, same)
+    request = SimpleNamespace(task=task, center=same, policy=policy, starts=starts, goals=goals, soft_start_s=0.0)
+    predicted = predict(cfg, request, PANDA)
+    arm = SimulatedArm(PANDA, same, position_noise=0, velocity_noise=0)
+    arm.speed_share = share
+    done = rollout(policy, PolicyRunner(arm, task, same.level, rotors=same.armature), task, starts, goals)
+    assert gap(done, predicted)["ee_path_rmse_mm"] < 1e-6
+    assert (np.abs(predicted.dq) <= share * PANDA.dq_max).all()
+    assert (driver_limits(cfg, PANDA, task)[:, [DQ_ALLOWED, DQ_MAX]] <= share * PANDA.dq_max[:, None]).all()
 
 
 @pytest.mark.parametrize("share", [0.0, 1.5])

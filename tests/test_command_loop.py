@@ -16,7 +16,7 @@ from r2s.arm.clients.collision_thresholds import CAUTIOUS
 from r2s.arm.clients.consent import CONSENT, operator_agrees
 from r2s.arm.clients.franka import ACCELERATION, TORQUE_SHARE, Franka
 from r2s.arm.command_loop import SLIDING, CommandLoop
-from r2s.arm.driver import Driver
+from r2s.arm.driver import ADDED, Driver
 from r2s.arm.emulator.control import HOLD
 from r2s.arm.interface import ArmStopped, NotCleared, StopRequested, signal_sizes
 from r2s.arm.policy_runner import PolicyRunner
@@ -34,6 +34,7 @@ from r2s.excitation.paths import path_violation
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.payload import LoadTorque, mass_and_moment, payload_of
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.tasks.reach import ReachTask
@@ -369,6 +370,37 @@ class Wire:
     def finish(self):
         """End the motion."""
         self._arm.stop()
+
+
+def test_a_stop_keeps_a_heavy_compensated_load():
+    """3 kg that nobody declared, held by an adapter and moving slowly: the stop ends at rest, near where it began."""
+    q = np.array([0.0, 0.9, 0, -0.9, 0, 1.8, 0.785])
+    payload = payload_of(3.0, PANDA.payload_max)
+    dynamics = nominal_dynamics(PANDA, **conf("friction/paper"))
+    twin = SimulatedArm(PANDA, dynamics, position_noise=0.0, velocity_noise=0.0, payload=payload)
+    twin.move_to(q)
+    wire, ends = Wire(twin), []
+    finish, wire.finish = wire.finish, lambda: (ends.append(twin.read()), finish())
+    arm = Franka(PANDA, wire)
+    arm.move_to(q)
+    load = LoadTorque(PANDA)(q, mass_and_moment(PANDA, payload))
+    hold = np.clip(load, -ADDED * PANDA.tau_max, ADDED * PANDA.tau_max)
+    assert np.abs(hold / PANDA.tau_max).max() > TORQUE_SHARE
+    falling = hold - 1.2 * np.eye(7)[1]  # Nm
+    for k in range(1, 61):  # the rest of the load is supported until the command has reached `falling`
+        twin.external = (k / 60 - 1) * falling
+        arm.command(k / 60 * falling)
+    twin.external = np.zeros(7)
+    for _ in range(20):
+        arm.command(falling)
+    before = arm.read()
+    assert np.abs(before.dq).max() > 0.05
+    arm.hold, speeds, send = hold, [], twin.command
+    twin.command = lambda tau: (send(tau), speeds.append(twin.read().dq))
+    arm.stop()
+    assert np.abs(speeds)[:, 1].max() < 1.2 * np.abs(before.dq[1])  # the load does not drop when the stop begins
+    assert np.abs(ends[0].dq).max() < SLIDING
+    assert np.abs(ends[0].q - before.q).max() < 0.03
 
 
 def hostile(cycles, seed):

@@ -12,9 +12,12 @@ from served_arms import Bare
 from test_emulator import CLIENTS, client  # noqa: F401  (a fixture)
 
 from r2s.arm.clients import computer_check
+from r2s.arm.clients.collision_thresholds import thresholds_of
 from r2s.arm.clients.computer_check import computer_findings, network_findings
 from r2s.arm.clients.connection_check import FR3, PANDA, Connection, gravity_torque
+from r2s.arm.clients.fr3 import FR3 as FR3_CLIENT
 from r2s.arm.clients.fr3 import within_fr3
+from r2s.arm.clients.panda import Panda
 from r2s.arm.emulator.control import Control
 from r2s.arm.emulator.process import Emulator
 from r2s.arm.interface import ArmStopped
@@ -22,6 +25,7 @@ from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.cli import main
 from r2s.errors import UserError
 from r2s.physics.payload import mass_and_moment, payload_of
+from r2s.physics.push_limit import PushLimit
 from r2s.physics.robot import load_robot
 
 HAND = {"m_ee": 0.73, "F_x_Cee": [-0.01, 0.0, 0.03]}  # Franka's Hand
@@ -113,6 +117,15 @@ def test_a_refused_client_is_closed_and_a_check_does_not_move(client, robot):  #
         arm = make(robot, address, declared_payload={"mass": 0.73, "centre": HAND["F_x_Cee"]})
         assert float(arm.read().m_ee) == pytest.approx(0.73)
         arm.close()
+
+
+def test_a_robot_of_six_joints_is_one_line_before_any_connection():
+    """No client connects, and no threshold is computed, for an arm that is no Franka arm."""
+    ur = load_robot(**{**conf("robot/other"), **conf("robot/ur10e")})
+    plane = PushLimit(40.0, 0.03, np.zeros(3), np.array([0.0, 0, 1]))
+    for make in (lambda: Panda(ur, "nowhere"), lambda: FR3_CLIENT(ur, "nowhere"), lambda: thresholds_of(ur, plane)):
+        with pytest.raises(UserError, match=r"^expected 7 joints for a Franka arm, got 6 \(ur10e\)$"):
+            make()
 
 
 def test_limits_lie_inside_the_arms_own(robot):

@@ -17,6 +17,7 @@ from r2s.arm.clients.franka import Franka
 from r2s.arm.driver import DriverBatch
 from r2s.arm.emulator.control import Control
 from r2s.arm.policy_runner import PolicyRunner
+from r2s.arm.presses import press_plan
 from r2s.arm.twins.make_twin import make_twin
 from r2s.arm.warm_up import warm_up
 from r2s.errors import UserError
@@ -173,6 +174,23 @@ def test_the_reflexes_of_an_arm_follow_the_force_of_its_task():
         UserError, match=r"^safety.force_max: 80 N, with safety.speed_near of 0.05 m/s, allows 1\d\d N"
     ):
         thresholds_of(PANDA, PushLimit(80.0, 0.05, POINT, UP))
+
+
+def test_the_reflexes_allow_the_force_that_a_task_on_a_surface_requests():
+    """Without safety.force_max too: pressing, wiping and data.presses stay below the thresholds, with what errs."""
+    arm = conf("arm/panda") | {"address": "arm"}
+    for task in (make_task(), press_plan(PANDA, TRUE)):
+        own = _arm_settings(OmegaConf.create({"arm": arm}), PANDA, task)
+        limit = PushLimit(task.force[1], 0.02, *task.plane(PANDA))
+        most = task.force[1] + 2 * limit.at(PANDA, TRUE.level, PANDA.q_home)[1]
+        assert (np.array(own["collision_force"][:3]) > most).all()
+        lever = np.abs([UP @ TIP(goal[9 : 9 + N])[1] for goal in task.goals(PANDA, np.random.default_rng(0), 3)])
+        assert (np.array(own["collision_torque"]) > task.force[1] * lever).all()
+        assert max(*own["collision_torque"], *own["collision_force"]) < 100.0
+        typed = _arm_settings(OmegaConf.create({"arm": arm | {"collision_force": [30.0] * 6}}), PANDA, task)
+        assert typed["collision_force"] == [30.0] * 6
+    with pytest.raises(UserError, match=r"^task.force: 20 N, at a task.approach_speed of 0.3 m/s, allows 2\d\d N"):
+        _arm_settings(OmegaConf.create({"arm": arm}), PANDA, make_task(approach_speed=0.3))
 
 
 @pytest.mark.long

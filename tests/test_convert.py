@@ -13,10 +13,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import ROOT, conf, in_blocks
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from r2s.commands import run_command
+from r2s.commands import robot_of, run_command
 from r2s.errors import UserError
 from r2s.excitation.motion import Excitation
 from r2s.physics.dynamics import nominal_dynamics
@@ -25,6 +27,7 @@ from r2s.recordings.lerobot import INFO, write_dataset
 from r2s.recordings.readers import files_of, read
 from r2s.recordings.recording import Recording
 from r2s.recordings.ros_bag import write_mcap
+from r2s.stages.build import CONF
 from r2s.stages.data import read_episodes
 
 JOINTS = [f"joint{j}" for j in range(1, 8)]
@@ -382,3 +385,23 @@ def test_every_robot_has_frames_and_a_description(tmp_path, name):
     (frames, *_) = messages(tmp_path / "a.mcap", "/tf")
     text = messages(tmp_path / "a.mcap", "/robot_description")[0].data
     assert all(f'<link name="{x.child_frame_id}"' in text for x in frames.transforms)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("stage", ["identify", "transfer"])
+def test_a_run_folder_names_the_arm(tmp_path, stage):
+    """With friction and inertia of its joints; of a transfer, policy.yaml names the arm, config.yaml the default."""
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        own = OmegaConf.to_yaml(compose("config", ["robot=ur10e"]))
+        default = OmegaConf.to_yaml(compose("config", ["stage=transfer"]))
+    (tmp_path / "config.yaml").write_text(own if stage == "identify" else default)
+    if stage == "transfer":
+        (tmp_path / "policy.yaml").write_text(own)
+    true = motion("commanded", split=False)
+    replace(true, q=true.q[:, :6], dq=true.dq[:, :6], tau=true.tau[:, :6]).save(tmp_path / "train.npz")
+    run_command(["convert", str(tmp_path / "train.npz"), f"to={tmp_path / 'set'}"])
+    info = json.loads((tmp_path / "set" / INFO).read_text())
+    assert info["robot_type"] == "ur10e"
+    assert [len(info["features"]["action"][key]) for key in ("names", "shape")] == [6, 1]
+    run_command(["convert", str(tmp_path / "train.npz"), f"to={tmp_path / 'a.mcap'}"])
+    assert robot_of([tmp_path, tmp_path]).name == "ur10e"

@@ -1,8 +1,11 @@
 """Costs of a training: their values on a motion, their multipliers, and policies that keep the limits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from conftest import conf
 from test_press import PANDA, make_draw, make_task, resting
 
 from r2s.errors import UserError
@@ -11,10 +14,12 @@ from r2s.learning.env import TaskEnv
 from r2s.learning.sac import SAC
 from r2s.learning.td3 import TD3
 from r2s.learning.tqc import TQC
+from r2s.physics.robot import load_robot
 from r2s.physics.tip import Tip
 from r2s.tasks.costs import COSTS, MARGIN_RAD, MOST, PATIENCE, ConstrainedReward
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.rewards import Reward
+from r2s.tasks.task import State
 
 LIMITS = {"excess_force": 0.5, "impact_speed": 0.01, "limit_margin": 0.02}
 
@@ -35,6 +40,19 @@ def test_costs_have_their_units():
     np.testing.assert_allclose(speed, [max(inwards[0], 0.0), max(inwards[1], 0.0), 0.0], atol=1e-9)
     np.testing.assert_allclose(margin[2], MARGIN_RAD - 0.03)
     assert not margin[:2].any()
+
+
+def test_a_joint_without_limits_has_a_margin_of_its_own():
+    """A turn of a limitless joint costs nothing; beside its neighbour's limit, the neighbour's margin counts."""
+    robot = load_robot(**conf("robot/kinova_gen3"))
+    assert np.isinf(robot.q_max[0])
+    q = np.tile(robot.q_home, (3, 1))
+    q[0, 0], q[1, 0] = robot.q_home[0] + np.pi - 0.02, 7.0
+    q[2, 1] = robot.q_max[1] - 0.03
+    state = replace(State.at_home(robot), q=q)
+    np.testing.assert_allclose(COSTS["limit_margin"](robot, None, state, q), [0.0, 0.0, MARGIN_RAD - 0.03])
+    endless = replace(robot, q_min=np.full(robot.n, -np.inf), q_max=np.full(robot.n, np.inf))
+    assert not COSTS["limit_margin"](endless, None, state, q).any()
 
 
 def test_a_reward_is_charged_its_costs():

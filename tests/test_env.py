@@ -19,6 +19,7 @@ from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.tasks.reach import ReachTask, observe
 from r2s.tasks.rewards import MAX_FACTOR, PAPER, TERMS, Curriculum, terms
+from r2s.tasks.track import TrackTask
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/tables.yaml, reward
 
@@ -354,6 +355,29 @@ def test_a_list_of_torque_fractions_must_fit(panda):
     np.testing.assert_allclose(ReachTask(torque_fraction=(0.1,) * 7).torque_limit(panda), 0.1 * panda.tau_max)
     with pytest.raises(UserError, match=r"^task\.torque_fraction: expected 7 values, for the 7 joints"):
         ReachTask(torque_fraction=(0.1, 0.2)).torque_limit(panda)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"torque_fraction": 30}, r"task.torque_fraction: expected a number in \[1e-6, 1\], got 30"),
+        ({"torque_fraction": -0.3}, "task.torque_fraction: expected a number in .*, got -0.3"),
+        ({"torque_fraction": (0.1, 0.0)}, "task.torque_fraction: expected a number in .*, got 0.0"),
+        ({"torque_fraction": "half"}, "task.torque_fraction: expected a number in .*, got 'half'"),
+        ({"reach": 0.5}, r"task.reach: expected \[least, most\] m or null, got 0.5"),
+        ({"reach": (0.5,)}, r"task.reach: expected \[least, most\] m or null, got \(0.5,\)"),
+        ({"reach": (0.7, 0.3)}, r"task.reach: expected \[least, most\] m, got \[0.7, 0.3\]"),
+        ({"reach": (-0.1, 0.3)}, r"task.reach: expected a number in \[0, inf\), got -0.1"),
+        ({"height": None}, "task.height: expected a number in .*, got None"),
+        ({"azimuth": -1.0}, "task.azimuth: expected a number in .*, got -1.0"),
+    ],
+)
+@pytest.mark.parametrize("kind", [ReachTask, TrackTask])
+def test_a_wrong_region_or_share_of_torque_is_one_line(kind, changed, said):
+    """Of reaching and of tracking: a percentage, a sign, a single distance."""
+    with pytest.raises(UserError, match=f"^{said}") as error:
+        kind(**changed)
+    assert "\n" not in str(error.value)
 
 
 def test_the_observation_is_the_one_an_arm_gives(make):

@@ -11,16 +11,20 @@ import pytest
 import torch
 from conftest import ROOT, unfenced
 from test_export import COMPILER, LAW_NM, LIBFRANKA, POLICY, Exported, arm_of, drawn, loaded
+from test_faults import composed
 
 from r2s import commands
 from r2s.arm.policy_runner import as_state, episode_driver
 from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.export.contract import make_contract
-from r2s.export.law import Driver, Model
+from r2s.export.law import BundleError, Driver, Model
 from r2s.export.push import PushLimit
+from r2s.export.surface import check_surface_plan
+from r2s.export.surface_contract import surface_plans
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.surface import Surface
+from r2s.stages.build import make_dynamics, make_robot, make_task
 from r2s.tasks.task import observe
 
 FORCE_MAX = 40.0  # N
@@ -284,6 +288,12 @@ PLANS = {
         lambda plan: changed(plan, 7, 7, 50.0),
         "row 7 of the plan asks for 50 N; the training had up to 20",
     ),
+    "deep": (lambda plan: changed(plan, 7, 6, 0.5), "row 7 of the plan: a target 500.0 mm below the plane; the"),
+    "target aside": (lambda plan: changed(plan, 7, 19, plan[7, 19] + 0.3), "row 7 of the plan: the setpoint's tar"),
+    "target deeper": (lambda plan: changed(plan, 7, 20, plan[7, 20] - 0.3), "row 7 of the plan: the setpoint's ta"),
+    "setpoint too hard": (lambda plan: changed(plan, 7, 27, 1000.0), "row 7 of the plan: a setpoint with normal and"),
+    "setpoint turned": (lambda plan: changed(plan, 7, 24, 0.1), "row 7 of the plan: a setpoint with normal and"),
+    "measured force": (lambda plan: changed(plan, 7, 29, 1.0), "row 7 of the plan: a setpoint with normal and force"),
     "another start": (lambda plan: changed(plan, 0, 12, 0.5), "mm from where the plan begins"),
 }
 
@@ -302,6 +312,29 @@ def test_a_plan_that_the_training_did_not_have_is_refused(pressing, kind):
     with pytest.raises(runtime.BundleError, match=re.escape(words)) as refused:
         other.reset(change(np.load(pressing.folder / "plans.npz")["plans"][0]))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("task=press",),
+        ("task=press", "control=cartesian_impedance"),
+        ("task=press", "control=hybrid", "control.normal=[0,0,1]", "control.force=5"),
+        pytest.param(("task=wipe",), marks=pytest.mark.long),
+    ],
+)
+def test_every_plan_of_a_task_is_accepted(words):
+    """Setpoint and columns agree: for each kind of controller, half a period ahead, and with its own contact."""
+    cfg = composed(*words)
+    robot = make_robot(cfg)
+    dynamics = make_dynamics(cfg, robot)
+    task = make_task(cfg, robot, dynamics)
+    contract = make_contract(robot, task, dynamics.level)
+    model, begin = Model(contract["model"]), contract["goal"]["columns"]["setpoint"][0]
+    for plan in surface_plans(robot, task, task.goals(robot, np.random.default_rng(0), 3)):
+        check_surface_plan(contract, model, plan)
+        with pytest.raises(BundleError, match="row 7 of the plan: the setpoint's target is 30"):
+            check_surface_plan(contract, model, changed(plan, 7, begin + 1, plan[7, begin + 1] + 0.3))
 
 
 def test_a_motion_begins_where_its_plan_does(pressing):
@@ -330,6 +363,7 @@ def test_the_loop_for_libfranka_takes_a_plan(pressing, tmp_path):
     subprocess.run([*words, str(LIBFRANKA / "loop.cpp"), "-o", str(tmp_path / "loop")], check=True)
     plan = np.load(pressing.folder / "plan.npy")
     plans = {"hard": changed(plan, 7, 7, 50.0), "short": plan[:-1], "single": plan.astype(np.float32)}
+    plans |= {"deep": changed(plan, 7, 6, 0.5), "aside": changed(plan, 7, 19, 0.3), "push": changed(plan, 7, 27, 1e3)}
     for name, values in plans.items():
         np.save(tmp_path / f"{name}.npy", values)
 
@@ -349,6 +383,9 @@ def test_the_loop_for_libfranka_takes_a_plan(pressing, tmp_path):
         ("hard", "hard.npy: row 7 asks for 50.000000 N; the training had up to 20"),
         ("short", "expected float64 of shape (201, 30), row by row, got {'descr': '<f8', 'fortran_order': False, 's"),
         ("single", "expected float64 of shape (201, 30), row by row, got {'descr': '<f4'"),
+        ("deep", "deep.npy: row 7 has a target at a depth that the training did not have"),
+        ("aside", "aside.npy: row 7 has a setpoint with another target"),
+        ("push", "push.npy: row 7 has a setpoint with another normal or force"),
         ("none", "none.npy is no file of numpy.save"),
     ):
         status, out, error = run(str(tmp_path / f"{name}.npy"))

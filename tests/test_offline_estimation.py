@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 from test_adaptation import accurate, recording, robot, truth
 
 from r2s.adaptation.arm_model import make_arm_model
@@ -16,6 +17,7 @@ from r2s.adaptation.tuning import SPAN
 from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
+from r2s.stages.estimate import calibrated_by_commands, compensated, given_recording
 
 
 def test_the_same_data_give_the_same_estimate():
@@ -73,6 +75,35 @@ def test_the_stage_estimates_from_a_recording(tmp_path, capsys):
     before = rows.iloc[round(1.9 / (SPAN * SIM_DT))]
     # without calibration= no delay is known: 3 ms of it cause torque errors in every acceleration
     assert abs(before["mass_kg"] - 1.0) < 2 * before["mass_kg_half"]
+
+
+def given(*words):
+    """Return a config of stage=estimate data=recording with overrides "KEY=VALUE"."""
+    data = {"kind": "recording", "path": "a.npz", "torque": "commanded", "payload": None, "loaded": None}
+    cfg = OmegaConf.create({"data": {**data, "declared_payload": None}, "calibration": None})
+    return OmegaConf.merge(cfg, OmegaConf.from_dotlist(list(words)))
+
+
+def test_a_recording_has_its_declared_payload():
+    """Gravity compensation removed its weight from the commands; a payload to be identified is none of this stage."""
+    found = compensated(given("data.declared_payload=2.0"), robot(), truth())
+    assert found.declared_payload[0] == 2.0
+    assert not compensated(given(), robot(), truth()).declared_payload.any()
+    with pytest.raises(UserError, match=r"^data\.declared_payload: expected a number in \[0, 3\], got 99"):
+        compensated(given("data.declared_payload=99"), robot(), truth())
+    for key in ("payload", "loaded"):
+        with pytest.raises(
+            UserError, match=rf"^data\.{key}: stage=estimate finds the payload itself, got 2\.0; leave"
+        ):
+            given_recording(given(f"data.{key}=2.0"), robot())
+
+
+def test_an_estimate_needs_a_model_from_commanded_torque(tmp_path):
+    """Like an adapter; also if the folder has the recordings."""
+    (tmp_path / "parameters.yaml").write_text("source: {torque: measured}\n")
+    (tmp_path / "train.npz").touch()
+    with pytest.raises(UserError, match=r"^calibration: .* data\.torque=commanded, got measured \("):
+        calibrated_by_commands(given(f"calibration={tmp_path}"), robot())
 
 
 @pytest.mark.slow

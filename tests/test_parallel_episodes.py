@@ -1,11 +1,14 @@
 """Episodes on copies of a twin in parallel processes."""
 
+import multiprocessing
 import os
 import signal
 import sys
+import time
 from contextlib import contextmanager
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from conftest import conf
@@ -55,6 +58,34 @@ def test_two_processes_do_what_one_does_and_report_every_goal(panda, monkeypatch
     assert counts == sorted(counts)
     assert counts[-1] == GOALS
     np.testing.assert_array_equal(done[1].q, done[2].q)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="several processes only on Linux")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_no_process_outlives_a_parent_that_is_killed(panda, monkeypatch, number, tmp_path):
+    """Two processes run episodes of a minute; both end within a second of the process that started them."""
+    monkeypatch.setattr(parallel_episodes, "CHUNK", 1)
+    task = ReachTask(episode_s=0.2)
+    starts, goals = fixed_episodes(panda, task, 2)
+
+    @contextmanager
+    def open_twin(chunk):
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(60)
+        yield
+
+    job = open_twin, None, task, starts, goals, 2, lambda k, total: None
+    parent = multiprocessing.get_context("fork").Process(target=parallel_episodes.run_parallel_episodes, args=job)
+    parent.start()
+    while len(workers := list(tmp_path.iterdir())) < 2:
+        time.sleep(0.01)
+    processes = [psutil.Process(int(worker.name)) for worker in workers]
+    os.kill(parent.pid, number)
+    parent.join()
+    left = psutil.wait_procs(processes, 1.0)[1]
+    for process in left:
+        process.kill()
+    assert not [process for process in left if process.status() != psutil.STATUS_ZOMBIE]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="several processes only on Linux")

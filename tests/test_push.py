@@ -3,6 +3,7 @@
 import itertools
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,16 +14,19 @@ from test_cli import r2s, succeed
 from test_press import BARE, PANDA, TRUE, N, resting
 
 from r2s.arm.twins.make_twin import make_twin
+from r2s.control.impedance import cartesian_impedance
 from r2s.control.torque import torque
 from r2s.engines.dart import dart
 from r2s.engines.episodes import EngineArms
 from r2s.errors import UserError
 from r2s.learning.box_randomization import BoxRandomization
+from r2s.learning.demonstrations import make_demonstrator
 from r2s.learning.evaluate import fixed_draws, fixed_episodes, make_evaluation
 from r2s.learning.pusher import TOLERANCE, Pusher
 from r2s.learning.vector_arms import VectorArms
 from r2s.physics.box import check_size, standing_box, table_frame
 from r2s.physics.contact_layout import DEPTH, MASS, POINT, TABLE, box_pose
+from r2s.physics.push_limit import push_limit
 from r2s.physics.tip import Tip
 from r2s.tasks.push import BOX, ERROR, START, PushTask
 from r2s.tasks.push_measures import GOOD_M
@@ -244,6 +248,31 @@ def test_a_wrong_task_is_one_line(changed, message):
     with pytest.raises(UserError, match=message) as error:
         make_task(**changed)
     assert "\n" not in str(error.value)
+
+
+def test_the_limit_of_pushes_is_at_the_table_of_the_task():
+    """Of a table elsewhere; by default, bit for bit at the plane below the tip at home."""
+    normal = (0.6, 0.0, 0.8)
+    elsewhere = make_task(point=(0.5, 0.0, 0.55), normal=normal).pushing_within(PANDA, TRUE.level, 40.0, 0.1)
+    np.testing.assert_allclose(elsewhere.push_limit.point, elsewhere.table.origin)
+    np.testing.assert_allclose(elsewhere.push_limit.normal, normal)
+    usual, below = make_task().pushing_within(PANDA, TRUE.level, 40.0, 0.1), push_limit(PANDA, TRUE.level, 40.0, 0.1)
+    np.testing.assert_array_equal(usual.push_limit.point, below.point)
+    np.testing.assert_array_equal(usual.push_limit.normal, below.normal)
+
+
+def test_the_reference_uses_the_spring_of_its_controller(task):
+    """Its stiffness and damping, not those of the task's own; it refuses actions that set no target, or rotate."""
+    make = partial(cartesian_impedance, PANDA, task, TRUE)
+    soft = Pusher(PANDA, task.controlled_by(make(stiffness=400.0, damping=0.7)), TRUE)
+    full = Pusher(PANDA, task.controlled_by(make(stiffness=400.0)), TRUE)
+    assert soft._stiffness == 400.0
+    assert soft._damping == pytest.approx(0.7 * full._damping)
+    for wrong in ({"action": "stiffness"}, {"action": "both"}, {"rotational_stiffness": 5.0}):
+        other = task.controlled_by(make(**wrong))
+        with pytest.raises(UserError, match=r"algo: pusher cannot do .* its targets as actions is allowed"):
+            Pusher(PANDA, other, TRUE)
+        assert make_demonstrator(PANDA, other, TRUE) is None
 
 
 def test_what_does_not_fit_is_one_line(task):

@@ -130,6 +130,8 @@ def test_a_declared_payload_is_taken_out(groups, robot, truth):  # noqa: F811
         ({"identify__prior__offset__mean": 99}, "identify.prior.offset.mean: 99 is outside identify.bounds.offset"),
         ({"identify__from": "runs/identify/coold"}, "identify.from: no parameters.yaml at .*coold"),
         ({"identify__drift": -1}, "identify.drift: expected a number in"),
+        ({"data__torque": None, "data__loaded": "sensor.npz"}, "data.loaded: expected motor torque .*got measured"),
+        ({"data__ramps": A}, "data.ramps: ramps determine .* data.path has only motor torque"),
     ],
 )
 def test_a_mistake_is_one_line_before_anything_is_written(groups, change, line):
@@ -143,6 +145,8 @@ def test_a_recording_in_other_units_is_named(groups, folder, robot, truth):  # n
     type(bad)(**{**vars(bad), "tau": 1e3 * bad.tau}).save(folder / "milli.npz")
     with pytest.raises(UserError, match=r"^milli.npz: the recording: motor tau is 1000 times what threelink needs"):
         groups(data__path=[A, "milli.npz"])
+    with pytest.raises(UserError, match="motor tau is 1000 times what threelink needs"):
+        groups(data__path=A, data__loaded="milli.npz")
 
 
 @pytest.mark.long

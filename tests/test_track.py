@@ -143,7 +143,9 @@ def test_a_right_model_follows_within_the_time_that_it_is_late(plans):
     assert np.all(done.distance.max(1) < 0.5 / TASK.ctrl_hz * fastest + 1e-4)
     row = TASK.measures(done)
     assert row["within_5mm"] == 1.0
-    assert row["stopped"] == 0.0
+    assert row["stopped"] == row["collision"] == 0.0
+    touched = replace(done, collision=np.array(["0.50 s: hand and the table", "", "", ""], dtype=object))
+    assert TASK.measures(touched)["collision"] == 0.25
     assert row["path_rmse_mm"] == pytest.approx(1e3 * np.sqrt((done.distance**2).mean()))
     wrong = TASK.with_model(PANDA, nominal_dynamics(PANDA, **conf("friction/gaz2019")))
     off = rollout(ZeroAction(N), arms, wrong, TASK.begin(np.zeros((len(plans), N)), plans), plans)

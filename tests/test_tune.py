@@ -19,7 +19,7 @@ from r2s.errors import UserError
 from r2s.reporting.tuning import against_table, best_so_far, read_grid
 from r2s.runs import Job, Run
 from r2s.stages.build import CONF
-from r2s.stages.tune import TrialRun, Tune, at_edges, corners, follow, parse_range, suggest
+from r2s.stages.tune import TrialRun, Tune, at_edges, corners, follow, parse_range, suggest, words_of
 
 TUNE = yaml.safe_load((ROOT / "conf" / "stage" / "tune.yaml").read_text())["tune"]
 TOY = [
@@ -143,6 +143,13 @@ def test_a_grid_without_a_finished_training_of_the_task_is_one_line(tmp_path):
     assert len(read_grid(f"{tmp_path}/*", "return_paper")) == 1
     with pytest.raises(UserError, match=r"with path_rmse_mm, .* none: a \(unfinished\); b, c \(no path_rmse_mm\)$"):
         read_grid(f"{tmp_path}/*", "path_rmse_mm")
+
+
+def test_none_in_a_space_is_null():
+    """Hydra reads 'None' as a string."""
+    trial = pytest.importorskip("optuna").trial.FixedTrial({"algo.residual_l2": None, "algo.lr": 1e-3})
+    settings = suggest(trial, {"algo.residual_l2": [None, 2.0], "algo.lr": "log(1e-4, 1e-2)"})
+    assert words_of(settings) == ["algo.residual_l2=null", "algo.lr=0.001"]
 
 
 def test_corners_hold_every_value_and_both_ends():

@@ -1,7 +1,7 @@
 """External wrench without a sensor: what was applied is found within its interval, and friction hides what it can."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import pytest
 from conftest import conf
 
 from r2s.adaptation import tuning
-from r2s.adaptation.adapters import AdapterContext, observer
+from r2s.adaptation.adapters import AdapterContext, observer, rls
 from r2s.adaptation.estimator import Estimator
 from r2s.adaptation.momentum import BODY
 from r2s.adaptation.wrench import WrenchObserver, contact_thresholds, contacts, observe_recording
@@ -22,7 +22,7 @@ from r2s.errors import UserError
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.friction import BRISTLE
 from r2s.physics.kinematics import POSE, hand_kinematics
-from r2s.physics.payload import ee_pose, payload_of
+from r2s.physics.payload import ee_pose, mass_and_moment, payload_of
 from r2s.physics.rigid_body import mass_matrix
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.surface import Surface, Tool
@@ -245,6 +245,33 @@ def test_an_adapter_does_not_push_against_a_contact():
         added[robot.tool is None] = np.abs(np.array(torques)[1800:]).mean(0).max()
     assert added[True] > 3.0
     assert added[False] < 0.1 * added[True]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("make", [rls, partial(observer, filter_s=0.087)])
+def test_an_adapter_feels_a_contact_of_an_arm_with_an_unknown_payload(make):
+    """Its weight holds the adapter only until it is estimated; then 20 N at the tip hold it as without payload."""
+    load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03]}, (3.0, 0.15))
+    recording, force = swing(lambda t: np.zeros(3), payload=load), np.array([20.0, 0.0, 0.0])
+    gate, held = make(AdapterContext(ROBOT, truth())), []
+    for k, (q, dq, tau) in enumerate(zip(recording.q, recording.dq, recording.tau, strict=True)):
+        if k >= 2500 and k % 20 == 0:
+            J = jacobian(q)
+        gate(q, dq, tau - (J.T @ force if k >= 2500 else 0.0))
+        held.append(gate.adapter.held)
+    assert not any(held[1500:2500])
+    assert np.mean(held[2550:]) > 0.9
+
+
+@pytest.mark.long
+def test_a_declared_payload_changes_no_contact_threshold():
+    """The recordings of an identification declare none, whatever the arm declares later."""
+    load = mass_and_moment(ROBOT, payload_of(1.0, ROBOT.payload_max, "declared_payload"))
+    thresholds = [
+        contact_thresholds(ROBOT, WrenchObserver(ROBOT, replace(truth(), declared_payload=x)), [free(1), free(2)])
+        for x in (np.zeros(4), load)
+    ]
+    np.testing.assert_allclose(thresholds[1], thresholds[0], rtol=1e-6)
 
 
 NORMAL = np.array([0.0, 0.6, 0.8])

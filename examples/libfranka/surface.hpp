@@ -38,8 +38,31 @@ struct Plan {
   const double* start() const { return row(0) + c::column_q; }
 
  private:
+  static constexpr double rounding = 1e-6, near = 1e-3;  // m and N; m
+
+  // Why the setpoint of row k, which commands the controller, contradicts the row's target, normal or force.
+  // The target may be that of the middle of the control period, between this row's and the next one's.
+  std::string contradicts(int k, const Vec& normal) const {
+    const double *x = row(k), *next = row(k + 1), *given = x + c::column_setpoint, depth = x[c::column_depth];
+    const std::string here = "row " + std::to_string(k);
+    if (c::setpoints == 0) return "";
+    const double after = k + 1 < c::plan_rows ? next[c::column_depth] : 2.0 * depth - row(k - 1)[c::column_depth];
+    const Vec place{x[0], x[1], x[2]}, away = Vec{given[0], given[1], given[2]} - place;
+    const double deep = -dot(away, normal);
+    const Vec moved = Vec{next[0], next[1], next[2]} - place, aside = away + deep * normal;
+    if (deep > std::max(depth, after) + rounding || deep < std::min(depth, after) - rounding ||
+        std::sqrt(dot(aside, aside)) > std::sqrt(dot(moved, moved)) + rounding)
+      return here + " has a setpoint with another target";
+    if (c::setpoints < 12) return "";  // only hybrid control: normal, force, measured force, whether measured
+    for (int i = 0; i < 6; ++i) {
+      const double planned = i < 3 ? normal[i] : x[c::column_force];
+      const double asked = i > 3 ? 0.0 : c::own_contact ? c::contact[i] : planned;
+      if (std::abs(given[6 + i] - asked) > rounding) return here + " has a setpoint with another normal or force";
+    }
+    return "";
+  }
+
   std::string refused() const {
-    constexpr double rounding = 1e-6, near = 1e-3;  // m and N; m
     const Vec point{c::plane_point[0], c::plane_point[1], c::plane_point[2]};
     const Vec normal{c::plane_normal[0], c::plane_normal[1], c::plane_normal[2]};
     for (int k = 0; k < c::plan_rows; ++k) {
@@ -56,6 +79,9 @@ struct Plan {
       if (force < -rounding || force > c::plan_force + rounding)
         return here + " asks for " + std::to_string(force) + " N; the training had up to " +
                std::to_string(c::plan_force) + " N";
+      if (x[c::column_depth] > c::plan_deep + rounding || x[c::column_depth] < -c::plan_high - rounding)
+        return here + " has a target at a depth that the training did not have";
+      if (const std::string why = contradicts(k, normal); !why.empty()) return why;
     }
     Joints q;
     std::copy_n(start(), n, q.begin());

@@ -57,7 +57,7 @@ class AdapterContext:
         wrench = WrenchObserver(self.robot, self.dynamics)
         if self.unloaded is not None:
             wrench.thresholds = contact_thresholds(self.robot, wrench, self.unloaded)
-        return ContactGate(adapter, wrench)
+        return ContactGate(adapter, wrench, *self.corrected)
 
 
 def observer(context: AdapterContext, filter_s: float) -> Adapter:

@@ -1,14 +1,18 @@
 """Freeze an adapter in contact, because adapters treat a contact force as a model error and push against the force.
 
 In contact, the gate freezes the adapter's estimate and returns the torque that the adapter added REWIND cycles before
-the gate detected the contact.
+the gate detected the contact. The weight of a payload that the arm's model lacks is no contact: the gate passes the
+estimated payload to the wrench observer. For an adapter without an `Estimator`, the gate runs its own.
 """
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from r2s.adaptation.adapter import Adapter
+from r2s.adaptation.arm_model import ArmModel
+from r2s.adaptation.estimator import Estimator
+from r2s.adaptation.kalman import Noise
 from r2s.adaptation.wrench import WrenchObserver
 
 REWIND = 100  # cycles, age of the torque added in contact: longer than a detection takes (benchmarks/wrench.py)
@@ -24,11 +28,13 @@ class ContactGate:
     """Wrap an adapter, and freeze the wrapped adapter in contact.
 
     Args:
-        adapter: the wrapped adapter. wrench: observer that detects contacts.
+        adapter: the wrapped adapter; its payload estimate is that of its attribute `estimator`, if it has one.
+        wrench: observer that detects contacts.
+        arm, noise: arm model and its uncertainty for the gate's own estimator.
     """
 
-    def __init__(self, adapter: Holdable, wrench: WrenchObserver):
-        self.adapter, self.wrench = adapter, wrench
+    def __init__(self, adapter: Holdable, wrench: WrenchObserver, arm: ArmModel, noise: Noise):
+        self.adapter, self.wrench, self._model = adapter, wrench, (arm, noise)
         self.begin()
 
     def begin(self) -> None:
@@ -36,6 +42,9 @@ class ContactGate:
         self.adapter.begin()
         self.wrench.begin()
         self.adapter.held = False
+        given: Any = getattr(self.adapter, "estimator", None)
+        self._own = given is None
+        self._estimator: Estimator = Estimator(*self._model) if self._own else given
         self._past = np.zeros((REWIND, len(self.wrench.rests)))  # added torques of the last cycles without contact
         self._cycle = 0
 
@@ -43,6 +52,10 @@ class ContactGate:
         """Process one cycle; return the torque (n,) Nm that the driver adds in the next cycle; see `Adapter`."""
         self.adapter.held = self.wrench(q, dq, tau)
         torque = self.adapter(q, dq, tau)
+        if self._own:
+            self._estimator.held = self.adapter.held
+            self._estimator(q, dq, tau)
+        self.wrench.carry(self._estimator.payload)
         oldest = self._past[self._cycle % REWIND]
         if self.adapter.held:
             return oldest

@@ -16,6 +16,8 @@ the observer uses only the force test.
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -54,6 +56,7 @@ class WrenchObserver:
 
     def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):
         self._arm, self.tool = make_arm_model(robot, dynamics), robot.tool
+        self._declared = dynamics.declared_payload
         position, axes = ee_pose(robot)
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
@@ -93,6 +96,15 @@ class WrenchObserver:
         n, state = len(self._arm.level), self._state
         state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # momentum of the change of payload
         state.payload[:] = payload
+
+    def undeclared(self) -> Self:
+        """Return a copy for an arm whose gravity compensation includes no declared payload."""
+        compensated = self._arm.compensated.copy()
+        compensated[-1] -= self._declared
+        other = copy(self)
+        other._arm = self._arm._replace(compensated=compensated)
+        other.begin()
+        return other
 
     @property
     def in_contact(self) -> bool:
@@ -224,12 +236,16 @@ def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
 def contact_thresholds(robot: Robot, observer: WrenchObserver, free: Sequence[Recording]) -> np.ndarray:
     """Return the contact thresholds (2,) for one false alarm per hour, determined from recordings without contact.
 
+    Args:
+        robot, observer: the arm and its observer, of which `undeclared` processes the recordings.
+        free: recordings without contact and without a declared payload, such as those of an identification.
+
     Raises:
         UserError: the recordings are shorter than 5 s, or their rate is below 200 Hz.
     """
     if why := unfit_for_threshold(free):
         raise UserError(f"contact threshold: {why}")
-    maxima = []
+    observer, maxima = observer.undeclared(), []
     for recording in free:
         squares = observe_recording(robot, observer, recording)[SQUARES].rolling(tuning.CONFIRMED).min()
         square = squares.fillna(0.0).to_numpy()

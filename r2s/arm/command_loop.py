@@ -82,8 +82,11 @@ class CommandLoop:
         self.state = self.arm.read()
 
     def damp(self, hold: np.ndarray) -> None:
-        """Damp the arm to rest (see `rest`), even if a stop was requested."""
-        self._reset()
+        """Damp the arm to rest (see `rest`), even if a stop was requested.
+
+        The driver needs a torque limit of ADDED + REST_SHARE times tau_max to hold the largest load while it damps.
+        """
+        self._reset(hold)  # a low-pass that starts at zero would drop the load for 20 ms
         self.state = self.arm.read()
         self.rest(hold)
 
@@ -196,8 +199,8 @@ class CommandLoop:
             serve()
             raise StopRequested(reason)
 
-    def _reset(self) -> None:
-        self.driver.reset()
+    def _reset(self, torque: np.ndarray | None = None) -> None:
+        self.driver.reset(torque)
         self._ended = self._requested = False
         if self._adapter is not None:
             self._adapter.begin()

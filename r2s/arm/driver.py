@@ -118,9 +118,11 @@ class DriverBatch:
         self(np.tile(robot.q_home, (m, 1)), still, still, None)  # compile now, while no arm waits
         self.reset()
 
-    def reset(self) -> None:
-        """Reset the driver for a new motion, which starts from zero torque."""
+    def reset(self, torque: np.ndarray | None = None) -> None:
+        """Reset the driver for a new motion, which starts from `torque` (n,) Nm, by default zero."""
         self._memory = Memory.fresh(*self._shape, *self._sizes, self._push)
+        if torque is not None:
+            self._memory.filtered[:], self._memory.effort[:] = torque, torque
         self.stopping: list[str | None] = [None] * self._shape[0]
 
     @property
@@ -219,9 +221,9 @@ class Driver:
     def __init__(self, robot: Robot, torque: np.ndarray, friction: np.ndarray, **settings: Any):
         self._drivers = DriverBatch(robot, torque, 1, friction=friction, **settings)
 
-    def reset(self) -> None:
-        """Reset the driver for a new motion, which starts from zero torque."""
-        self._drivers.reset()
+    def reset(self, torque: np.ndarray | None = None) -> None:
+        """Reset the driver for a new motion, which starts from `torque` (n,) Nm, by default zero."""
+        self._drivers.reset(torque)
 
     @property
     def stopping(self) -> str | None:

@@ -5,8 +5,10 @@ chunk has its own stream of sensor noise. A twin with temperature-dependent fric
 """
 
 import multiprocessing
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -18,6 +20,7 @@ import numpy as np
 
 from r2s.arm.policy_runner import PolicyRunner, Stop
 from r2s.arm.realtime import Timing
+from r2s.arm.stop_request import follow
 from r2s.errors import UserError
 from r2s.tasks.rollout import PolicyLike, rollout
 from r2s.tasks.task import Episodes, Task
@@ -65,7 +68,8 @@ def run_parallel_episodes(
     else:
         context = multiprocessing.get_context("fork")
         finished = context.Value("l", 0)  # goals that all processes have finished
-        with ProcessPoolExecutor(min(workers, len(chunks)), context, _initialize, (job, finished)) as pool:
+        given = job, finished, os.getpid()
+        with ProcessPoolExecutor(min(workers, len(chunks)), context, _initialize, given) as pool:
             waiting = {pool.submit(_run_as_process, chunk): chunk for chunk in chunks}
             try:
                 while waiting:
@@ -95,13 +99,16 @@ _job: Any = None  # arguments that a forked process received from `_initialize`
 _finished: Any = None  # shared number of finished goals
 
 
-def _initialize(job: Any, finished: Any) -> None:
+def _initialize(job: Any, finished: Any, parent: int) -> None:
     import torch
 
     global _job, _finished
     _job, _finished = job, finished
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not a handler that the parent process may have
+    # a parent that is killed cannot end this process, and the pool's queue never reports the parent's end
+    threading.Thread(target=follow, args=(parent, threading.Event()), daemon=True, name="follow").start()
 
 
 def _run_as_process(chunk: int) -> Result:

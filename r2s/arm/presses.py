@@ -5,6 +5,7 @@ contact force rises along the first path, falls along the second, and so on. The
 a resting joint hides contact force (docs/how_to/surfaces.md).
 """
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,10 +16,12 @@ from r2s.arm.command_loop import CommandLoop
 from r2s.arm.interface import Arm, ArmState, ArmStopped, speed_share
 from r2s.arm.policy_runner import episode_driver
 from r2s.arm.realtime import Timing
+from r2s.errors import UserError, check_number
 from r2s.excitation.motion_checks import Space
 from r2s.excitation.paths import approach
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.impedance import FORCE_MAX
+from r2s.physics.push_limit import PushLimit
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 from r2s.tasks.wipe import WipeTask
@@ -47,15 +50,31 @@ def press_plan(
     dynamics: Dynamics,
     point: Sequence[float] | None = None,
     normal: Sequence[float] | None = None,
+    force_max: float | None = None,
+    speed_near: float | None = None,
 ) -> PressPlan:
     """Return the plan for a plane whose point (3,) m and normal (3,) are known within 5 mm and 5 degrees.
 
+    With `force_max`, N, and `speed_near`, m/s (see `PushLimit`), the driver limits force and closing speed. The
+    forces of the plan are then low enough that `force_max` allows them, whatever force joint friction hides.
+
     Raises:
-        UserError: the robot has no tool, or the plane is invalid.
+        UserError: the robot has no tool, the plane is invalid, or a limit is out of range or too low to press.
     """
     plan = PressPlan(point=point, normal=normal).with_model(robot, dynamics)  # type: ignore[arg-type]
-    low, high = (share * float(plan.own.parameters[FORCE_MAX]) for share in LOADS)  # type: ignore[union-attr]
-    return replace(plan, force=(low, high))
+    most = float(plan.own.parameters[FORCE_MAX])  # type: ignore[union-attr]
+    low, high = (share * most for share in LOADS)
+    if force_max is not None:
+        check_number("safety.force_max", force_max, "(0, inf)")
+        hidden = PushLimit(force_max, 1.0, *plan.plane(robot)).at(robot, dynamics.level, robot.q_home)[1]
+        if (least := low + 2.0 * hidden) > force_max:
+            raise UserError(
+                f"safety.force_max: {force_max:g} N is not allowed with data.presses; {least:.3g} N or more is: the "
+                f"largest force is {low:.3g} N or more, and joint friction may hide {hidden:.2g} N in each direction"
+            )
+        high = min(high, (force_max - 2.0 * hidden) * (1.0 - 1e-9))  # round-off must not exceed `force_max`
+        low *= high / (LOADS[1] * most)
+    return replace(plan, force=(low, high)).pushing_within(robot, dynamics.level, force_max, speed_near)
 
 
 def record_presses(
@@ -103,7 +122,8 @@ def record_presses(
                     loop(command if cycle == 0 else None, hold)
                     timing.cycle(loop.clock, loop.state)
             loop.settle()
-            loop.end()
+            if (reason := loop.end()) is not None:
+                raise ArmStopped(reason)
             timing.check(arm)
             ends.append(len(log))
             if progress is not None:
@@ -121,6 +141,7 @@ def _recording(log: deque[tuple[ArmState, np.ndarray]], ends: list[int], name: s
     """Return the recording of the completed paths; rows ends[k] to ends[k + 1] of `log` belong to path k."""
     rows = list(log)[: ends[-1]]
     path = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
-    t = np.arange(len(rows)) * SIM_DT + path * PAUSE_S
-    q, dq, tau = (np.array(x) for x in zip(*((s.q, s.dq, sent) for s, sent in rows), strict=True))
+    t, q, dq, tau = (np.array(x) for x in zip(*((s.t, s.q, s.dq, sent) for s, sent in rows), strict=True))
+    for begin, end in itertools.pairwise(ends):  # the arm's clock starts again at each path
+        t[begin:end] += (0.0 if begin == 0 else t[begin - 1] + SIM_DT + PAUSE_S) - t[begin]
     return Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=path, name=name)

@@ -73,7 +73,7 @@ def pipeline() -> int | None:
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 
-def _follow(parent: int, over: threading.Event) -> None:
+def follow(parent: int, over: threading.Event) -> None:
     """Send SIGTERM to this process when `parent` is no longer its parent; check until the event `over` is set."""
     while not over.wait(FOLLOW_S):
         if os.getppid() != parent:
@@ -131,7 +131,7 @@ def handled_signals(
     before[signal.SIGALRM] = signal.signal(signal.SIGALRM, insist)
     over = threading.Event()
     if parent is not None:
-        threading.Thread(target=_follow, args=(parent, over), daemon=True, name="follow").start()
+        threading.Thread(target=follow, args=(parent, over), daemon=True, name="follow").start()
     try:
         yield
     except KeyboardInterrupt:

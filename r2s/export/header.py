@@ -91,11 +91,17 @@ def _surface(contract: Mapping[str, Any]) -> list[str]:
     vectors = {"plane_point": trained["point_m"], "plane_normal": trained["normal"], "tip": goal["tip_m"]}
     vectors["gravity"] = model["gravity_m_per_s2"]
     lines += [f"constexpr double {name}[3] = {_braced(value)};" for name, value in vectors.items()]
+    low, deepest = trained["depth_m"]
     numbers = {
         "plane_spread": trained["spread_m"],
         "plan_force": trained["force_N"][1],
+        "plan_high": -low,
+        "plan_deep": deepest,
         "regular": goal["regular_m2"],
     }
+    own = trained["contact"]
+    lines += [f"constexpr bool own_contact = {str(own is not None).lower()};"]
+    lines += [f"constexpr double contact[4] = {_braced(own or [0.0] * 4)};  // instead of the plan's"]
     numbers |= {
         "friction_sign": model["number"]["sign_rad_per_s"],
         "load_sign": model["number"]["load_sign_rad_per_s"],

@@ -16,6 +16,7 @@ from r2s.export.plan import NO_PLAN, finite_plan
 
 WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
 NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and the target in the plan's first row
+CONTACT = slice(6, 12)  # in a setpoint of control=hybrid: normal, force N, measured force N, whether measured
 ROUNDING = 1e-6  # m and N, tolerance with which a plan is compared with the training's ranges
 
 
@@ -27,7 +28,10 @@ def columns_of(n: int, setpoints: int) -> dict[str, list[int]]:
 
 
 def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
-    """Raise BundleError if a plan leaves the training's plane, area or force range, or has a wrong start posture."""
+    """Raise BundleError if a plan leaves the training's plane, area, depth or force range.
+
+    Further errors are a setpoint that contradicts the other columns, and a wrong start posture.
+    """
     goal = contract["goal"]
     at, own, trained = goal["columns"], contract["law"]["joint"], goal["trained"]
     place, normal, depth, force, q = (plan[:, slice(*at[k])] for k in ("place", "normal", "depth", "force", "q"))
@@ -48,6 +52,14 @@ def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray)
     if force.max() > most + ROUNDING or force.min() < -ROUNDING:
         row = int(np.abs(force - 0.5 * most).argmax())
         raise BundleError(f"row {row} of the plan asks for {force[row, 0]:.3g} N; the training had up to {most:g} N")
+    low, deepest = trained["depth_m"]
+    if depth.max() > deepest + ROUNDING or depth.min() < low - ROUNDING:
+        row = int(np.abs(depth - 0.5 * (low + deepest)).argmax())
+        raise BundleError(
+            f"row {row} of the plan: a target {1e3 * depth[row, 0]:.1f} mm below the plane; the training had "
+            f"{1e3 * low:.1f} to {1e3 * deepest:.1f} mm"
+        )
+    check_setpoint(goal, plan)
     low, high_q = (np.array([s if v is None else v for v in own[k]]) for k, s in LIMITS.items())
     if (beyond := (q[0] < low) | (q[0] > high_q)).any():
         j = int(beyond.argmax())
@@ -56,6 +68,43 @@ def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray)
     tip = model.point(np.array(goal["tip_m"]))[0]
     if (apart := np.linalg.norm(tip - place[0] + depth[0] * normal[0])) > NEAR_M:
         raise BundleError(f"the tip is {1e3 * apart:.1f} mm from where the plan begins")
+
+
+def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
+    """Raise BundleError if the setpoint, which commands the controller, differs from target, normal or force.
+
+    The target lies between the targets of a row and of the next row, because the setpoint of a target that slides is
+    valid for the middle of the control period.
+
+    Args:
+        goal: entry `goal` of the contract. plan: (rows, columns), a plan on a surface.
+    """
+    at = goal["columns"]
+    place, normal, depth, force, setpoint = (
+        plan[:, slice(*at[k])] for k in ("place", "normal", "depth", "force", "setpoint")
+    )
+    if not setpoint.shape[1]:
+        return
+    away, after = setpoint[:, :3] - place, np.append(depth[1:], 2.0 * depth[-1:] - depth[-2:-1], axis=0)
+    deep = -(away * normal).sum(1, keepdims=True)
+    moved = np.linalg.norm(np.diff(place, axis=0, append=place[-1:]), axis=1)
+    aside = np.linalg.norm(away + deep * normal, axis=1) - moved
+    off = np.hstack([deep - np.maximum(depth, after), np.minimum(depth, after) - deep, aside[:, None]]).max(1)
+    if off.max() > ROUNDING:
+        row = int(off.argmax())
+        raise BundleError(f"row {row} of the plan: the setpoint's target is {1e3 * off[row]:.1f} mm off the plan's")
+    if setpoint.shape[1] < CONTACT.stop:
+        return
+    own = goal["trained"]["contact"]
+    asked = np.hstack([normal, force]) if own is None else np.tile(own, (len(plan), 1))
+    asked = np.hstack([asked, np.zeros((len(plan), 2))])  # a plan contains no measured force
+    given = setpoint[:, CONTACT]
+    if (unlike := np.abs(given - asked).max(1)).max() > ROUNDING:
+        row = int(unlike.argmax())
+        raise BundleError(
+            f"row {row} of the plan: a setpoint with normal and force {given[row].tolist()}, expected "
+            f"{asked[row].tolist()}"
+        )
 
 
 LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # keys of the law, and what null means

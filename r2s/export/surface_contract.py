@@ -13,7 +13,7 @@ from r2s.physics import push_limit as law
 from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
-from r2s.tasks.surface_task import REGULAR, START, SurfaceTask
+from r2s.tasks.surface_task import LAG_M, REGULAR, START, SurfaceTask
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
@@ -31,10 +31,15 @@ def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndar
 
 def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
     """Return the contract's entry `goal` for plans on a surface: their format, and their ranges during training."""
-    columns = columns_of(robot.n, task.control(robot).setpoint_size)
+    control, tool = task.control(robot), robot.tool
+    columns = columns_of(robot.n, control.setpoint_size)
     point, normal = task.plane(robot)
+    contact, radius = getattr(control, "contact", None), tool.radius  # type: ignore[union-attr]
+    deepest = float(task.beyond + LAG_M - radius + task.force[1] / task.spring)
     trained = {"point_m": point.tolist(), "normal": normal.tolist(), "spread_m": task.spread}
     trained |= {"place_m": task.place, "tilt_rad": float(np.radians(task.tilt)), "force_N": list(task.force)}
+    trained |= {"depth_m": [-float(task.clearance + radius), deepest]}
+    trained |= {"contact": None if contact is None else contact.tolist()}  # normal and force N if not the plan's
     site, axes = ee_pose(robot)
     return {
         "kind": "surface",
@@ -45,7 +50,7 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
         "unit": "m, m/s, N, rad, and the units of the controller",
         "frame": "the arm's base",
         "examples": "plans.npz",
-        "tip_m": (site + axes @ robot.tool.tip).tolist(),  # type: ignore[union-attr]
+        "tip_m": (site + axes @ tool.tip).tolist(),  # type: ignore[union-attr]
         "regular_m2": REGULAR,
         "trained": trained | {"seconds": task.episode_s},
     }

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from r2s.learning.model_based import Oracle, ZeroAction, hybrid_force
-from r2s.learning.pusher import Pusher
+from r2s.learning.pusher import Pusher, sets_targets
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
-from r2s.tasks.push import PushTask
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
@@ -51,8 +50,8 @@ def make_demonstrator(robot: Robot, task: Task, dynamics: Dynamics) -> Demonstra
     control = task.control(robot)
     if isinstance(task, ReachTask) and control.name == "torque":
         return Demonstrator(Oracle(robot, task, dynamics))
-    if isinstance(task, PushTask) and control.name == "cartesian_impedance" and control.action_dim == 3:
-        return Demonstrator(Pusher(robot, task, dynamics))
+    if sets_targets(task, control):
+        return Demonstrator(Pusher(robot, task, dynamics))  # type: ignore[arg-type]
     if control.name == "hybrid" and hasattr(task, "contact"):
         return Demonstrator(hybrid_force(robot, task, dynamics))
     return None

@@ -12,14 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2s.control.controller import Controller
 from r2s.errors import UserError
 from r2s.physics.box import EXPECTED
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.impedance import K_DEFAULT, RATIO
 from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
 from r2s.tasks.push_measures import GOOD_M, GOOD_RAD
+from r2s.tasks.task import Task
 
 POINTS, EDGE = 9, 0.75  # number of points per face; share of a half edge that the points span
 CLEAR = 0.02  # m, clearance between tip and box while the tip moves around the box
@@ -43,22 +46,20 @@ class Pusher:
 
     def __init__(self, robot: Robot, task: PushTask, dynamics: Dynamics):
         control = task.control(robot)
-        if not isinstance(task, PushTask) or control.name != "cartesian_impedance" or control.action_dim != 3:
+        if not sets_targets(task, control):
             raise UserError(
                 f"algo: pusher cannot do {type(task).__name__} under control={control.name}; task=push with "
                 "control=cartesian_impedance and its targets as actions is allowed"
             )
         self._task, self._dynamics, self._n = task, dynamics, robot.n
         self._axes, self._scale = task.table.axes, control.action_scale
-        self._stiffness, self._load = (
-            task.spring,
-            EXPECTED["mass"] * EXPECTED["table"] * np.linalg.norm(robot.gravity),
-        )
+        self._stiffness = float(control.parameters[K_DEFAULT])
+        self._load = EXPECTED["mass"] * EXPECTED["table"] * np.linalg.norm(robot.gravity)
         jacobian = task.tip(robot.q_home[None])[1][0]
         mobility = jacobian @ np.linalg.solve(
             InverseDynamics(robot, dynamics).mass(robot.q_home[None])[0], jacobian.T
         )
-        self._damping = 2.0 * np.sqrt(self._stiffness * 3.0 / np.trace(mobility))  # N s/m, critical
+        self._damping = control.parameters[RATIO] * np.sqrt(self._stiffness * 3.0 / np.trace(mobility))  # N s/m
         self._centre = task.table.inside(task.centre)
         half = 0.5 * np.array(task.size)
         self._half, self._clear = half[:2], half[:2] + task.tip_radius + CLEAR
@@ -165,6 +166,12 @@ class Pusher:
                 length, k = length + float(np.linalg.norm(corners[after] - corners[k])), after
             lengths.append(length + float(np.linalg.norm(to - corners[k])))
         return min(lengths)
+
+
+def sets_targets(task: Task, control: Controller) -> bool:
+    """Return whether a `Pusher` supports the task: actions must displace the tip's target along three axes, in m."""
+    impedes = control.name == "cartesian_impedance" and control.action == "target"
+    return isinstance(task, PushTask) and impedes and control.action_dim == 3
 
 
 def _face_points(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -73,6 +73,7 @@ def press_parts(cfg, robot, arm):
     from r2s.arm.presses import press_plan
     from r2s.stages.build import check_source, is_simulated
     from r2s.stages.data import check_data
+    from r2s.stages.parts import plain
 
     check_data(cfg)
     if robot.tool is None:
@@ -82,7 +83,8 @@ def press_parts(cfg, robot, arm):
     check_source(cfg, robot)
     plane = {"point": cfg.data.press_point, "normal": cfg.data.press_normal}
     plane = {k: None if v is None else tuple(v) for k, v in plane.items()}
-    return press_plan(robot, arm.space.dynamics(arm.x), **plane)
+    limits = plain(cfg.get("safety")) or {}  # older configs lack this key
+    return press_plan(robot, arm.space.dynamics(arm.x), **plane, **limits)
 
 
 def pressed_surface(cfg, run, arm, plan):

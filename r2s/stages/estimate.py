@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from r2s.errors import Stopped, UserError, check_number
 from r2s.files import located
-from r2s.stages.adapter_factory import calibrated, free_recordings, with_declared_payload
+from r2s.stages.adapter_factory import TORQUE, calibrated, free_recordings, with_declared_payload
 from r2s.stages.build import (
     check_source,
     make_dynamics,
@@ -14,6 +14,8 @@ from r2s.stages.build import (
     within_speed_share,
 )
 from r2s.stages.data import check_data, file_data, read_file
+from r2s.stages.parts import plain
+from r2s.stages.payload import torque_of_calibration
 
 WHY = {
     "arm": "only data=arm moves an arm",
@@ -43,9 +45,8 @@ def estimate(cfg, overrides):
     recording = given_recording(cfg, robot)
     dynamics, posterior, unloaded = make_dynamics(cfg, robot), None, None
     if cfg.calibration:
-        dynamics, posterior, unloaded = calibrated(cfg.calibration, robot)
-    if cfg.data.kind == "arm":
-        dynamics = with_declared_payload(cfg, robot, dynamics)
+        dynamics, posterior, unloaded = calibrated_by_commands(cfg, robot)
+    dynamics = compensated(cfg, robot, dynamics)
     surface = identified_surface(cfg, robot)
     inputs = [str(located(cfg.data.path))] if recording is not None else []
     with open_run(cfg, overrides, inputs) as run:
@@ -98,6 +99,26 @@ def estimate(cfg, overrides):
     print(f"written: {run.folder}")
 
 
+def calibrated_by_commands(cfg, robot):
+    """Return `calibrated` of calibration=; raise UserError unless commanded torque identified the model."""
+    if (torque := torque_of_calibration(cfg, None)) != TORQUE:
+        raise UserError(
+            f"calibration: stage=estimate expects a model identified with data.torque={TORQUE}, got {torque} "
+            f"({cfg.calibration})"
+        )
+    return calibrated(cfg.calibration, robot)
+
+
+def compensated(cfg, robot, dynamics):
+    """Return the dynamics of an arm whose gravity compensation includes the payload declared for arm or recording."""
+    from r2s.physics.payload import mass_and_moment, payload_of
+
+    if cfg.data.kind == "arm":
+        return with_declared_payload(cfg, robot, dynamics)
+    declared = payload_of(plain(cfg.data).get("declared_payload"), robot.payload_max, "data.declared_payload")
+    return dynamics if declared is None else replace(dynamics, declared_payload=mass_and_moment(robot, declared))
+
+
 def identified_surface(cfg, robot):
     """Return the identified surface of estimate.surface=, or None; raise UserError if the robot has no tool."""
     if not cfg.estimate.surface:
@@ -136,7 +157,7 @@ def given_recording(cfg, robot):
     """Return the recording of data=recording with one row per millisecond, or None if r2s will record an arm.
 
     Raises:
-        UserError: the file is missing or lacks commanded torque, or a setting of the arm is wrong.
+        UserError: the file is missing or lacks commanded torque, or a setting of arm or payload is wrong.
     """
     from r2s.adaptation.offline_estimation import at_rate
 
@@ -147,6 +168,12 @@ def given_recording(cfg, robot):
     if cfg.data.kind != "recording":
         check_source(cfg, robot)
         return None
+    for key in ("payload", "loaded"):
+        if cfg.data.get(key) is not None:
+            raise UserError(
+                f"data.{key}: stage=estimate finds the payload itself, got {cfg.data[key]}; leave it out; "
+                "data.declared_payload= is what gravity compensation assumed"
+            )
     file = file_data(cfg)
     return at_rate(robot, read_file(robot, file, file.path))
 

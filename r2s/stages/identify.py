@@ -24,6 +24,7 @@ from r2s.stages.recordings import Group, read_groups, recording_files, whole
 
 WHY = {
     "arm": "only data=arm moves an arm",
+    "safety": "only data.presses touches a surface",
     "inertia": "calibration= gives the links",
     "friction": "calibration= gives the friction; friction.family= may change its law",
 }
@@ -33,6 +34,7 @@ def reads(cfg):
     """Return the config keys that stage=identify reads."""
     keys = {"robot", "calibration", "identify", "search", "data"}
     keys |= {"friction.family"} if cfg.calibration else {"friction", "inertia"}
+    keys |= {"safety"} if cfg.data.get("presses") else set()
     return keys | ({"arm"} if cfg.data.kind == "arm" else set())
 
 

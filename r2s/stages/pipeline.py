@@ -37,6 +37,8 @@ ROWS = {
 }
 PATHS = 6  # number of contact motions on the surface, 8 s each; the last is for validation
 CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # see `commands`
+# keys that only learners read
+UNLEARNED = ("algo", "budget", "reward", "costs", "evaluation.env_steps", "compile", "matmul", "device")
 WHY = {
     "calibration": "it identifies the arm itself",
     "policy": "it trains its policies itself",
@@ -169,7 +171,8 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     """Return the commands {label: words} of each step: identify the arm, identify a surface, train, transfer.
 
     The trainings on the identified and the nominal model differ only in the model: settings, time and computer are
-    the same. With an adapter, the changes of the arm (CHANGES) apply only to transfers, not to identifications.
+    the same. With an adapter, the changes of a simulated arm (CHANGES) apply only to transfers, not to
+    identifications. A physical arm keeps its declared payload, because the load is set in its control box.
 
     Args:
         cfg: config of the pipeline. name: name of the pipeline's run folder, with which all other folder names begin.
@@ -202,7 +205,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
         "identified": step("train", "identified", *budget, known, *drawn, calibration=known, typed=bare),
         "nominal": step("train", "nominal", *budget, *choice, typed=bare),
     }
-    unlearned = without("adapt", "algo", "reward", "costs", "evaluation.env_steps", "compile", "matmul", "device")
+    unlearned = without("adapt", *UNLEARNED)
     if REFERENCE in labels(cfg)[0]:
         reference = "algo=pusher" if moves_box(cfg) else "algo=hybrid_force"
         words, typed = [reference, known, *drawn], [o for o in unlearned if not o.startswith("control")]
@@ -215,11 +218,12 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     for label in labels(cfg)[1]:
         policy = f"policy={root / 'train' / f'{name}_{MODELS[0] if label == ADAPTED else label}'}"
         transferred[label] = step("transfer", label, policy, *table, typed=overrides if label == ADAPTED else bare)
-    changes = CHANGES if adapts else ()
-    unchanged = without(*changes, *(["arm.surface"] if table or touched else []))
+    changes = CHANGES if adapts and is_simulated(cfg) else ()
+    unchanged = without(*changes, *(["arm.surface"] if touched or moves_box(cfg) else []))
     steps = [{"identify": step("identify", "identify", typed=unchanged)}, trained, transferred]
     if touched:
-        words = [known, f"data.presses={PATHS}", *tool_words(cfg), *table]
+        limits = [o for o in overrides if o.lstrip("+~").startswith("safety")]  # read because of data.presses
+        words = [known, f"data.presses={PATHS}", *tool_words(cfg), *table, *limits]
         pressed = step("identify", SURFACE, *words, calibration=known, typed=without("adapt", "data", *changes))
         steps.insert(1, {SURFACE: pressed})
     return steps
@@ -258,6 +262,14 @@ def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
     """Before the arm moves, raise UserError if identification or training would refuse an override."""
     first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
     identify.make_parts(compose_step(first["identify"], "stage=identify"))
+    for label, words in trained.items():
+        step = compose_step(words, f"the training '{label}'")
+        for word in words:
+            if why := unread(word.lstrip("+~").split("=")[0], step):
+                raise UserError(f"the training '{label}': {why}")
+    if COMPUTED in trained:  # refuses some controllers; the reference uses the task's own
+        bare = [word for word in trained[COMPUTED] if not word.startswith("calibration=")]
+        train.make_parts(compose_step([*bare, *chosen(overrides, cfg)], f"the training '{COMPUTED}'"))
     train.make_parts(compose_step(trained["nominal"], "stage=train"))  # other trainings need the identified model
 
 

@@ -129,7 +129,12 @@ def training_words(cfg, overrides, settings):
     step = cfg.copy()
     step.stage = "train"
     typed = [o for o in overrides_for(overrides, step) if not o.startswith(("resume=", "skip_completed="))]
-    return [*typed, *(f"{k}={v}" for k, v in settings.items()), "stage=train", "threads=1"]
+    return [*typed, *words_of(settings), "stage=train", "threads=1"]
+
+
+def words_of(settings):
+    """Return the overrides of the settings {option: value}; None becomes null."""
+    return [f"{key}={'null' if value is None else value}" for key, value in settings.items()]
 
 
 def check_trainings(cfg, overrides, space):
@@ -322,13 +327,14 @@ def tune(cfg, overrides):
         counts = trials["state"].value_counts().to_dict()
         run.summary({"best": best.to_dict() | {"unseen": last[how.measure]}, "trials": counts})
         tuning_page(run, trials, against, how.measure)
-    settings = " ".join(f"{k}={best[k]}" for k in how.space if k in best.index)
+    chosen = study.trials[int(best["trial"])].params  # the table has nan for None
+    settings = " ".join(words_of({k: chosen[k] for k in how.space if k in chosen}))
     unseen = f"{last[how.measure]:.4g} on goals that chose nothing"
     line = f"best of {len(trials)} trials: {how.measure} {best['value']:.4g}, {unseen}, with {settings}"
     seeds = ",".join(str(cfg.seed + k) for k in range(1, 4))
     lines = [
         line,
-        *at_edges({str(k): v for k, v in best.items()}, how.space),
+        *at_edges(chosen, how.space),
         f"its seed chose it: confirm with python run.py -m {settings} seed={seeds}",
     ]
     for line in lines:

@@ -38,8 +38,8 @@ def impact_speed(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np
 
 def limit_margin(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
     """Return (m,) rad, max(0, MARGIN_RAD - smallest distance of a joint from its position limits)."""
-    low, high = robot.q_range
-    return (MARGIN_RAD - np.minimum(state.q - low, high - state.q).min(1)).clip(0.0)
+    left = np.minimum(state.q - robot.q_min, robot.q_max - state.q)  # infinite for a joint without limits
+    return (MARGIN_RAD - left.min(1)).clip(0.0)
 
 
 COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {

@@ -25,9 +25,10 @@ from r2s.physics.box import (
     table_frame,
 )
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.impedance import K_DEFAULT, arm_tips
+from r2s.physics.impedance import arm_tips
+from r2s.physics.push_limit import push_limit
 from r2s.physics.robot import Robot
-from r2s.physics.tip import Tip
+from r2s.physics.tip import Tip, nominal_plane
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.push_measures import GOOD_M, GOOD_RAD, PUSH, push_measures
 from r2s.tasks.surface_task import near, rough
@@ -145,15 +146,17 @@ class PushTask(TipTask):
         own = cartesian_impedance(robot, task, dynamics, torque_fraction=share, displacement=self.displacement)
         return replace(task, own=own, parameters=own.parameters)
 
+    def pushing_within(
+        self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
+    ) -> Self:
+        """Return the task with limits of contact force, N, and speed, m/s, at the table of `point` and `normal`."""
+        plane = nominal_plane(robot, self.point, self.normal)
+        return self._with("push_limit", push_limit(robot, friction, force_max, speed_near, plane))
+
     @property
     def paper_weights(self) -> np.ndarray:
         """Weights (k,) of the reward terms, in the order of `reward_terms`."""
         return np.array(list(WEIGHTS.values()))
-
-    @property
-    def spring(self) -> float:
-        """The stiffness, N/m, of the default controller's spring."""
-        return float(self.of_model("parameters")[K_DEFAULT])
 
     @property
     def table(self) -> TableFrame:

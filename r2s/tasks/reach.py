@@ -94,6 +94,22 @@ class ReachTask(BaseTask):
         check_number("task.start_spread", self.start_spread, "[0, inf)")
         if self.speed_noise is not None:
             check_number("task.speed_noise", self.speed_noise, "[0, 1]")
+        for share in np.ravel(np.array(self.torque_fraction, dtype=object)):
+            check_number("task.torque_fraction", share, "[1e-6, 1]")
+        self._check_region()
+
+    def _check_region(self) -> None:
+        """Raise UserError unless `reach` is None or 0 <= low <= high, and `height` and `azimuth` are numbers."""
+        check_number("task.height", self.height, "[-inf, inf]")
+        check_number("task.azimuth", self.azimuth, "[0, inf]")
+        if self.reach is None:
+            return
+        if not isinstance(self.reach, tuple | list) or len(self.reach) != 2:
+            raise UserError(f"task.reach: expected [least, most] m or null, got {self.reach!r}")
+        for value in self.reach:
+            check_number("task.reach", value, "[0, inf)")
+        if self.reach[0] > self.reach[1]:
+            raise UserError(f"task.reach: expected [least, most] m, got {list(self.reach)}")
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "ReachTask":
         """Return the task; if `speed_noise` is None, set the default for an arm with these dynamics."""

@@ -112,11 +112,12 @@ class TrackTask(BaseTask):
         for kind in self.kinds or ("",):
             if kind not in KINDS:
                 raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
-        replace(self._region)  # raises if the region is invalid
+        replace(self._region)  # raises if the region or the torque is invalid
 
     @property
     def _region(self) -> ReachTask:
-        return ReachTask(self.ctrl_hz, self.episode_s, reach=self.reach, height=self.height, azimuth=self.azimuth)
+        place = {"reach": self.reach, "height": self.height, "azimuth": self.azimuth}
+        return ReachTask(self.ctrl_hz, self.episode_s, self.torque_fraction, **place)  # type: ignore[arg-type]
 
     @property
     def observation_summary(self) -> str:
@@ -293,7 +294,8 @@ class TrackTask(BaseTask):
         path_max_mm: mean over paths without a stop of the largest distance on a path. within_x: share of steps with a
         distance below x; steps of stopped paths never qualify. return_track: mean over paths of the reward's sum.
         torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector, from cubic fits
-        over JERK_S. stopped: share of stopped paths. q_left_rad, limited: see `r2s.tasks.rollout.measures`.
+        over JERK_S. stopped: share of stopped paths. q_left_rad, limited, collision: see
+        `r2s.tasks.rollout.measures`.
         """
         ended = ~np.isfinite(episodes.distance).all(1)
         error = 1e3 * episodes.distance[~ended]
@@ -314,6 +316,7 @@ class TrackTask(BaseTask):
             "torque_rms_Nm": float(np.sqrt((episodes.tau**2).mean())),
             "jerk": float(np.sqrt((jerk**2).mean())),
             "stopped": float(ended.mean()),
+            "collision": float((episodes.collision != "").mean()),
             "q_left_rad": float(np.quantile(episodes.q_left, 0.05)),
             "limited": float(episodes.limited.mean()),
         }

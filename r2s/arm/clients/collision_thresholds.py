@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r2s.arm.clients.connection_check import check_joints
 from r2s.errors import UserError, check_number
 from r2s.physics.push_limit import STIFF, PushLimit
 from r2s.physics.robot import Robot
@@ -44,19 +45,23 @@ class CollisionThresholds:
 CAUTIOUS = CollisionThresholds()
 
 
-def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
+def thresholds_of(robot: Robot, limit: PushLimit | None, cause: str | None = None) -> CollisionThresholds:
     """Return collision thresholds above every contact force that the push limit allows; without a limit, CAUTIOUS.
 
     On a rigid surface, the tip exerts at most the normal force F that the push limit allows, and the tangential force
     FRICTION * F. The thresholds are the resulting torques and forces plus ERROR * CAUTIOUS for model errors, but at
     least CAUTIOUS.
 
+    cause: subject of the error message; if None, the settings of the push limit.
+
     Raises:
-        UserError: the push limit needs thresholds so high that they would switch the reflexes off.
+        UserError: the push limit needs thresholds so high that they would switch the reflexes off, or the robot does
+            not have 7 joints.
     """
     cautious = np.array(CAUTIOUS.torque), np.array(CAUTIOUS.force)
     if limit is None:
         return CAUTIOUS
+    check_joints(robot)
     tip, tool = Tip(robot), robot.tool
     q = tip.posture(limit.point + tool.radius * limit.normal)  # type: ignore[union-attr]
     q = robot.q_home if q is None else q
@@ -66,9 +71,9 @@ def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
     reached = most * lever, most * np.repeat([1.0, arm], 3)
     torque, force = (np.maximum(low, ERROR * low + x) for low, x in zip(cautious, reached, strict=True))
     if max(torque.max(), force.max()) >= OFF:
+        typed = f"{limit.force_max:g} N, with safety.speed_near of {limit.speed_near:.3g} m/s,"
         raise UserError(
-            f"safety.force_max: {limit.force_max:g} N, with safety.speed_near of {limit.speed_near:.3g} m/s, allows "
-            f"{most:.3g} N on a rigid surface; for that the arm's reflexes would be off ({OFF:g} N or Nm); lower "
-            "one, or set arm.collision_torque and arm.collision_force"
+            f"{cause or f'safety.force_max: {typed}'} allows {most:.3g} N on a rigid surface; for that the arm's "
+            f"reflexes would be off ({OFF:g} N or Nm); lower one, or set arm.collision_torque and arm.collision_force"
         )
     return CollisionThresholds(tuple(torque.round(1).tolist()), tuple(force.round(1).tolist()))

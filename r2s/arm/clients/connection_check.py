@@ -22,6 +22,12 @@ GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # allowed error: a share of the posture's 
 BEYOND = 0.1  # rad, how far a person may guide a joint beyond its limit
 
 
+def check_joints(robot: Robot) -> None:
+    """Raise UserError unless the robot has the 7 joints of a Franka arm."""
+    if robot.n != 7:
+        raise UserError(f"expected 7 joints for a Franka arm, got {robot.n} ({robot.name})")
+
+
 @dataclass(frozen=True)
 class ArmType:
     """A type of Franka arm and its limits (Franka's FCI documentation).

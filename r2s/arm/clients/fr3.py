@@ -95,8 +95,8 @@ class FR3(Panda):
     """A Franka Research 3, with the arguments of `Panda` and the limits of `within_fr3`.
 
     Raises:
-        UserError: pylibfranka is missing, no server of FCI version 10 answers at the address, or the connected arm
-            does not match the model.
+        UserError: the robot does not have 7 joints, pylibfranka is missing, no server of FCI version 10 answers at
+            the address, or the connected arm does not match the model.
     """
 
     arm_type, client_type, within = connection_check.FR3, _FR3Client, staticmethod(within_fr3)

@@ -14,11 +14,11 @@ import numpy as np
 
 from r2s.arm.clients import fci
 from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
-from r2s.arm.clients.connection_check import Connection, Finding, refuse
+from r2s.arm.clients.connection_check import Connection, Finding, check_joints, refuse
 from r2s.arm.clients.consent import Operator
 from r2s.arm.clients.libfranka import Client
-from r2s.arm.command_loop import STILL, CommandLoop
-from r2s.arm.driver import Driver
+from r2s.arm.command_loop import REST_SHARE, STILL, CommandLoop
+from r2s.arm.driver import ADDED, Driver
 from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
 from r2s.arm.realtime import realtime_section
 from r2s.arm.tracking_controller import CUTOFF_HZ, TrackingController
@@ -42,6 +42,8 @@ INTEGRAL_GAIN = 15.0  # share of tau_max per rad s; overcomes breakaway torque a
 INTEGRAL_SHARE = 0.15  # share of tau_max, limit of the integral's torque
 ARRIVED = 2e-3  # rad from the target: the motion ends
 ACCEPTED = 1e-2  # rad from the target after SETTLE_S: accepted, because friction may hold a real wrist there
+# share of tau_max that the driver allows in `stop`: the largest `hold` of a load, and the damping torque on top of it
+STOP_SHARE = ADDED + REST_SHARE
 MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
 
 
@@ -82,8 +84,7 @@ class Franka:
         speed_share: float = 1.0,
     ):
         check_number("speed_share", speed_share, "(0, 1]")
-        if robot.n != 7:
-            raise UserError(f"expected 7 joints for a Franka arm, got {robot.n} ({robot.name})")
+        check_joints(robot)
         self.robot, self.operator, self.speed_share = robot, operator, speed_share
         self.blocked: str | None = None
         self.hold = np.zeros(robot.n)
@@ -95,12 +96,12 @@ class Franka:
         self._stopped: str | None = "no motion was started; call move_to first"
         self._read_idle()
         self._connection, self.findings = connection, self._compared(connection)
-        limits = TORQUE_SHARE * robot.tau_max, 2 * friction_margin(robot)
-        fence = CollisionCheck(robot, table=None)
         # a strong reference to the arm would keep the arm and its connection alive after their last use
-        self._loop = CommandLoop(
-            weakref.proxy(self),
-            Driver(robot, *limits, cutoff_hz=CUTOFF_HZ, fence=fence, speed_share=speed_share),
+        arm, friction = weakref.proxy(self), 2 * friction_margin(robot)
+        how = {"cutoff_hz": CUTOFF_HZ, "fence": CollisionCheck(robot, table=None), "speed_share": speed_share}
+        self._loop, self._damping_loop = (
+            CommandLoop(arm, Driver(robot, share * robot.tau_max, friction, **how))
+            for share in (TORQUE_SHARE, STOP_SHARE)
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
@@ -208,7 +209,7 @@ class Franka:
         if self._stopped is None:
             self._damping = True
             try:
-                self._loop.damp(self.hold)
+                self._damping_loop.damp(self.hold)
             finally:
                 self._damping = False
 

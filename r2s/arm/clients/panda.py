@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
-from r2s.arm.clients.connection_check import PANDA, ArmType, Connection
+from r2s.arm.clients.connection_check import PANDA, ArmType, Connection, check_joints
 from r2s.arm.clients.consent import Operator, find_operator
 from r2s.arm.clients.franka import Franka
 from r2s.arm.clients.libfranka import Client, one_line
@@ -136,8 +136,8 @@ class Panda(Franka):
         moves: see `Connection`.
 
     Raises:
-        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the connected arm
-            does not match the model.
+        UserError: the robot does not have 7 joints, panda-python is missing, no server of FCI version 5 answers at
+            the address, or the connected arm does not match the model.
     """
 
     arm_type: ArmType = PANDA
@@ -157,6 +157,7 @@ class Panda(Franka):
         moves: bool = True,
         speed_share: float = 1.0,
     ):
+        check_joints(robot)
         thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
         declared = payload_of(declared_payload, robot.payload_max, "arm.declared_payload")
         expected = Connection(self.arm_type, declared, moves)

@@ -6,13 +6,13 @@ each arm, and all rows of a condition use the same resampled episodes.
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from r2s.reporting.comparison.arm_conditions import NOMINAL, in_words, order
+from r2s.reporting.comparison.arm_conditions import NOMINAL, in_words, order, without_common
 from r2s.reporting.comparison.grouping import differing
 from r2s.reporting.comparison.statistics import paired
 from r2s.reporting.comparison.transfers import Transferred
@@ -49,6 +49,8 @@ class AdapterComparison:
 
 def compare_adapters(found: Sequence[Transferred]) -> AdapterComparison:
     """Compare the adapters in transfers that `comparable` selected."""
+    conditions = without_common([r.condition for r in found])
+    found = [replace(r, condition=own) for r, own in zip(found, conditions, strict=True)]
     runs, key = rows_of(found)
     reference = {name: _reference(name, runs) for name in runs}
     frame = pd.concat(

@@ -1,10 +1,10 @@
 """Describe the test conditions of an arm in words: payload, friction of a warm arm, delayed commands."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 NOMINAL = "nominal"
-IDENTITY = ("_target_", "name", "variant", "seed", "noise")  # keys of conf/arm that identify the arm
+IDENTITY = ("_target_", "name", "variant", "seed", "noise", "address")  # keys of conf/arm that identify the arm
 SETTINGS: dict[str, tuple[Any, str]] = {  # keys of conf/arm that set a condition -> nominal value, words
     "payload": (0.0, "{} kg"),
     "declared_payload": (0.0, "{} kg declared"),
@@ -29,6 +29,16 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
         return "payload" in key and not isinstance(value, str) and not _size(value)  # a string is a run folder
 
     return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and not empty(k, v)}
+
+
+def without_common(conditions: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the `conditions` without settings that are equal in all of them, such as the surface of a task's arms.
+
+    Keys of SETTINGS remain, because SETTINGS states their nominal values.
+    """
+    first = conditions[0]
+    common = {k for k in first.keys() - SETTINGS if all(k in c and c[k] == first[k] for c in conditions)}
+    return [{k: v for k, v in c.items() if k not in common} for c in conditions]
 
 
 def in_words(settings: Mapping[str, Any]) -> str:

@@ -30,7 +30,8 @@ class Transferred:
     Attributes:
         folder: run folder. start: start time, from meta.json. policy: absolute path of the policy's run folder.
         adapter: name in conf/adapt. settings: the adapter's settings, such as {"filter_s": 0.087}.
-        arm: name such as "twin, rigid, seed 0". condition: output of `condition`. robot: robot config in training.
+        arm: name such as "twin, rigid, seed 0" or "panda, 172.16.0.2". condition: output of `condition`.
+        robot: robot config in training.
         measures: measures of the task. length: episode length and rate, as "4 s at 100 Hz". goals: number of goals.
         us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
         episodes: table with a row per episode, indexed by goal, and columns for `MeasureTable.transfer`, path gap and
@@ -78,7 +79,7 @@ def _read(folder: Path) -> Transferred:
         t, goals = saved["t"], saved["goal"]
     row = json.loads((folder / "summary.json").read_text())[arm["name"]]
     step = float(t[0])
-    words = {"name": "{}", "variant": "{}", "seed": "seed {}"}
+    words = {"name": "{}", "variant": "{}", "seed": "seed {}", "address": "{}"}
     return Transferred(
         folder,
         str(meta["start"]),
