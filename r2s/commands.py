@@ -16,6 +16,7 @@ from r2s.errors import UserError, choices, instead_of, nearest, nearest_file
 PORT = 9090
 CONVERTED = ("robot", "data", "calibration", "friction", "inertia")  # config groups that `convert` reads
 JUDGED = (*CONVERTED, "identify")
+ARM = ("robot", "friction", "inertia")  # config groups of an arm; friction and inertia have a value per joint
 TRUSTED = "modules that a run may execute beside r2s, with commas between, also trust=MODULES"
 
 
@@ -211,7 +212,7 @@ def convert(typed: Namespace) -> None:
     groups = {w.lstrip("+~").split("=")[0].split(".")[0] for w in typed.override}
     if (typed.file.parent / "config.yaml").is_file() and "robot" not in groups:
         own = arm_config(typed.file.parent, typed.trust)
-        for group in ("robot", "friction", "inertia"):  # a robot's friction and inertia have a value per joint
+        for group in ARM:
             if group in own and group not in groups:
                 cfg[group] = own[group]
     robot = make_robot(cfg)
@@ -255,11 +256,15 @@ def arm_config(folder: Path, trust: str | None = None) -> Any:
     Raises:
         UserError: the file cannot be read or names an untrusted module.
     """
-    from r2s.stages.run_config import checked, loaded
+    from omegaconf import OmegaConf
+
+    from r2s.stages.run_config import checked, loaded, run_config
 
     path = folder / "policy.yaml"  # of stage=transfer, whose config.yaml has the default robot
-    path = path if path.is_file() else folder / "config.yaml"
-    return checked(loaded(path), path, trust)
+    if not path.is_file():
+        return run_config(folder, trust)
+    cfg = loaded(path)
+    return checked(OmegaConf.masked_copy(cfg, [k for k in ARM if k in cfg]), path, trust)  # not its task and policy
 
 
 def robot_of(folders: Sequence[Path], trust: str | None = None):

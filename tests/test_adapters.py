@@ -28,7 +28,7 @@ from r2s.errors import UserError
 from r2s.override_checks import check_overrides
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.inverse_dynamics import InverseDynamics
-from r2s.physics.payload import dynamics_with_payload, payload_of
+from r2s.physics.payload import dynamics_with_payload, mass_and_moment, payload_of
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.stages.adapter_factory import free_recordings, make_adapter
 from r2s.tasks.reach import ReachTask
@@ -67,11 +67,10 @@ class Logged:
         return self.added[-1]
 
 
-def swing(adapter, *, seconds=2.0, rate=1.0, payload=None, push=0.0, noise=0.0):
+def swing(adapter, *, seconds=2.0, rate=1.0, payload=None, declared=None, push=0.0, noise=0.0):
     """Return q, dq, commands (T, 7) of a known arm under a spring to a swinging goal, with the adapter."""
-    arm = SimulatedArm(
-        PANDA, truth(), position_noise=1e-2 * noise, velocity_noise=noise, payload=payload and replace(payload)
-    )
+    sensors = {"position_noise": 1e-2 * noise, "velocity_noise": noise}
+    arm = SimulatedArm(PANDA, truth(), **sensors, payload=payload and replace(payload), declared_payload=declared)
     arm.external[1] = push
     loop = CommandLoop(arm, Driver(PANDA, TORQUE, truth().level), adapter=adapter)
     loop.place(PANDA.q_home)
@@ -123,6 +122,22 @@ def test_a_payload_s_torque_is_added(make, latency):
     assert error < latency * rms(np.gradient(needed, SIM_DT, axis=0)) + 0.1 * rms(needed)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize("share", [1.0, 0.5, 1.5])
+def test_the_weight_of_a_declared_payload_is_not_added_again(make, share):
+    """An adapter adds what the arm's own compensation lacks, whatever share of the payload was declared."""
+    declared = replace(PAYLOAD, mass=share * PAYLOAD.mass)
+    known = replace(truth(), declared_payload=mass_and_moment(PANDA, declared))
+    logged = Logged(make(AdapterContext(PANDA, known)))
+    q, _, _ = swing(logged, payload=PAYLOAD, declared=declared, seconds=2.0, noise=1e-3)
+    zero = np.zeros_like(q)
+    weight = InverseDynamics(PANDA, dynamics_with_payload(PANDA, truth(), PAYLOAD)).rigid(q, zero, zero)
+    weight -= InverseDynamics(PANDA, truth()).rigid(q, zero, zero)
+    error = (np.array(logged.added) - (1.0 - share) * weight)[1000:, 1]  # slow motion: hardly any acceleration
+    assert np.sqrt((error**2).mean()) < 0.1 * np.abs(weight[:, 1]).mean()
+
+
 def test_a_new_estimate_enters_over_a_span():
     """The estimated torque steps at a detected payload; the added torque follows through a low-pass."""
     adapter, estimated = rls(context()), []
@@ -163,7 +178,7 @@ def test_an_uncertain_torque_is_not_added():
         noise = default._replace(mean=mean, prior=sigma, payload_drift=0.0, rest_drift=0.0)
         residual, weight = MomentumResidual.empty(7), np.zeros(7)
         residual.payload[:, 0] = [0.0, 5, 1, 3, 0, 1, 0]
-        shrinkage_weights(Filter.fresh(noise), residual, np.eye(BODY)[0], weight)
+        shrinkage_weights(Filter.fresh(noise), residual, np.eye(BODY)[0], np.zeros(7), weight)
         added.append(weight[1])
     assert added[0] == added[1] == 0.0
     np.testing.assert_allclose(added[2:], [1 - 0.3**2, 1 - 0.01**2])

@@ -411,7 +411,7 @@ def test_joints_of_a_log_are_put_in_the_order_of_the_robot(tmp_path):
     mixed = {k: x[:, order] if x.ndim == 2 else x for k, x in columns.items()}
     path = in_file(tmp_path / "ramps.npz", mixed | {"joint_names": np.array(names)[order]})
     ramps = read_ramps(path, n_joints=3, model_joints=names)
-    plain = read_ramps(in_file(tmp_path / "plain.npz", columns), n_joints=3)
+    plain = read_ramps(in_file(tmp_path / "plain.npz", columns), n_joints=3, joints=names)  # names of a recording
     np.testing.assert_array_equal(ramps.recording.q, plain.recording.q)
     np.testing.assert_array_equal(ramps.recording.tau, plain.recording.tau)
     assert ramps.joint.tolist() == plain.joint.tolist()

@@ -17,6 +17,7 @@ from r2s.adaptation.tuning import SPAN
 from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
+from r2s.stages.adapter_factory import with_declared_payload
 from r2s.stages.estimate import calibrated_by_commands, compensated, given_recording
 
 
@@ -82,6 +83,19 @@ def given(*words):
     data = {"kind": "recording", "path": "a.npz", "torque": "commanded", "payload": None, "loaded": None}
     cfg = OmegaConf.create({"data": {**data, "declared_payload": None}, "calibration": None})
     return OmegaConf.merge(cfg, OmegaConf.from_dotlist(list(words)))
+
+
+def test_a_load_that_was_compensated_during_the_identification_is_not_compensated_twice(tmp_path):
+    """The identified model lacks it; what counts is the change of the declared payload since."""
+    arm = {"name": "panda", "declared_payload": 0.7}
+    OmegaConf.save(
+        OmegaConf.create({"stage": "identify", "data": {"kind": "arm"}, "arm": arm}), tmp_path / "config.yaml"
+    )
+    for now, mass in ((0.7, 0.0), (1.0, 0.3), (None, -0.7)):
+        cfg = OmegaConf.create({"arm": arm | {"declared_payload": now}})
+        found = with_declared_payload(cfg, robot(), truth(), tmp_path / "parameters.yaml")
+        assert found.declared_payload[0] == pytest.approx(mass)
+        assert with_declared_payload(cfg, robot(), truth(), None).declared_payload[0] == (now or 0.0)
 
 
 def test_a_recording_has_its_declared_payload():

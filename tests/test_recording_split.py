@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_recording import assert_same, message, sine
 
+from r2s.errors import UserError
 from r2s.recordings.readers import read
 from r2s.recordings.recording import SPLIT_GUARD_S, Recording
 
@@ -52,6 +53,8 @@ def test_a_pause_near_an_end_does_not_choose_what_is_held_out(pause):
     assert len(validation.t) == 1250
     assert len(train.t) == pytest.approx(3750 - 1e3 * SPLIT_GUARD_S, abs=2)
     assert validation.t[0] - train.t[train.t < validation.t[0]][-1] > SPLIT_GUARD_S - 1e-9
+    with pytest.raises(UserError, match="for validation, got 1 of 5000"):
+        sine(np.arange(5000) * 1e-3, trajectory=(np.arange(5000) >= 40).astype(int)).split(1e-6)
 
 
 def test_one_trajectory_is_cut_once_with_a_gap():

@@ -4,7 +4,7 @@ To add an adapter, write a function or class whose arguments are an `AdapterCont
 name this function or class in a new file of conf/adapt.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -61,8 +61,12 @@ class AdapterContext:
 
 
 def observer(context: AdapterContext, filter_s: float) -> Adapter:
-    """Return the disturbance observer of `adapt=observer`; raise UserError unless filter_s is above 0."""
-    return context.gated(Observer(context.arm, filter_s))
+    """Return the disturbance observer of `adapt=observer`; raise UserError unless filter_s is above 0.
+
+    The observer's model has no declared payload: what the arm compensates itself is no disturbance.
+    """
+    bare = replace(context.dynamics, declared_payload=np.zeros(4))
+    return context.gated(Observer(make_arm_model(context.robot, bare), filter_s))
 
 
 def rls(context: AdapterContext) -> Adapter:

@@ -30,6 +30,7 @@ class ArmModel(NamedTuple):
 
     links: np.ndarray  # (n, LINK)
     compensated: np.ndarray  # (n, 4) kg and kg m, mass and first moment that gravity compensation uses
+    declared: np.ndarray  # (4,) kg and kg m, the declared payload, which `compensated` includes
     payload_frame: np.ndarray  # (12,), position and axes of the payload frame in the last link
     gravity: np.ndarray  # (3,) m/s^2
     armature: np.ndarray  # (n,) kg m^2
@@ -67,6 +68,7 @@ def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
     return ArmModel(
         links=links_of(robot, d.mass, d.com, d.inertia),
         compensated=compensated,
+        declared=np.array(d.declared_payload, dtype=float),
         payload_frame=np.concatenate([position, axes.ravel()]),
         gravity=np.array(robot.gravity, dtype=float),
         armature=np.array(d.armature, dtype=float),

@@ -1,8 +1,9 @@
 """Compute the feedforward torque of the estimated payload, friction and offsets.
 
 The feedforward uses the payload's estimated mass and center, clipped by `plausible_payload`. For joint j, the
-estimate x with covariance P predicts the torque c = h x in Nm. The vector h consists of ten payload terms (gravity,
-Coriolis, acceleration), the model's friction, and 1 for the offset. The torque c has the variance s^2 = h P h^T. The
+estimate x with covariance P predicts the torque c = h x - g_d in Nm. The vector h consists of ten payload terms
+(gravity, Coriolis, acceleration), the model's friction, and 1 for the offset. g_d is the weight of the declared
+payload, which the arm compensates itself. The torque c has the variance s^2 = h P h^T. The
 feedforward torque is w c with a weight w. For the true torque c*, the mean square error E (w c - c*)^2 is smallest at
 w = c*^2 / (c*^2 + s^2). Because c^2 - s^2 is an unbiased estimate of c*^2, r2s chooses the weight
 
@@ -63,7 +64,7 @@ class Feedforward:
         filter, state, residual = self.estimator.internals
         if new:
             plausible_payload(filter.x, self._arm.payload_max, self._payload)
-            shrinkage_weights(filter, residual, self._payload, self._weight)
+            shrinkage_weights(filter, residual, self._payload, state.terms.declared, self._weight)
             before = self._torque.copy()
         _estimated_torque(filter.x, state, self._payload, self._weight, self._slow, self._torque)
         if new:
@@ -94,12 +95,12 @@ def plausible_payload(x, most, out):
 
 
 @njit(cache=True, error_model="numpy")
-def shrinkage_weights(filter, residual, payload, weight):
+def shrinkage_weights(filter, residual, payload, declared, weight):
     """At the end of a 20 ms span, write the shrinkage weight of each joint's torque to `weight` (n,)."""
     x, P, n = filter.x, filter.P, len(weight)
     h, at = np.empty(BODY + 2), np.empty(BODY + 2, dtype=np.int64)
     for j in range(n):
-        mean, variance = residual.friction[j] * x[BODY + j] + x[BODY + n + j], 0.0
+        mean, variance = residual.friction[j] * x[BODY + j] + x[BODY + n + j] - declared[j], 0.0
         for c in range(BODY):
             h[c], at[c] = residual.payload[j, c], c
             mean += h[c] * payload[c]
@@ -116,7 +117,7 @@ def _estimated_torque(x, state, payload, weight, slow, torque):
     """Write the weighted torque of payload and state x to `torque` (n,) Nm; slow: (n, 10), low-passed `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
-        total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j]
+        total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j] - terms.declared[j]
         for c in range(BODY):
             slow[j, c] += share * (terms.payload_p[j, c] - slow[j, c])
             total += payload[c] * ((terms.payload_p[j, c] - slow[j, c]) / ACCELERATION_S - terms.payload_torque[j, c])

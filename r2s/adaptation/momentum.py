@@ -24,13 +24,14 @@ class MomentumTerms(NamedTuple):
     coriolis: np.ndarray  # (n,) Nm, C^T dq
     uncompensated: np.ndarray  # (n,) Nm, gravity torque of the links that gravity compensation does not cancel
     compensated: np.ndarray  # (n,) Nm, gravity torque that gravity compensation cancels
+    declared: np.ndarray  # (n,) Nm, the declared payload's part of `compensated`
     payload_p: np.ndarray  # (n, 10), the payload's columns of p
     payload_torque: np.ndarray  # (n, 10), the payload's columns of coriolis - uncompensated
 
     @staticmethod
     def empty(n: int) -> "MomentumTerms":
         """Return the terms of n joints, filled with zeros."""
-        return MomentumTerms(*np.zeros((4, n)), *np.zeros((2, n, BODY)))  # type: ignore[call-arg]
+        return MomentumTerms(*np.zeros((5, n)), *np.zeros((2, n, BODY)))  # type: ignore[call-arg]
 
 
 @njit(cache=True, inline="always")
@@ -88,6 +89,13 @@ def momentum(arm, q, dq, terms, work):
             down = o[3] * gx + o[4] * gy + o[5] * gz
             pull[j] -= o[0] * ax + o[1] * ay + o[2] * az + (m - b[0]) * down
             weight[j] -= o[0] * bx + o[1] * by + o[2] * bz + b[0] * down
+    b = arm.declared
+    ax, ay, az = rotate(R, b[1], b[2], b[3])
+    bx, by, bz = _cross(ax + b[0] * px, ay + b[0] * py, az + b[0] * pz, gx, gy, gz)
+    for j in range(n):
+        o = work[j]
+        down = o[3] * gx + o[4] * gy + o[5] * gz
+        terms.declared[j] = -(o[0] * bx + o[1] * by + o[2] * bz + b[0] * down)
     _payload_columns(arm, R, (px, py, pz), (wx, wy, wz), (vx, vy, vz), terms, work)
     for j in range(n - 1, -1, -1):
         s = work[j]

@@ -102,7 +102,7 @@ class WrenchObserver:
         compensated = self._arm.compensated.copy()
         compensated[-1] -= self._declared
         other = copy(self)
-        other._arm = self._arm._replace(compensated=compensated)
+        other._arm = self._arm._replace(compensated=compensated, declared=np.zeros(4))
         other.begin()
         return other
 

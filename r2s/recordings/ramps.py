@@ -9,7 +9,7 @@ import numpy as np
 
 from r2s.errors import UserError, nearest
 from r2s.recordings import readers
-from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, by_names, find_columns, listed
+from r2s.recordings.columns import DEFAULT_COLUMNS, NAMES, Spec, by_names, find_columns, listed
 from r2s.recordings.gaps import longest_step
 from r2s.recordings.readers import Options, scalar
 from r2s.recordings.recording import FIELDS, Recording, save_npz
@@ -93,7 +93,7 @@ def read_ramps(
     try:
         if table.keys() >= OWN and table["torque"].ndim == 0:
             return _saved(table)
-        table = by_names(table, joints, model_joints, n_joints)
+        table = by_names(table, joints if table.keys() & set(NAMES) else None, model_joints, n_joints)
         how = Options("commanded", dict(columns or {}), n_joints, max_gap_s, name=path.stem, repair=False)
         return _from_columns(table, replace(how, robot_joints=model_joints, limits=limits))
     except UserError as error:

@@ -309,7 +309,7 @@ class Recording:
             count, share = len(self.t), validation_fraction
             first = min((s.start for s in self.stretches[1:]), key=lambda row: abs(row - (1 - share) * count))
             if not 0.5 * share <= 1 - first / count <= max(2 * share, 0.5):  # as in a log with one early pause
-                first = round((1 - share) * count)
+                first = min(round((1 - share) * count), count - 1)
             close = (self.trajectory == self.trajectory[first]) & (self.t > self.t[first] - SPLIT_GUARD_S)
             validation = np.arange(count) >= first
             train = ~validation & ~close

@@ -74,14 +74,26 @@ def _given_recordings(folder):
     return [r for r in (read_file(robot, file, file.path) for file in files) if r.torque == TORQUE]
 
 
-def with_declared_payload(cfg, robot, dynamics):
-    """Return the dynamics of an arm whose gravity compensation includes arm.declared_payload."""
+def with_declared_payload(cfg, robot, dynamics, calibration):
+    """Return the dynamics of an arm whose gravity compensation includes arm.declared_payload.
+
+    A model that the run folder `calibration` identified with a declared payload lacks this payload, because the
+    gravity compensation carried it; so the dynamics contain the change of the declared payload since then.
+    """
+    from omegaconf import OmegaConf
+
     from r2s.physics.payload import mass_and_moment, payload_of
 
-    if not (value := plain(cfg.arm).get("declared_payload")):
+    path = run_folder(calibration) / "config.yaml" if calibration else None
+    then = loaded(path) if path is not None and path.is_file() else OmegaConf.create()
+    moved = OmegaConf.select(then, "stage") == "identify" and OmegaConf.select(then, "data.kind") == "arm"
+    before = plain(then.arm).get("declared_payload") if moved else None
+    now = plain(cfg.arm).get("declared_payload")
+    if not now and not before:
         return dynamics
-    payload = payload_of(value, robot.payload_max, "arm.declared_payload")
-    return replace(dynamics, declared_payload=mass_and_moment(robot, payload))
+    payloads = (payload_of(value, robot.payload_max, "arm.declared_payload") for value in (now, before))
+    declared, earlier = (mass_and_moment(robot, payload) for payload in payloads)
+    return replace(dynamics, declared_payload=declared - earlier)
 
 
 def make_adapter(cfg, robot, source):
@@ -106,7 +118,7 @@ def make_adapter(cfg, robot, source):
     dynamics, posterior, unloaded = calibrated(folder, robot, modules(cfg.get("trust")))
     if unloaded is None:
         print(f"{name}: {folder} has no recordings; the uncertainty of its model comes from priors")
-    dynamics = with_declared_payload(cfg, robot, dynamics)
+    dynamics = with_declared_payload(cfg, robot, dynamics, folder)
     return part(cfg.adapt, "adapt", AdapterContext(robot, dynamics, posterior, unloaded), beside=BESIDE)
 
 

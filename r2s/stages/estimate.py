@@ -114,7 +114,7 @@ def compensated(cfg, robot, dynamics):
     from r2s.physics.payload import mass_and_moment, payload_of
 
     if cfg.data.kind == "arm":
-        return with_declared_payload(cfg, robot, dynamics)
+        return with_declared_payload(cfg, robot, dynamics, cfg.calibration)
     declared = payload_of(plain(cfg.data).get("declared_payload"), robot.payload_max, "data.declared_payload")
     return dynamics if declared is None else replace(dynamics, declared_payload=mass_and_moment(robot, declared))
 

@@ -269,6 +269,7 @@ def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
                 raise UserError(f"the training '{label}': {why}")
     if COMPUTED in trained:  # refuses some controllers; the reference uses the task's own
         bare = [word for word in trained[COMPUTED] if not word.startswith("calibration=")]
+        bare += [word for word in overrides if word.lstrip("+~").startswith(("friction", "inertia"))]
         train.make_parts(compose_step([*bare, *chosen(overrides, cfg)], f"the training '{COMPUTED}'"))
     train.make_parts(compose_step(trained["nominal"], "stage=train"))  # other trainings need the identified model
 
