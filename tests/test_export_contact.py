@@ -330,6 +330,7 @@ def test_every_plan_of_a_task_is_accepted(words):
     dynamics = make_dynamics(cfg, robot)
     task = make_task(cfg, robot, dynamics)
     contract = make_contract(robot, task, dynamics.level)
+    assert min(contract["law"]["reflexes"]["force_N"][:3]) > task.force[1]  # without safety.force_max too
     model, begin = Model(contract["model"]), contract["goal"]["columns"]["setpoint"][0]
     for plan in surface_plans(robot, task, task.goals(robot, np.random.default_rng(0), 3)):
         check_surface_plan(contract, model, plan)

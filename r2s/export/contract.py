@@ -19,7 +19,7 @@ from r2s.export.inverse_dynamics import FRICTION
 from r2s.export.law import Model
 from r2s.export.plan import COLUMNS
 from r2s.export.runtime import FORMAT
-from r2s.export.surface_contract import pushes, surface_goal, surface_start
+from r2s.export.surface_contract import pushes, reflexes, surface_goal, surface_start
 from r2s.learning.policy import observation_words
 from r2s.physics import safety_filter as law
 from r2s.physics.actuation import low_pass_factor
@@ -114,6 +114,7 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
             "joint": of_joints(as_driven(robot), task, friction),
             "number": numbers(task),
             "push": pushes(robot, task.push_limit),
+            "reflexes": reflexes(robot, task),
         },
     }
 

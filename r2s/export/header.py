@@ -42,7 +42,7 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
     begin, end = contract["goal"]["columns"]["setpoint"] if on_surface else (0, 3 * (control["setpoint"] == "goal"))
     sizes = {"actions": len(control["action_scale"]), "setpoints": end - begin, "memories": control["memory_size"]}
     goal = ", then the setpoint of the plan" if on_surface else ", then the goal in m" if end > begin else ""
-    lines += _push(filter_["push"]) + (_surface(contract) if on_surface else [])
+    lines += _push(filter_["push"]) + _reflexes(filter_["reflexes"]) + (_surface(contract) if on_surface else [])
     lines += ["", f"// control={control['name']}: the command is the policy's action in {control['unit']}{goal}"]
     lines += [f"constexpr int {name} = {size};" for name, size in sizes.items()]
     parameters = control["parameters"] or [0.0]  # C++ has no empty array
@@ -63,20 +63,27 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
 
 
 def _push(push: Mapping[str, Any] | None) -> list[str]:
-    """Return the C++ constants of the push limit (0 if there is none) and of a Franka arm's reflex thresholds."""
+    """Return the C++ constants of the push limit (0 if there is none)."""
     own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
         PUSH_VECTOR, [0.0] * 3
     )
     lines = ["", f"constexpr bool limits_pushes = {str(push is not None).lower()};", "namespace push {"]
     lines += [f"constexpr double {name} = {own[name]!r};" for name in PUSH_NUMBER]
     lines += [f"constexpr double {name}[3] = {_braced(own[name])};" for name in PUSH_VECTOR]
-    lines += [f"enum Stop {{ {', '.join(STOPS)} }};", f"constexpr Stop stop = {own['stop']};", "}  // namespace push"]
-    for name, unit, cautious in (("torque", "Nm", CAUTIOUS.torque), ("force", "N", CAUTIOUS.force)):
-        values = own.get(f"collision_{name}_{unit}") or list(cautious)
-        lines.append(
-            f"constexpr double collision_{name}[{len(values)}] = {_braced(values)};  // of the arm's reflexes"
-        )
-    return lines
+    return [
+        *lines,
+        *(f"enum Stop {{ {', '.join(STOPS)} }};", f"constexpr Stop stop = {own['stop']};", "}  // namespace push"),
+    ]
+
+
+def _reflexes(given: Mapping[str, Any] | None) -> list[str]:
+    """Return the C++ constants of a Franka arm's reflex thresholds; None: the cautious ones."""
+    own = given or {"torque_Nm": CAUTIOUS.torque, "force_N": CAUTIOUS.force}
+    return [
+        "// thresholds of the arm's reflexes",
+        f"constexpr double collision_torque[7] = {_braced(list(own['torque_Nm']))};",
+        f"constexpr double collision_force[6] = {_braced(list(own['force_N']))};",
+    ]
 
 
 def _surface(contract: Mapping[str, Any]) -> list[str]:

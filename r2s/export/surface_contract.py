@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.arm.clients.collision_thresholds import thresholds_of
+from r2s.arm.clients.collision_thresholds import thresholds_for
 from r2s.errors import UserError
 from r2s.export.push import PUSH_NUMBER, STOPS
 from r2s.export.surface import columns_of
@@ -14,6 +14,7 @@ from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
 from r2s.tasks.surface_task import LAG_M, REGULAR, START, SurfaceTask
+from r2s.tasks.task import Task
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
@@ -77,13 +78,20 @@ def pushes(robot: Robot, limit: law.PushLimit | None) -> dict[str, Any] | None:
     out: dict[str, Any] = dict(zip(PUSH_NUMBER, values, strict=True))
     for name, at in (("point", law.POINT), ("normal", law.NORMAL), ("tip", law.TIP)):
         out[name] = columns[at : at + 3].tolist()
-    out |= {"stop": limit.stop, "collision_torque_Nm": None, "collision_force_N": None}
     assert limit.stop in STOPS
-    if robot.n == 7:  # a Franka arm: add thresholds for libfranka's setCollisionBehavior; null: cautious defaults
-        try:
-            own = thresholds_of(robot, limit)
-        except UserError as error:
-            print(f"no thresholds of an arm's reflexes in the bundle: {error}")
-        else:
-            out |= {"collision_torque_Nm": list(own.torque), "collision_force_N": list(own.force)}
-    return out
+    return out | {"stop": limit.stop}
+
+
+def reflexes(robot: Robot, task: Task) -> dict[str, list[float]] | None:
+    """Return the thresholds of a Franka arm's collision reflexes for libfranka's setCollisionBehavior.
+
+    None stands for the cautious thresholds: the arm has other than 7 joints, or the task's forces are too large.
+    """
+    if robot.n != 7:
+        return None
+    try:
+        own = thresholds_for(robot, task)
+    except UserError as error:
+        print(f"no thresholds of an arm's reflexes in the bundle: {error}")
+        return None
+    return {"torque_Nm": list(own.torque), "force_N": list(own.force)}

@@ -137,32 +137,12 @@ def _arm_settings(cfg, robot, task=None):
     """Return the settings of conf/arm; compute unset reflex thresholds from the task's contact forces."""
     settings = plain(cfg.arm)
     if "collision_force" in settings and None in (settings["collision_torque"], settings["collision_force"]):
-        from r2s.arm.clients.collision_thresholds import thresholds_of
+        from r2s.arm.clients.collision_thresholds import thresholds_for
 
-        own = thresholds_of(robot, *_expected_pushes(robot, task))
+        own = thresholds_for(robot, task)
         given = {k: v for k, v in settings.items() if v is not None}
         settings = {**settings, "collision_torque": own.torque, "collision_force": own.force, **given}
     return settings
-
-
-def _expected_pushes(robot, task):
-    """Return the arguments `limit` and `cause` of `thresholds_of` for a task, or None for no task.
-
-    Without safety.force_max, a task on a surface pushes with at most the requested force, the force that an action
-    adds, and twice the force that joint friction may hide, and meets the surface at its approach speed.
-    """
-    from r2s.physics.push_limit import PushLimit
-
-    limit = None if task is None else task.push_limit
-    if limit is not None or not hasattr(task, "approach_speed"):
-        return limit, None
-    from r2s.tasks.surface_task import RESIDUAL
-
-    limit = PushLimit((1.0 + RESIDUAL) * task.force[1], task.approach_speed, *task.plane(robot))
-    hidden = limit.at(robot, task.model.dynamics.level, robot.q_home)[1]
-    most = limit.force_max + 2.0 * hidden
-    speed = f"{task.approach_speed:g} m/s"
-    return replace(limit, force_max=most), f"task.force: {task.force[1]:g} N, at a task.approach_speed of {speed},"
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Set the external torque and force at which a Franka arm stops itself (libfranka's setCollisionBehavior)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from r2s.errors import UserError, check_number
 from r2s.physics.push_limit import STIFF, PushLimit
 from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
+from r2s.tasks.surface_task import RESIDUAL, SurfaceTask
+from r2s.tasks.task import Task
 
 OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to this value, so that no reflex acts
 # Share of the cautious thresholds reserved for friction and model errors, which cause an external torque of up to
@@ -43,6 +45,25 @@ class CollisionThresholds:
 
 
 CAUTIOUS = CollisionThresholds()
+
+
+def thresholds_for(robot: Robot, task: Task | None) -> CollisionThresholds:
+    """Return collision thresholds above every contact force that a task expects; without a task, CAUTIOUS.
+
+    Without safety.force_max, a task on a surface pushes with at most the requested force, the force that an action
+    adds, and twice the force that joint friction may hide, and meets the surface at its approach speed.
+
+    Raises:
+        UserError: as `thresholds_of`.
+    """
+    limit = None if task is None else task.push_limit
+    if limit is not None or not isinstance(task, SurfaceTask):
+        return thresholds_of(robot, limit)
+    speed = task.approach_speed
+    limit = PushLimit((1.0 + RESIDUAL) * task.force[1], speed, *task.plane(robot))
+    hidden = limit.at(robot, task.model.dynamics.level, robot.q_home)[1]  # type: ignore[union-attr]
+    limit = replace(limit, force_max=limit.force_max + 2.0 * hidden)
+    return thresholds_of(robot, limit, f"task.force: {task.force[1]:g} N, at a task.approach_speed of {speed:g} m/s,")
 
 
 def thresholds_of(robot: Robot, limit: PushLimit | None, cause: str | None = None) -> CollisionThresholds:
