@@ -265,7 +265,14 @@ def test_what_does_not_fit_is_one_line():
 @pytest.mark.parametrize("task", ["press", "wipe"])
 def test_train_and_transfer_to_a_twin(task, tmp_path):
     """From the command line: a short training improves nothing yet, but the policy touches the surface of a twin."""
-    short = "budget.env_steps=4000", "budget.minutes=null", "evaluation.episodes=2", "algo.n_envs=8", "compile=false"
+    short = (
+        "budget.env_steps=4000",
+        "budget.minutes=null",
+        "evaluation.episodes=2",
+        "algo.n_envs=8",
+        "compile=false",
+        "algo.demonstrations=800",
+    )
     succeed(f"task={task}", *short, f"root={tmp_path}", "name=toy", "threads=1")
     transfer = "stage=transfer", f"policy={tmp_path}/train/toy", "arm=twin", "evaluation.episodes=2", "threads=1"
     refused = r2s(*transfer, f"root={tmp_path}")
