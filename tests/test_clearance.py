@@ -33,7 +33,7 @@ from r2s.physics.fence import FENCE_M, first_breaches
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
 from r2s.physics.simulator import Simulator
-from r2s.stages.transfer import driver_limits, predict
+from r2s.stages.transfer import predict
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.rollout import gap, rollout
 
@@ -224,7 +224,8 @@ def test_the_prediction_of_a_transfer_keeps_the_speed_share():
     done = rollout(policy, PolicyRunner(arm, task, same.level, rotors=same.armature), task, starts, goals)
     assert gap(done, predicted)["ee_path_rmse_mm"] < 1e-6
     assert (np.abs(predicted.dq) <= share * PANDA.dq_max).all()
-    assert (driver_limits(cfg, PANDA, task)[:, [DQ_ALLOWED, DQ_MAX]] <= share * PANDA.dq_max[:, None]).all()
+    limits = filter_limits(PANDA, task.torque_limit(PANDA), share)
+    assert (limits[:, [DQ_ALLOWED, DQ_MAX]] <= share * PANDA.dq_max[:, None]).all()
 
 
 @pytest.mark.parametrize("share", [0.0, 1.5])

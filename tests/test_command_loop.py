@@ -373,7 +373,7 @@ class Wire:
 
 
 def test_a_stop_keeps_a_heavy_compensated_load():
-    """3 kg that nobody declared, held by an adapter and moving slowly: the stop ends at rest, near where it began."""
+    """An adapter compensates an undeclared payload of 3 kg in slow motion: the stop ends near where it began."""
     q = np.array([0.0, 0.9, 0, -0.9, 0, 1.8, 0.785])
     payload = payload_of(3.0, PANDA.payload_max)
     dynamics = nominal_dynamics(PANDA, **conf("friction/paper"))

@@ -56,7 +56,6 @@ class WrenchObserver:
 
     def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):
         self._arm, self.tool = make_arm_model(robot, dynamics), robot.tool
-        self._declared = dynamics.declared_payload
         position, axes = ee_pose(robot)
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
@@ -100,7 +99,7 @@ class WrenchObserver:
     def undeclared(self) -> Self:
         """Return a copy for an arm whose gravity compensation includes no declared payload."""
         compensated = self._arm.compensated.copy()
-        compensated[-1] -= self._declared
+        compensated[-1] -= self._arm.declared
         other = copy(self)
         other._arm = self._arm._replace(compensated=compensated, declared=np.zeros(4))
         other.begin()

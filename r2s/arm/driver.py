@@ -38,7 +38,7 @@ from r2s.physics.newton_euler import links_of
 from r2s.physics.push_limit import HOLD, STOP, PushLimit
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
+from r2s.physics.safety_filter import filter_limits
 
 DEADLINE_S = 0.05  # s; the driver stops an arm without a new finite command for this time, or for PERIODS if longer
 PERIODS = 2.5  # control periods of the policy
@@ -103,13 +103,12 @@ class DriverBatch:
             factor=low_pass_factor(cutoff_hz),
             fade=round(soft_start_s / SIM_DT),
         )
-        links, limits = links_of(robot, robot.mass, robot.com, robot.inertia), filter_limits(robot, torque)
-        limits[:, [DQ_ALLOWED, DQ_MAX]] *= speed_share
+        links = links_of(robot, robot.mass, robot.com, robot.inertia)
         self._model = Model(
             friction=np.array(friction, dtype=float),
             links=links,
             rotors=robot.armature if rotors is None else np.array(rotors, dtype=float),
-            limits=limits,
+            limits=filter_limits(robot, torque, speed_share),
             fence=Fence(links, empty_scene() if fence is None else fence.scene),
         )
         self._nothing, self._free = np.zeros(self._shape), np.zeros(m, dtype=bool)

@@ -70,10 +70,8 @@ def _push(push: Mapping[str, Any] | None) -> list[str]:
     lines = ["", f"constexpr bool limits_pushes = {str(push is not None).lower()};", "namespace push {"]
     lines += [f"constexpr double {name} = {own[name]!r};" for name in PUSH_NUMBER]
     lines += [f"constexpr double {name}[3] = {_braced(own[name])};" for name in PUSH_VECTOR]
-    return [
-        *lines,
-        *(f"enum Stop {{ {', '.join(STOPS)} }};", f"constexpr Stop stop = {own['stop']};", "}  // namespace push"),
-    ]
+    lines += [f"enum Stop {{ {', '.join(STOPS)} }};", f"constexpr Stop stop = {own['stop']};", "}  // namespace push"]
+    return lines
 
 
 def _reflexes(given: Mapping[str, Any] | None) -> list[str]:

@@ -31,6 +31,7 @@ class VectorArms:
         nthread: number of threads; 0: all cores.
         soft_start_s: s, time for which the torque fades in from 0 at the start of an episode.
         seed: seed of the sensor noise; the noise restarts when `place` resets all arms.
+        speed_share: factor on the speed limits of the safety filter.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class VectorArms:
         nthread: int = 0,
         soft_start_s: float = 0.0,
         seed: int | np.random.SeedSequence = 0,
+        speed_share: float = 1.0,
     ):
         surface, named = dynamics.surface, type(task).__name__
         if task.touches and surface is None:
@@ -51,7 +53,8 @@ class VectorArms:
         self.robot, self.width = robot, width
         torque, self._period = task.torque_limit(robot), 1 / task.ctrl_hz
         self.sim = Simulator(robot, dynamics, width, nthread, control=task.control(robot))
-        self.sim.drive(filter_limits(robot, torque), torque, task.cutoff_hz, soft_start_s, task.push_limit)
+        limits = filter_limits(robot, torque, speed_share)
+        self.sim.drive(limits, torque, task.cutoff_hz, soft_start_s, task.push_limit)
         self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
         self.speeds = None
         self._limited = np.zeros(width)  # cycles changed by the safety filter before the last step

@@ -66,7 +66,7 @@ class JointDynamics(NamedTuple):
     bias: np.ndarray
 
 
-def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
+def filter_limits(robot: Robot, torque: np.ndarray, speed_share: float = 1.0) -> np.ndarray:
     """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
     For light joints, the filter's mass matrix has just enough added inertia (column ADDED) that the largest target
@@ -76,6 +76,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
         torque: (n,) Nm, largest target torque.
+        speed_share: factor on the speed limits. The added inertia does not depend on this factor.
     """
     out = np.empty((robot.n, COLUMNS))
     inside = np.minimum(Q_MARGIN, 0.1 * (robot.q_max - robot.q_min))
@@ -89,6 +90,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm, as effective as any joint's target torque
     out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.step_max
+    out[:, [DQ_ALLOWED, DQ_MAX]] *= speed_share
     return out
 
 

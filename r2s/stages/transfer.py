@@ -183,11 +183,13 @@ def run_on_arm(cfg, request, runner, predicted):
 
     from r2s.physics.collision import CollisionCheck
     from r2s.physics.fence import first_breaches
+    from r2s.physics.safety_filter import filter_limits
     from r2s.tasks.rollout import rollout, select_episodes
 
     robot, task = runner.robot, request.task
     check = CollisionCheck(robot, table=None, may_touch=task.may_touch)
-    near = first_breaches(check, driver_limits(cfg, robot, task), predicted.q, predicted.dq)
+    limits = filter_limits(robot, task.torque_limit(robot), speed_share(cfg))
+    near = first_breaches(check, limits, predicted.q, predicted.dq)
     tried = np.flatnonzero((predicted.collision == "") & (near < 0))
     for e, (contact, pair) in enumerate(zip(predicted.collision, near, strict=True), 1):
         if contact:
@@ -218,16 +220,9 @@ def run_on_twins(cfg, request, open_runner):
     return ArmResult(np.arange(len(request.goals)), done, stops, timing)
 
 
-def driver_limits(cfg, robot, task):
-    """Return `filter_limits` (n, COLUMNS) with the allowed speeds scaled by arm.speed_share, as in the driver.
-
-    The speed limits of `robot` stay, because the filter's added inertia depends on them.
-    """
-    from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
-
-    limits = filter_limits(robot, task.torque_limit(robot))
-    limits[:, [DQ_ALLOWED, DQ_MAX]] *= cfg.arm.get("speed_share", 1.0)
-    return limits
+def speed_share(cfg):
+    """Return arm.speed_share, the driver's factor on the speed limits; 1 for arms without this setting."""
+    return cfg.arm.get("speed_share", 1.0)
 
 
 def predict(cfg, request, robot):
@@ -236,9 +231,8 @@ def predict(cfg, request, robot):
     from r2s.tasks.rollout import rollout
 
     task, goals = request.task, request.goals
-    model = VectorArms(robot, task, task.expected(robot, request.center), len(goals), cfg.threads)
-    limits, torque = driver_limits(cfg, robot, task), task.torque_limit(robot)
-    model.sim.drive(limits, torque, task.cutoff_hz, request.soft_start_s, task.push_limit)
+    how = {"soft_start_s": request.soft_start_s, "speed_share": speed_share(cfg)}
+    model = VectorArms(robot, task, task.expected(robot, request.center), len(goals), cfg.threads, **how)
     return rollout(request.policy, model, task, request.starts, goals)
 
 
