@@ -5,7 +5,8 @@
 arms    simulated arms with contact, train, validation and ramps recordings and the truth, FOLDER/<name>, which are no
         part of this repository: stage=identify with its defaults, then the surface against the truth
 twins   variant_seed: `stage=identify` from free motion, then with data.presses=6 on the surface of the seed, for
-        elastic twins also with stated gears; finished identifications in runs/identify are not repeated
+        elastic twins also with stated gears, and with gears identified from slow slides (`data.gears=true`); finished
+        identifications in runs/identify are not repeated
 seeds   recordings of benchmarks/pressing.py on drawn surfaces: coverage of the intervals
 
 Only this script reads the truth. It writes benchmarks/results/contact_identification.md.
@@ -33,6 +34,7 @@ from r2s.identification.contact.contact_file import IdentifiedSurface, load_cont
 from r2s.identification.contact.estimate import Arm, ContactEstimate, identify_contact
 from r2s.identification.contact.exchange import linearized
 from r2s.identification.contact.tip import TipMotion
+from r2s.identification.gears.gears_file import load_gears
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.identification.residuals.modulating_functions import CUTOFF_HZ
 from r2s.physics.robot import SIM_DT, Robot
@@ -45,8 +47,10 @@ TWINS_NOTE = (
     "the estimate and its 95 % interval; with rigid gears: error if the gears are taken as rigid; gears: mean "
     "deflection by the largest torques. The prior of the gears was chosen on twins 0 to 9. stated gears: the same "
     "presses with `identify.gears.stiffness=`, the twin's own with an error of 10 %, half of "
-    "its variance common to all joints."
+    "its variance common to all joints. identified gears: the same presses with `identify.gears.stiffness=` a run of "
+    "`data.gears=true` on the twin; gears 1 to 4: the largest error of this run's stiffness among the strong joints."
 )
+GEARS = ("with stated gears, %", "with identified gears, %", "gears 1 to 4, %")  # columns of elastic twins
 ACCURACY = 0.1  # relative error of the stated gears
 PLAY = 2e-5  # m, of a Panda's encoders; see `TipMotion`
 
@@ -141,12 +145,31 @@ def identify_with_gears(variant: str, seed: int) -> Path:
     return identified(run, variant, seed, words)
 
 
-def identified(run: Path, variant: str, seed: int, words: list[str]) -> Path:
+def identify_gears(variant: str, seed: int) -> tuple[Path, Path]:
+    """Identify a twin's gears, then its surface with these gears, unless it is done; return both run folders."""
+    run = ROOT / "runs" / "identify" / f"slides_{variant}_{seed}"
+    words = ["arm=twin", f"arm.variant={variant}", f"arm.seed={seed}", "data.gears=true"]
+    identified(run, variant, seed, words, "gears.yaml")
+    behind = run.with_name(f"behind_{variant}_{seed}")
+    words = ["data=recording", f"data.contact={run.with_name(f'surface_{variant}_{seed}') / 'contact.npz'}"]
+    return run, identified(behind, variant, seed, [*words, f"identify.gears.stiffness={run}"])
+
+
+def gear_error(run: Path, variant: str, seed: int) -> str:
+    """Return the largest error, %, of the identified stiffness among the strong joints."""
+    stiffness, _ = load_gears(run, ROBOT.n, "slides")
+    true = make_twin(ROBOT, variant=variant, seed=seed)._hidden[STIFF]
+    strong = ROBOT.tau_max > 0.5 * ROBOT.tau_max.max()
+    error = (100 * (stiffness / true - 1.0))[strong]
+    return f"{error[np.abs(error).argmax()]:+.1f}"
+
+
+def identified(run: Path, variant: str, seed: int, words: list[str], result: str = "contact.yaml") -> Path:
     """Run stage=identify with a twin's identification as calibration, unless it is done; return the run folder."""
     tool = run.with_name("press_tool.json")
     tool.write_text(json.dumps({"tip_in_flange_m": TOOL.tip.tolist(), "radius_m": TOOL.radius}))
     words = [*words, f"calibration={twin_run(variant, seed)}", f"robot.tool={tool}", f"root={ROOT / 'runs'}"]
-    if not (run / "contact.yaml").is_file():
+    if not (run / result).is_file():
         command = [sys.executable, "run.py", "stage=identify", *words, f"name={run.name}"]
         subprocess.run(command, cwd=ROOT, check=True)
     return run
@@ -167,18 +190,23 @@ def judged_twin(variant: str, seed: int) -> tuple[dict[str, Score], dict[str, st
     truth = draw_surface(robot, True, np.random.default_rng([seed, 4]))
     assert isinstance(truth, Surface)
     s = score(found.surface, found.interval, truth)
-    scores, stated = {"": s}, ""
+    scores, known_gears = (
+        {"": s},
+        dict.fromkeys(("with stated gears, %", "with identified gears, %", "gears 1 to 4, %"), ""),
+    )
     if variant == "elastic":
-        again = identify_with_gears(variant, seed)
-        known, its = load_contact(again), yaml.safe_load((again / "contact.yaml").read_text())
-        scores[" with stated gears"] = score(known.surface, known.interval, truth)
-        stated = slope_error(known, its, truth)
+        slides, behind = identify_gears(variant, seed)
+        known_gears["gears 1 to 4, %"] = gear_error(slides, variant, seed)
+        for how, again in (("stated", identify_with_gears(variant, seed)), ("identified", behind)):
+            known, its = load_contact(again), yaml.safe_load((again / "contact.yaml").read_text())
+            scores[f" with {how} gears"] = score(known.surface, known.interval, truth)
+            known_gears[f"with {how} gears, %"] = slope_error(known, its, truth)
     rigid = document["rigid_gears"]["parameters"]["slope_at_10N"]["value"]
     held_out = json.loads((run / "summary.json").read_text())["contact"]["validation"]["force_rmse_N"]
     return scores, {
         "true slope, N/mm": f"{1e-3 * linearized(truth)[0]:.1f}",
         "slope at 10 N, %": slope_error(found, document, truth),
-        "with stated gears, %": stated,
+        **known_gears,
         "with rigid gears, %": f"{100 * (rigid / linearized(truth)[0] - 1.0):+.1f}",
         "friction": f"{s.friction:+.4f}",
         "plane, mm": f"{1e3 * s.plane:+.3f}",

@@ -379,7 +379,7 @@ MISTAKES = {
 GEARS = {
     ".stiffness=0": ".stiffness: expected positive numbers, Nm/rad, got 0",
     ".stiffness=[1,2]": ".stiffness: expected 7 values, for the 7 joints, got 2",
-    ".stiffness=soft": ".stiffness: expected a number, or one for each of the 7 joints, got 'soft'",
+    ".stiffness=soft": r".stiffness: no gears\.yaml at ",
     ".stiffness=14": r".stiffness: robot.tau_max would twist these gears by .* rad, allowed are 0.04.* Nm/rad",
     ".accuracy=0": r".accuracy: expected a number in \(0, 0.4\], got 0",
     "=14000": r": expected identify\.gears\.stiffness= and \.accuracy=, got 14000",

@@ -36,6 +36,7 @@ def record(
     torque: str = "commanded",
     progress: Callable[[int, int], None] | None = None,
     loaded: bool = False,
+    added: np.ndarray | None = None,
     timing: Timing | None = None,
 ) -> Recording:
     """Follow the excitation at 1 kHz and return the recorded motion.
@@ -50,6 +51,7 @@ def record(
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, includes gravity).
         progress: called every 0.5 s with (cycles done, total cycles); must return at once, because the arm is moving.
         loaded: whether the arm may carry an undeclared payload; if so, `LoadedTrackingController` tracks the motion.
+        added: (T, n) Nm, torque added to that of the tracking controller; None: no torque.
         timing: receives the durations of the cycles.
 
     Raises:
@@ -78,7 +80,8 @@ def record(
             state = loop.state
             if (reason := controller.deviation(k, state)) is not None:
                 loop.halt(reason)
-            loop(controller(k, state), controller.offset)
+            target = controller(k, state)
+            loop(target if added is None else target + added[k], controller.offset)
             timing.cycle(loop.clock, loop.state)
             rows.add(state, loop.sent)
             if progress is not None and (k % PROGRESS_EVERY == 0 or k == len(excitation.t) - 1):

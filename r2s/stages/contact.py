@@ -48,12 +48,15 @@ def contact_data(cfg, robot, file):
 
 
 def stated_stiffness(cfg, robot):
-    """Return the prior of gear stiffness from identify.gears.stiffness and identify.gears.accuracy; None if unset.
+    """Return the prior of gear stiffness from identify.gears; None if identify.gears.stiffness is unset.
+
+    identify.gears.stiffness contains numbers, with the accuracy identify.gears.accuracy, or a folder with gears.yaml.
 
     Raises:
         UserError: a value is invalid.
     """
-    from r2s.identification.contact.surface_space import stated_gears
+    from r2s.identification.contact.surface_space import identified_gears, stated_gears
+    from r2s.identification.gears.gears_file import load_gears
     from r2s.stages.parts import called, plain
 
     gears = plain(cfg.identify.get("gears"))  # older configs lack this key
@@ -61,6 +64,9 @@ def stated_stiffness(cfg, robot):
         return None
     if not isinstance(gears, dict):
         raise UserError(f"identify.gears: expected identify.gears.stiffness= and .accuracy=, got {gears!r}")
+    if isinstance(folder := gears.get("stiffness"), str):
+        found = load_gears(located(folder), robot.n, "identify.gears.stiffness")
+        return identified_gears(robot.tau_max, *found)
     return called(stated_gears, "identify.gears", gears, robot.tau_max)
 
 

@@ -26,6 +26,7 @@ class ArmData:
         excitation: file of the training motion; if None, r2s optimizes a training motion.
         ramp_poses: number of postures in which r2s ramps every joint in both directions; 0 means no ramps.
         presses: number of contact motions (press and slide), which replace all motions without contact; 0 means none.
+        gears: whether each joint slides slowly under a multisine torque, which replaces all other motions.
         press_point, press_normal: point (3,) m and normal (3,) of the nominal plane; if None, a work table below the
             tip in the home posture.
 
@@ -40,6 +41,7 @@ class ArmData:
     excitation: str | None
     ramp_poses: int
     presses: int = field(default=0, kw_only=True)
+    gears: bool = field(default=False, kw_only=True)
     press_point: list[float] | None = field(default=None, kw_only=True)
     press_normal: list[float] | None = field(default=None, kw_only=True)
 
@@ -103,6 +105,7 @@ class FileData:
     contact: str | None = None
     contact_validation: str | None = None
     loaded: str | None = None
+    gears: str | None = None
     declared_payload: Any = None
     payload: Any = None
 

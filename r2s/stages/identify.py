@@ -7,18 +7,11 @@ from typing import Any
 from r2s.errors import UserError, check_number, choices
 from r2s.files import located
 from r2s.stages.build import base_dynamics, check_source, console, make_robot, open_run
-from r2s.stages.contact import (
-    calibrated_arm,
-    contact_data,
-    identify_surface,
-    keep_calibration,
-    press_parts,
-    pressed_surface,
-    stated_stiffness,
-)
-from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_user_ramps, record_arm
+from r2s.stages.contact import contact_data, identify_surface, stated_stiffness
+from r2s.stages.data import check_cutoff, check_data, ramp_poses, read_user_ramps, record_arm
+from r2s.stages.known_arm import identify_with_known_arm, with_known_arm
 from r2s.stages.parts import part
-from r2s.stages.payload import LoadedData, identify_load, loaded_data, torque_of_calibration
+from r2s.stages.payload import LoadedData, identify_load, loaded_data
 from r2s.stages.prior import Earlier, check_known, earlier_run, make_settings, start_of
 from r2s.stages.recordings import Group, read_groups, recording_files, whole
 
@@ -109,53 +102,6 @@ def make_parts(cfg):
         return Parts(robot, nominal, searches, [], earlier=earlier)
     motion = load(cfg.data.excitation, robot)
     return Parts(robot, nominal, searches, [cfg.data.excitation], motion, earlier=earlier)
-
-
-def with_known_arm(cfg):
-    """Return the option of `data` (presses, contact, loaded) that needs an arm from `calibration=`, or None.
-
-    Raises:
-        UserError: the option needs an identified arm, but `calibration=` and data.path= are missing.
-    """
-    from omegaconf import OmegaConf
-
-    if cfg.data.get("presses"):
-        if not cfg.calibration:
-            raise UserError("data.presses: give the arm, identified from free motion, by calibration=RUN_FOLDER")
-        return "presses"
-    key = next((k for k in ("contact", "loaded") if cfg.data.get(k)), None)
-    if key is None or not OmegaConf.is_missing(cfg.data, "path"):
-        return None
-    if not cfg.calibration:
-        what = {"contact": "its free motion", "loaded": "its motion without payload"}[key]
-        raise UserError(f"data.{key}: give the arm by calibration=RUN_FOLDER, or {what} by data.path=FILE")
-    return key
-
-
-def identify_with_known_arm(cfg, overrides, key):
-    """Identify a surface or a payload with the model of `calibration=`; write contact.yaml or payload.yaml."""
-    robot = make_robot(cfg)
-    stated_stiffness(cfg, robot)
-    if key == "presses":
-        arm = calibrated_arm(cfg, robot)
-        plan = press_parts(cfg, robot, arm)
-        with open_run(cfg, overrides) as run:
-            entry = identify_surface(cfg, run, arm, pressed_surface(cfg, run, arm, plan))
-            keep_calibration(cfg, run)
-            run.summary({"contact": entry})
-        print(f"written: {run.folder}")
-        return
-    file = file_data(cfg, cfg.data[key])
-    if key == "contact":
-        data = contact_data(cfg, robot, file)
-    else:
-        data = loaded_data(cfg, robot, file, torque_of_calibration(cfg, file.torque))
-    arm = calibrated_arm(cfg, robot)
-    with open_run(cfg, overrides, data.files) as run:
-        entry = (identify_surface if key == "contact" else identify_load)(cfg, run, arm, data)
-        keep_calibration(cfg, run)
-        run.summary({"contact" if key == "contact" else "payload": entry})
-    print(f"written: {run.folder}")
 
 
 def identify(cfg, overrides):

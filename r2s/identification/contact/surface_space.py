@@ -32,6 +32,7 @@ FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
 # wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
 DEFLECTION, SOFTEST = 0.01, 0.05
 SCATTER, FARTHEST = 0.2, 0.6  # a joint's deflection / (mean deflection * `shape`) - 1: standard deviation; limit
+WIDEST = 0.25  # largest relative standard deviation of an identified gear's deflection
 LEAST_ACCURATE = 0.4  # largest allowed `accuracy`; two standard deviations then stay within FARTHEST and SOFTEST
 
 
@@ -42,14 +43,15 @@ class Gears:
     Attributes:
         shape: (n,) prior mean of each gear's deflection, relative to the mean over all gears.
         center, width: rad, prior mean and standard deviation of the mean deflection over all gears.
-        scatter: relative standard deviation of a gear's deflection about the mean deflection times `shape`.
-        stated: whether the user stated the stiffness of the gears.
+        scatter: (n,) or one number, relative standard deviation of a gear's deflection about the mean deflection
+            times `shape`.
+        stated: whether the stiffness of the gears is known, from the user or from an identification of the gears.
     """
 
     shape: np.ndarray
     center: float
     width: float
-    scatter: float
+    scatter: np.ndarray | float
     stated: bool
 
 
@@ -87,6 +89,18 @@ def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float 
             "the unit is Nm/rad"
         )
     return Gears(deflection / mean, mean, half * mean, half, True)
+
+
+def identified_gears(tau_max: np.ndarray, stiffness: np.ndarray, spread: np.ndarray) -> Gears:
+    """Return the prior of identified gears; half of the variance of the best known gear is common to all gears.
+
+    Args:
+        tau_max: (n,) Nm, largest torques of the joints. stiffness: (n,) Nm/rad. spread: (n,) relative standard
+            deviation of the stiffness; at most WIDEST counts, because of the bound FARTHEST.
+    """
+    deflection, spread = tau_max / stiffness, np.minimum(spread, WIDEST)
+    mean, common = float(deflection.mean()), float(spread.min() / np.sqrt(2.0))
+    return Gears(deflection / mean, mean, common * mean, np.sqrt(spread**2 - common**2), True)
 
 
 @dataclass(frozen=True)
@@ -141,7 +155,7 @@ class SurfaceSpace:
 
     def prior(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean and 1 / standard deviation, each (count,), of the normal prior of a vector u (count,)."""
-        joints = np.full(len(self.tau_max), 2.0 * FARTHEST / self.gears.scatter)
+        joints = np.broadcast_to(2.0 * FARTHEST / self.gears.scatter, len(self.tau_max))
         weight = np.concatenate([np.full(SURFACE, FLAT), [SOFTEST / self.gears.width], joints])
         return self.with_gears(np.full(SURFACE, 0.5))[:count], weight[:count]
 

@@ -1,0 +1,58 @@
+"""Record an arm while each joint in turn slides slowly under a multisine torque, to identify its gears."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from r2s.arm.interface import Arm, speed_share
+from r2s.arm.realtime import Timing
+from r2s.arm.recorder import record
+from r2s.errors import UserError
+from r2s.excitation.motion_checks import Space, check_limits, check_space, check_torque
+from r2s.excitation.multisine import PERIOD_S, gear_motion, multisine, slides
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+PAUSE_S = 1.0  # s added to the clock between two slides
+
+
+def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
+    """Raise UserError unless all joints can slide about home; `share` scales the speeds (`speed_share`)."""
+    space = Space(robot)
+    for joint in range(robot.n):
+        motion = gear_motion(robot, joint, share)
+        try:
+            check_limits(robot, motion)
+            check_torque(robot, motion)
+            check_space(robot, motion, space=space)
+        except UserError as error:
+            raise UserError(f"data.gears: slide of joint {joint + 1} about robot.q_home: {error}") from None
+
+
+def record_gear_motions(
+    arm: Arm, *, progress: Callable[[int, int], None] | None = None, timing: Timing | None = None
+) -> Recording:
+    """Run `gear_motion` and `multisine` of each joint; return the steady slides, one trajectory each.
+
+    The rows have the format of `r2s.arm.recorder.record` with commanded torque.
+
+    Args:
+        arm: the arm, which always stops at the end. progress: called after every joint with (joints done, joints).
+        timing: receives the durations of the cycles.
+
+    Raises:
+        ArmStopped, UserError: as in `r2s.arm.recorder.record`.
+    """
+    robot, share, parts = arm.robot, speed_share(arm), []
+    for joint in range(robot.n):
+        added = np.zeros((len(gear_motion(robot, joint, share).t), robot.n))
+        added[:, joint] = multisine(robot, joint, share)
+        out = record(arm, gear_motion(robot, joint, share), added=added, timing=timing)
+        parts += [(out.q[rows], out.dq[rows], out.tau[rows], out.t[rows]) for rows in slides()]
+        if progress is not None:
+            progress(joint + 1, robot.n)
+    q, dq, tau, t = (np.concatenate(x) for x in zip(*parts, strict=True))
+    index = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
+    starts = np.repeat([part[3][0] for part in parts], [len(part[0]) for part in parts])
+    t = t - starts + index * (PERIOD_S + PAUSE_S)
+    return Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=index, name=robot.name)

@@ -1,0 +1,85 @@
+"""Plan the motions that show elastic gears: each joint in turn slides slowly under an added multisine torque.
+
+While a joint slides in one direction, its friction is nearly constant, so the response of the motor's angle to the
+multisine is linear. The multisine repeats every PERIOD_S, so its spectrum has lines only at LINES_HZ (Pintelon and
+Schoukens, System Identification, 2nd ed. 2012, chapter 2). Above the resonance of the gear, the motor moves without
+the link, and the response reveals the gear's stiffness (r2s/identification/gears).
+"""
+
+import numpy as np
+
+from r2s.excitation.motion import Excitation
+from r2s.physics.rigid_body import mass_matrix
+from r2s.physics.robot import SIM_DT, Robot
+
+PERIOD_S = 2.0  # s, of the multisine; also the time of steady sliding in each leg
+LEGS = 4  # slides per joint, to and fro
+RAMP_S, SETTLE_S = 0.5, 0.25  # s, to the sliding speed; until the tracking loop has settled (5 of its time constants)
+LEG_S = 2 * RAMP_S + SETTLE_S + PERIOD_S
+SPEED = 0.07  # sliding speed / dq_max: 0.15 rad/s of a Panda's strong joints, above the Stribeck velocity
+# Lines spread over the resonances of arms, 10 to 80 Hz
+LINES_HZ = np.unique(np.round(np.geomspace(6.0, 120.0, 24) * PERIOD_S)) / PERIOD_S
+RIPPLE = 0.05  # velocity of each line / sliding speed, so that their sum never stops the joint
+RATE_SHARE, TORQUE_SHARE = 0.4, 0.05  # largest torque rate / dtau_max and torque / tau_max of the multisine
+DRAWS = 200  # random phases tried; those with the lowest peak torque rate are used
+MARGIN = 0.15  # rad, distance kept to the position limits
+
+
+def gear_motion(robot: Robot, joint: int, speed_share: float = 1.0) -> Excitation:
+    """Return a motion of one joint: LEGS slides to and fro at constant speed about home; the other joints rest.
+
+    speed_share: factor on the joint's speed, for arms with a speed limit.
+    """
+    rows = round(LEG_S / SIM_DT)
+    t = np.arange(LEGS * rows + 1) * SIM_DT
+    leg = np.minimum(np.arange(len(t)) // rows, LEGS - 1)
+    within = t - leg * LEG_S
+    speed = SPEED * speed_share * robot.dq_max[joint]
+    rise, fall = within / RAMP_S, (LEG_S - within) / RAMP_S
+    x = np.clip(np.minimum(rise, fall), 0.0, 1.0)
+    steady = np.clip(within - RAMP_S, 0.0, SETTLE_S + PERIOD_S)
+    area = RAMP_S * (x**6 - 3 * x**5 + 2.5 * x**4)  # integral of the velocity profile over a ramp
+    way = np.where(rise <= fall, area, RAMP_S - area) + steady
+    total = RAMP_S + SETTLE_S + PERIOD_S
+    forth = leg % 2 == 0
+    q = np.tile(robot.q_home, (len(t), 1))
+    dq, ddq = np.zeros_like(q), np.zeros_like(q)
+    half = 0.5 * speed * total
+    center = np.clip(robot.q_home[joint], robot.q_min[joint] + MARGIN + half, robot.q_max[joint] - MARGIN - half)
+    q[:, joint] = center + speed * (np.where(forth, way, total - way) - 0.5 * total)
+    sign = np.where(forth, 1.0, -1.0)
+    dq[:, joint] = sign * speed * (6 * x**5 - 15 * x**4 + 10 * x**3)
+    ddq[:, joint] = sign * np.where(rise <= fall, 1.0, -1.0) * speed / RAMP_S * (30 * x**4 - 60 * x**3 + 30 * x**2)
+    return Excitation(t, q, dq, ddq)
+
+
+def slides() -> list[slice]:
+    """Return the rows of each leg's steady slide, one period and its end point."""
+    first, rows = round((RAMP_S + SETTLE_S) / SIM_DT), round(PERIOD_S / SIM_DT)
+    return [slice(k, k + rows + 1) for k in (leg * round(LEG_S / SIM_DT) + first for leg in range(LEGS))]
+
+
+def multisine(robot: Robot, joint: int, speed_share: float = 1.0) -> np.ndarray:
+    """Return the multisine torque (T,) Nm for all rows of `gear_motion`; it fades in and out with the speed.
+
+    Light joints get a multisine of constant velocity amplitude, heavy joints one of constant torque rate.
+    """
+    motion = gear_motion(robot, joint, speed_share)
+    inertia = 1 / np.linalg.inv(mass_matrix(robot, robot.q_home[None])[0])[joint, joint]  # other joints free
+    omega = 2 * np.pi * LINES_HZ
+    speed = SPEED * speed_share * robot.dq_max[joint]
+    rate = RATE_SHARE * robot.dtau_max[joint] / np.sqrt(len(omega) / 2)
+    amplitude = np.minimum(RIPPLE * speed * inertia * omega, rate / omega)
+    t = np.arange(round(PERIOD_S / SIM_DT)) * SIM_DT
+    phases = np.random.default_rng(0).uniform(-np.pi, np.pi, (DRAWS, len(omega)))
+    peaks = [np.abs((amplitude * omega) @ np.cos(np.outer(omega, t) + phase[:, None])).max() for phase in phases]
+    phase = phases[int(np.argmin(peaks))]
+    wave = amplitude @ np.sin(np.outer(omega, t) + phase[:, None])
+    most = min(
+        1.0,
+        TORQUE_SHARE * robot.tau_max[joint] / np.abs(wave).max(),
+        RATE_SHARE * robot.dtau_max[joint] / min(peaks),
+    )
+    start = round((RAMP_S + SETTLE_S) / SIM_DT)
+    rows = (np.arange(len(motion.t)) % round(LEG_S / SIM_DT) - start) % len(t)
+    return most * wave[rows] * np.abs(motion.dq[:, joint]) / speed

@@ -1,0 +1,174 @@
+"""Identify the stiffness of an arm's gears from slow slides under a multisine torque, with intervals.
+
+The encoders must be on the motors. The rotor, gear and link of each joint are a chain of two inertias: below the
+resonance, rotor and link move together; above, the rotor alone. The response in between determines the stiffness,
+even if the links' inertia tensors are uncertain.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from r2s.identification.arm_uncertainty import Arm
+from r2s.identification.gears.response import Drives, Slides, motor_response, slides_of
+from r2s.identification.result import SHARPER
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.inverse_dynamics import InverseDynamics
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+DRAWS = 400  # posterior draws
+MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 7
+# Prior: mean and standard deviation, of the logarithm unless stated otherwise
+DEFLECTION = 0.0055, 0.6  # rad, of a strain wave gear at the joint's largest torque (contact/surface_space.py)
+ROTOR = 0.2, 0.7  # inertia of the rotor beyond the model's, relative to the joint's links
+GEAR_DAMPING = 0.04, 0.7  # relative to critical damping; 0.01 to 0.1 for metal gears
+LOOP_DAMPING = 0.3, 1.0  # relative to critical damping
+DELAY = 3e-3, 2e-3  # s, not logarithmic
+LAG = 1.2e-3, 0.6  # s
+TENSOR = 0.3  # of the links' inertia tensors, which slow motion hardly shows (paper, Table IV: 0.73 to 1.37)
+VISCOUS = 0.3  # change of friction relative to its level, per sliding speed; not logarithmic
+
+
+@dataclass(frozen=True, eq=False)
+class GearEstimate:
+    """Identified gears of n joints.
+
+    Attributes:
+        drives: the estimate. draws: (S, n) Nm/rad, posterior draws of the stiffness.
+        identifiable: (n,) bool, whether the data determine each stiffness.
+        misfit: (n,), RMS of each joint's residual in standard deviations. tau_max: (n,) Nm.
+        slides: the measured spectra. response: (W, F) rad/Nm, the estimate's response.
+    """
+
+    drives: Drives
+    draws: np.ndarray
+    identifiable: np.ndarray
+    misfit: np.ndarray
+    tau_max: np.ndarray
+    slides: Slides
+    response: np.ndarray
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Relative standard deviation (n,) of each stiffness."""
+        return np.log(self.draws).std(0)
+
+
+@dataclass(frozen=True, eq=False)
+class GearProblem:
+    """Least-squares problem of a vector x (8 n,): values of all joints in standard deviations of the prior.
+
+    Attributes:
+        slides: measured spectra. mass: (W, n, n) kg m^2, mass matrices of the links. tensors: (n, W, n, n) kg m^2,
+            their parts due to each link's inertia tensor. nominal: prior means.
+        critical: (n,) critical damping of a gear per sqrt(stiffness). viscous: (n,) Nm s/rad, prior deviation.
+        noise: factor on `slides.sigma`.
+    """
+
+    slides: Slides
+    mass: np.ndarray
+    tensors: np.ndarray
+    nominal: Drives
+    critical: np.ndarray
+    viscous: np.ndarray
+    noise: float = 1.0
+
+    def drives(self, x: np.ndarray) -> Drives:
+        """Return the drives at x (8 n,)."""
+        rotor, stiff, damping, loop, viscous, delay, lag, _ = x.reshape(8, -1)
+        d = self.nominal
+        stiffness = d.stiffness * np.exp(DEFLECTION[1] * stiff)
+        critical = self.critical * np.sqrt(stiffness)
+        return Drives(
+            rotor=d.rotor * np.exp(ROTOR[1] * rotor),
+            stiffness=stiffness,
+            damping=critical * GEAR_DAMPING[0] * np.exp(GEAR_DAMPING[1] * damping),
+            loop=critical * LOOP_DAMPING[0] * np.exp(LOOP_DAMPING[1] * loop),
+            viscous=self.viscous * viscous,
+            delay=DELAY[0] + DELAY[1] * delay,
+            lag=LAG[0] * np.exp(LAG[1] * lag),
+        )
+
+    def response(self, x: np.ndarray) -> np.ndarray:
+        """Return the response (W, F) rad/Nm at x (8 n,)."""
+        scale = np.exp(TENSOR * x.reshape(8, -1)[7]) - 1.0
+        return motor_response(self.slides, self.mass + np.tensordot(scale, self.tensors, 1), self.drives(x))
+
+    def misfit(self, x: np.ndarray) -> np.ndarray:
+        """Return the complex residual (W, F) at x (8 n,), in standard deviations."""
+        return (self.response(x) - self.slides.response) / (self.noise * self.slides.sigma)
+
+    def residual(self, x: np.ndarray) -> np.ndarray:
+        """Return residual and prior (2 W F + 8 n,) at x (8 n,)."""
+        error = self.misfit(x).ravel()
+        return np.concatenate([error.real, error.imag, x])
+
+
+def gear_problem(robot: Robot, dynamics: Dynamics, slides: Slides) -> GearProblem:
+    """Return the problem of gears on an arm with identified `dynamics`."""
+
+    def masses(d: Dynamics, q: np.ndarray) -> np.ndarray:
+        return InverseDynamics(robot, d).mass(q) - np.diag(d.armature)
+
+    mass = masses(dynamics, slides.q)
+    tensors = []
+    for link in range(robot.n):
+        inertia = np.array(dynamics.inertia)
+        inertia[link] *= 2.0
+        tensors.append(masses(replace(dynamics, inertia=inertia), slides.q) - mass)
+    own = 1 / np.diag(np.linalg.inv(masses(dynamics, robot.q_home[None])[0]))  # kg m^2, with all other joints free
+    rotor = dynamics.armature + ROTOR[0] * own
+    zero = np.zeros(robot.n)
+    nominal = Drives(rotor, robot.tau_max / DEFLECTION[0], zero, zero, zero, zero, zero)
+    speed = np.array([np.abs(slides.speed[slides.joint == i]).mean() for i in range(robot.n)])
+    critical = 2 * np.sqrt(rotor * own / (rotor + own))
+    return GearProblem(slides, mass, np.array(tensors), nominal, critical, VISCOUS * dynamics.level / speed)
+
+
+def identify_gears(
+    arm: Arm, recording: Recording, *, seed: int = 0, report: Callable[[float, str], None] = lambda share, what: None
+) -> GearEstimate:
+    """Identify the gears of an arm whose encoders are on the motors.
+
+    Args:
+        arm: the identified arm. recording: slides of all joints (r2s/excitation/multisine.py), commanded torque.
+        seed: seed of the posterior's draws. report: function that receives the completed share and the next step.
+
+    Raises:
+        UserError: the recording does not contain a slide of each joint with the multisine.
+    """
+    report(0.0, "spectra")
+    slides = slides_of(recording)
+    problem = gear_problem(arm.robot, arm.space.dynamics(arm.x), slides)
+    n = arm.robot.n
+    report(0.1, "stiffness")
+    x, _ = _minimum(problem, np.zeros(8 * n))
+    report(0.6, "intervals")
+    # the neighbors of a line may underestimate its noise; they never overestimate what the model leaves unexplained
+    noise = max(1.0, float(np.sqrt(0.5 * (np.abs(problem.misfit(x)) ** 2).mean())))
+    problem = replace(problem, noise=noise)
+    x, covariance = _minimum(problem, x)
+    covariance = covariance[n : 2 * n, n : 2 * n] * DEFLECTION[1] ** 2
+    sd = np.sqrt(np.diag(covariance))
+    drives = problem.drives(x)
+    rng = np.random.default_rng(seed)
+    steps = rng.multivariate_normal(np.zeros(n), covariance + MODEL**2 * np.eye(n), DRAWS)
+    rms = np.sqrt(0.5 * np.abs(problem.misfit(x)) ** 2).mean(1)
+    misfit = np.array([rms[slides.joint == i].mean() for i in range(n)])
+    return GearEstimate(
+        drives, drives.stiffness * np.exp(steps), sd < DEFLECTION[1] / SHARPER, misfit, arm.robot.tau_max, slides,
+        problem.response(x),
+    )  # fmt: skip
+
+
+def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the minimum x (8 n,) near `start` and its covariance (8 n, 8 n).
+
+    The loss grows linearly with large residuals, because the friction ripple of a revolving motor may meet a line.
+    """
+    fit = least_squares(problem.residual, start, loss="soft_l1")
+    jacobian = np.asarray(fit.jac)
+    return fit.x, np.linalg.inv(jacobian.T @ jacobian)

@@ -1,0 +1,93 @@
+"""stage=identify data.gears: identify the stiffness of elastic gears; write gears.yaml."""
+
+from r2s.errors import Stopped, UserError
+from r2s.files import located
+from r2s.stages.build import console
+from r2s.stages.data import check_data, read_file
+
+ALONE = "identify the gears first, then name their run folder: identify.gears.stiffness=RUN_FOLDER"
+
+
+def check_alone(cfg):
+    """Raise UserError if data.gears is combined with another recording or lacks the identified arm."""
+    for key in ("presses", "contact", "loaded"):
+        if cfg.data.get(key):
+            raise UserError(f"data.gears: cannot be combined with data.{key}; {ALONE}")
+    if not cfg.calibration:
+        raise UserError("data.gears: give the arm, identified from free motion, by calibration=RUN_FOLDER")
+
+
+def gear_file(robot, file):
+    """Return the recording in data.gears and its path; file: `FileData` of the config.
+
+    Raises:
+        UserError: data.torque is not commanded, or the file is invalid.
+    """
+    from r2s.identification.checks import check_recording
+
+    if file.torque not in (None, "commanded"):
+        raise UserError(f"data.gears: gears need commanded torque, not data.torque={file.torque}")
+    path = located(file.gears)
+    recording = read_file(robot, file, path, torque="commanded")
+    check_recording(robot, recording)
+    return recording, path
+
+
+def check_motions(cfg, robot):
+    """Raise UserError if the settings of data=arm are invalid, or if a joint cannot slide about home."""
+    from r2s.arm.gear_motions import check_gear_motions
+    from r2s.stages.build import check_source, within_speed_share
+
+    check_data(cfg)
+    check_source(cfg, robot)
+    share = within_speed_share(cfg, robot).dq_max[0] / robot.dq_max[0]
+    check_gear_motions(robot, share)
+
+
+def recorded_slides(cfg, run, robot):
+    """Let the arm slide joint by joint, and return the recording; a resumed run reads its existing recording.
+
+    Raises:
+        Stopped: the arm stopped.
+    """
+    from r2s.arm.gear_motions import record_gear_motions
+    from r2s.arm.interface import ArmStopped
+    from r2s.arm.realtime import Timing
+    from r2s.progress import Progress
+    from r2s.recordings.readers import read
+    from r2s.stages.build import opened_source
+
+    path = run.folder / "gears.npz"
+    if not path.is_file():
+        progress, timing = Progress("slide joint by joint", in_cycle=True), Timing()
+        try:
+            with opened_source(cfg, robot, 4) as arm:
+                show = lambda k, n: progress(k / n, f"{k} joints")  # noqa: E731
+                out = record_gear_motions(arm, progress=show, timing=timing)
+        except ArmStopped as stop:
+            raise Stopped(f"while the joints slid: {stop}; resume={run.folder} starts again") from None
+        finally:
+            for row in timing.table():
+                run.log("timing", {"motion": "gears", **row})
+        out.save(path)
+        progress.close(f"{out.duration:.1f} s of slides")
+    return read(path, torque="commanded")
+
+
+def identify_gears(cfg, run, arm, recording):
+    """Identify the gears; write gears.yaml and a figure, print the table, return the entry for summary.json."""
+    from r2s.identification.gears.estimate import identify_gears
+    from r2s.identification.gears.gears_file import save_gears
+    from r2s.progress import Progress
+    from r2s.reporting.identification.gears import gears_figure, gears_table
+    from r2s.reporting.tables import print_table
+
+    progress = Progress("gears")
+    found = identify_gears(arm, recording, seed=cfg.seed, report=progress)
+    progress.close()
+    source = {"recording": recording.name, "calibration": cfg.calibration, "run": str(run.folder)}
+    save_gears(run.folder / "gears.yaml", arm.robot, found, source)
+    gears_figure(run.figure("gears"), found)
+    print_table(console(), gears_table(found), "gears, 95 % intervals")
+    entry = {"stiffness_Nm_per_rad": found.drives.stiffness.tolist(), "relative_sd": found.spread.tolist()}
+    return entry | {"identifiable": found.identifiable.tolist()}

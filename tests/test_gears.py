@@ -1,0 +1,247 @@
+"""The stiffness of gears is identified from slow slides under a multisine torque."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import ROOT, conf
+from test_cli import r2s
+
+from r2s.arm.gear_motions import check_gear_motions, record_gear_motions
+from r2s.arm.twins.elastic_joints import STIFF
+from r2s.arm.twins.elastic_twin import ElasticTwin
+from r2s.errors import UserError
+from r2s.excitation.motion_checks import check_motion
+from r2s.excitation.multisine import (
+    LINES_HZ,
+    PERIOD_S,
+    RATE_SHARE,
+    SPEED,
+    TORQUE_SHARE,
+    gear_motion,
+    multisine,
+    slides,
+)
+from r2s.identification.contact.surface_space import SurfaceSpace, identified_gears, unknown_gears
+from r2s.identification.gears.estimate import DEFLECTION, gear_problem, identify_gears
+from r2s.identification.gears.gears_file import load_gears, save_gears
+from r2s.identification.gears.response import Drives, Slides, motor_response, slides_of
+from r2s.physics.robot import SIM_DT, load_robot
+from r2s.recordings.recording import Recording
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from pressing import estimated_arm
+
+PANDA = load_robot(**conf("robot/panda"))
+ROBOTS = ("panda", "fr3", "ur10e", "kinova_gen3", "iiwa14", "xarm7")
+NOISE = 1e-5  # rad, of an encoder
+ROWS = round(PERIOD_S / SIM_DT)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return estimated_arm(PANDA, 1)
+
+
+@pytest.fixture(scope="module")
+def drives(arm):
+    """Vector of drives: gears 25 % softer and 35 % stiffer than expected in turn, and all else unexpected, too."""
+    x = np.random.default_rng(3).normal(0.0, 0.7, (8, PANDA.n))
+    x[1] = np.log(np.where(np.arange(PANDA.n) % 2, 1.35, 0.75)) / DEFLECTION[1]
+    return x.ravel()
+
+
+@pytest.fixture(scope="module")
+def recording(arm, drives):
+    return responding(arm, drives)
+
+
+@pytest.fixture(scope="module")
+def found(arm, recording):
+    return identify_gears(arm, recording)
+
+
+def planned():
+    """Return a recording of slides without any response to the multisine."""
+    q, tau = [], []
+    for j in range(PANDA.n):
+        motion, wave = gear_motion(PANDA, j), multisine(PANDA, j)
+        for rows in slides():
+            q.append(motion.q[rows])
+            tau.append(wave[rows, None] * np.eye(PANDA.n)[j])
+    index = np.repeat(np.arange(len(q)), ROWS + 1)
+    t = np.tile(np.arange(ROWS + 1) * SIM_DT, len(q)) + index * (PERIOD_S + 1.0)
+    q, tau = np.concatenate(q), np.concatenate(tau)
+    return Recording(t=t, q=q, dq=np.zeros_like(q), tau=tau, torque="commanded", trajectory=index)
+
+
+def responding(arm, x):
+    """Return slides of an arm with drives x (8 n,), measured with encoder noise."""
+    plan = planned()
+    spectra = slides_of(plan)
+    response = gear_problem(arm.robot, arm.space.dynamics(arm.x), spectra).response(x) * spectra.torque
+    wave = np.exp(2j * np.pi * np.outer(np.arange(ROWS + 1) * SIM_DT, LINES_HZ))
+    q = plan.q + np.random.default_rng(0).normal(0.0, NOISE, plan.q.shape)
+    for stretch, j, lines in zip(plan.stretches, spectra.joint, response, strict=True):
+        q[stretch, j] += (wave @ lines).real
+    return Recording(plan.t, q, plan.dq, plan.tau, "commanded", plan.trajectory)
+
+
+def test_the_stiffness_of_the_gears_is_identified(arm, drives, found):
+    """Within three standard deviations for each of seven joints, and within a twentieth for the strong ones."""
+    true = gear_problem(arm.robot, arm.space.dynamics(arm.x), found.slides).drives(drives)
+    error = np.log(found.drives.stiffness / true.stiffness)
+    assert (np.abs(error) < 3 * found.spread).all()
+    assert np.abs(error[:4]).max() < 0.05
+    assert found.identifiable.all()
+    assert (found.misfit < 1.2).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_the_gears_of_an_elastic_twin_are_identified(seed):
+    """A plant of its own: stiction, ripple, jitter and lost commands; the arm is the nominal one."""
+    twin = ElasticTwin(PANDA, seed, noise=4)
+    arm = estimated_arm(PANDA, 1)
+    found = identify_gears(replace(arm, x=arm.space.start), record_gear_motions(twin))
+    error = np.log(found.drives.stiffness / twin._hidden[STIFF])
+    assert (np.abs(error) < 3 * found.spread).all()
+    assert np.abs(error[:4]).max() < 0.08
+
+
+def test_two_inertias_and_a_spring():
+    """One joint without damping: the closed form, and its limits for stiff and for soft gears."""
+    zero, one = np.zeros(1), np.ones(1)
+    lines = len(LINES_HZ)
+    own = Slides(np.zeros(1, int), np.zeros((1, 1)), one, np.zeros((1, lines, 1)), np.ones((1, lines)), None)
+    mass, s2 = 0.7 * np.ones((1, 1, 1)), -((2 * np.pi * LINES_HZ) ** 2)
+
+    def response(K):
+        return motor_response(own, mass, Drives(0.3 * one, K * one, zero, zero, zero, zero, zero))[0]
+
+    K = 2e4
+    closed = (0.7 * s2 + K) / (s2 * (0.3 * 0.7 * s2 + (0.3 + 0.7) * K))
+    np.testing.assert_allclose(response(K), closed, rtol=1e-9)
+    np.testing.assert_allclose(response(1e12), 1 / (1.0 * s2), rtol=1e-5)
+    np.testing.assert_allclose(response(1e-6), 1 / (0.3 * s2), rtol=1e-5)
+    late = motor_response(own, mass, Drives(0.3 * one, K * one, zero, zero, zero, 2e-3 * one, 1e-3 * one))[0]
+    s = 2j * np.pi * LINES_HZ
+    np.testing.assert_allclose(late, closed * np.exp(-2e-3 * s) / (1 + 1e-3 * s), rtol=1e-9)
+
+
+def test_other_motors_that_move_are_accounted_for(arm, drives):
+    """The measured motion of another motor changes the predicted response, in the slides in which it moves alone."""
+    spectra = slides_of(responding(arm, drives))
+    problem = gear_problem(arm.robot, arm.space.dynamics(arm.x), spectra)
+    alone = problem.response(drives)
+    pushed = np.array(spectra.angles)
+    pushed[:4, :, 3] += 1e-4  # another motor moves while joint 1 slides
+    other = replace(problem, slides=replace(spectra, angles=pushed)).response(drives)
+    assert np.abs(other[:4] / alone[:4] - 1.0).max() > 0.01
+    np.testing.assert_array_equal(other[4:], alone[4:])
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_shipped_robot_can_slide(name):
+    """The motions pass all checks, and the multisine stays within its shares and never stops the joint."""
+    robot = load_robot(**conf(f"robot/{name}"))
+    check_gear_motions(robot)
+    for j in range(robot.n):
+        motion, torque = gear_motion(robot, j), multisine(robot, j)
+        assert np.abs(torque).max() <= TORQUE_SHARE * robot.tau_max[j] * (1 + 1e-9)
+        fade = 1.05  # the fade adds a little to the rate
+        assert np.abs(np.diff(torque)).max() / SIM_DT <= fade * RATE_SHARE * robot.dtau_max[j]
+        assert torque[0] == torque[-1] == 0.0
+        for rows in slides():
+            np.testing.assert_allclose(np.abs(motion.dq[rows, j]), SPEED * robot.dq_max[j])
+
+
+def test_the_multisine_has_its_lines_alone():
+    """In the steady slides, all power is at LINES_HZ."""
+    for rows in slides():
+        spectrum = np.abs(np.fft.rfft(multisine(PANDA, 1)[rows][:-1]))
+        lines = np.round(LINES_HZ * PERIOD_S).astype(int)
+        rest = np.delete(spectrum, lines)
+        assert rest.max() < 1e-9 * spectrum[lines].min()
+
+
+def test_a_slow_arm_slides_slowly():
+    """A speed share scales the speed; the motion begins and ends at rest, and its derivatives agree."""
+    motion = gear_motion(PANDA, 5, 0.3)
+    assert np.abs(motion.dq).max() == pytest.approx(0.3 * SPEED * PANDA.dq_max[5])
+    check_motion(PANDA, motion)
+
+
+BAD = {
+    "short": (
+        lambda r: rows(r, r.t % (PERIOD_S + 1.0) < 1.0),
+        r"trajectory 0 lasts 0\.999 s, expected .* 2 s or more",
+    ),
+    "slow": (lambda r: rows(r, slice(None, None, 5)), r"trajectory 0: 200 Hz, expected 300 Hz or more"),
+    "quiet": (
+        lambda r: replace(r, tau=noise(r)),
+        r"the torque of joint 1 does not have the multisine of data\.gears",
+    ),
+    "missing": (lambda r: rows(r, r.trajectory // 4 != 4), r"no slide of joint 5; every joint must slide in turn"),
+}
+
+
+def rows(r, some):
+    return Recording(*(x[some] for x in (r.t, r.q, r.dq, r.tau)), "commanded", r.trajectory[some])
+
+
+def noise(recording):
+    return np.random.default_rng(0).normal(size=recording.tau.shape)
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_recordings_that_show_no_gears_are_one_line(recording, what):
+    change, message = BAD[what]
+    with pytest.raises(UserError, match=rf"^data\.gears: .*{message}") as caught:
+        slides_of(change(recording))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_file_gives_back_the_gears(tmp_path, found):
+    """To six digits; files of another arm, and others, are refused in one line."""
+    save_gears(tmp_path / "gears.yaml", PANDA, found, {"run": "here"})
+    stiffness, spread = load_gears(tmp_path, PANDA.n, "identify.gears.stiffness")
+    np.testing.assert_allclose(stiffness, found.drives.stiffness, rtol=1e-5)
+    np.testing.assert_allclose(spread, found.spread, rtol=1e-5)
+    with pytest.raises(UserError, match=r"^identify\.gears\.stiffness: expected gears of 6 joints, got 7 in "):
+        load_gears(tmp_path, 6, "identify.gears.stiffness")
+    for text in ("stiffness: {value: [1, -2], relative_sd: [0.1, 0.1]}", "7", "stiffness: 3", "a: ["):
+        (tmp_path / "gears.yaml").write_text(text)
+        with pytest.raises(UserError, match=r"^x: .*gears\.yaml is not a gears\.yaml of r2s \("):
+            load_gears(tmp_path, 2, "x")
+
+
+def test_identified_gears_keep_their_variance():
+    """Each gear's prior has its own standard deviation, part of which all gears share."""
+    spread = np.linspace(0.02, 0.1, PANDA.n)
+    gears = identified_gears(PANDA.tau_max, 150.0 * PANDA.tau_max, spread)
+    np.testing.assert_allclose(gears.scatter**2 + (gears.width / gears.center) ** 2, spread**2)
+    space = SurfaceSpace(np.zeros(3), np.eye(3)[2], PANDA.tau_max, gears)
+    u, weight = space.prior(9 + PANDA.n)
+    np.testing.assert_allclose(space.compliance(u), 1 / (150.0 * PANDA.tau_max))
+    assert weight.shape == u.shape
+    free = replace(space, gears=unknown_gears(PANDA.n)).prior(9 + PANDA.n)[1]
+    assert (weight[8:] > free[8:]).all()
+
+
+WRONG = {
+    "data.gears=true": "data.gears: give the arm, identified from free motion, by calibration=RUN_FOLDER",
+    "data.gears=true data.presses=6 calibration=x": "data.gears: cannot be combined with data.presses; identify the",
+    "data.gears=maybe calibration=x": "data.gears: expected true or false, got 'maybe'",
+    "data=recording data.gears=nowhere.npz calibration=x": "nowhere.npz",
+    "data=recording data.gears=a.npz data.torque=measured calibration=x": "gears need commanded torque",
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_wrong_words_are_one_line(words):
+    done = r2s("stage=identify", *words.split())
+    assert done.returncode == 2
+    assert WRONG[words] in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
