@@ -27,6 +27,8 @@ from r2s.identification.contact.surface_space import SurfaceSpace, identified_ge
 from r2s.identification.gears.estimate import DEFLECTION, gear_problem, identify_gears
 from r2s.identification.gears.gears_file import load_gears, save_gears
 from r2s.identification.gears.response import Drives, Slides, motor_response, slides_of
+from r2s.identification.parameter_file import save_parameters
+from r2s.identification.parameters import ParameterEstimate
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.recordings.recording import Recording
 
@@ -228,6 +230,40 @@ def test_identified_gears_keep_their_variance():
     assert weight.shape == u.shape
     free = replace(space, gears=unknown_gears(PANDA.n)).prior(9 + PANDA.n)[1]
     assert (weight[8:] > free[8:]).all()
+
+
+@pytest.fixture
+def calibration(tmp_path, arm):
+    low, high = np.quantile(arm.samples, [0.025, 0.975], axis=0)
+    (tmp_path / "run").mkdir()
+    estimate = ParameterEstimate(arm.x, low, high, low < high, arm.samples)
+    save_parameters(tmp_path / "run" / "parameters.yaml", arm.space, estimate, {"torque": "commanded"})
+    return f"calibration={tmp_path / 'run'}", f"root={tmp_path}"
+
+
+@pytest.mark.long
+def test_the_command_writes_gears_from_a_file(tmp_path, calibration, recording, found):
+    """The stiffness of the function, a figure, and the arm, so that the folder can be a calibration."""
+    recording.save(tmp_path / "slides.npz")
+    words = "data=recording", f"data.gears={tmp_path / 'slides.npz'}", "name=gears"
+    done = r2s("stage=identify", *calibration, *words)
+    assert done.returncode == 0, done.stderr
+    run = tmp_path / "identify" / "gears"
+    assert "joint 7" in done.stdout
+    assert all((run / name).is_file() for name in ("parameters.yaml", "posterior.npz", "figures/gears.png"))
+    stiffness, spread = load_gears(run, PANDA.n, "gears")
+    np.testing.assert_allclose(stiffness, found.drives.stiffness, rtol=1e-4)  # parameters.yaml rounds the arm
+    np.testing.assert_allclose(spread, found.spread, rtol=1e-2)
+
+
+@pytest.mark.slow
+def test_the_command_lets_a_twin_slide(tmp_path, calibration):
+    """On an elastic twin, with an arm that was not identified."""
+    done = r2s("stage=identify", *calibration, "arm.variant=elastic", "arm.seed=3", "data.gears=true", "name=gears")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "identify" / "gears" / "gears.npz").is_file()
+    stiffness, spread = load_gears(tmp_path / "identify" / "gears", PANDA.n, "gears")
+    assert (np.abs(np.log(stiffness / ElasticTwin(PANDA, 3)._hidden[STIFF])) < 3 * spread).all()
 
 
 WRONG = {

@@ -39,6 +39,7 @@ ELSEWHERE = {  # what this file does not type, and why
     r"python run.py .*data\.path=(logs/|\[a\.csv)": "recordings that a reader has: test_known.py",
     r"python run.py .*identify\.prior\.": "a recording of three joints: test_known.py",
     r"python run.py .*(UNLOADED|LOADED)": "an arm with and without a payload: test_loaded.py",
+    r"python run.py .*data\.gears=": "an arm with elastic gears: test_gears.py",
     r"python run.py .*TOOL\.json": "an arm at a surface: test_contact_identification.py, test_presses.py",
 }
 INSTEAD = {  # of what no test has
