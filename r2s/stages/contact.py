@@ -66,7 +66,11 @@ def stated_stiffness(cfg, robot):
         raise UserError(f"identify.gears: expected identify.gears.stiffness= and .accuracy=, got {gears!r}")
     if isinstance(folder := gears.get("stiffness"), str):
         found = load_gears(located(folder), robot.n, "identify.gears.stiffness")
-        return identified_gears(robot.tau_max, *found)
+        if (prior := identified_gears(robot.tau_max, *found)) is None:
+            raise UserError(
+                f"identify.gears.stiffness: the slides in {folder} determined fewer than half of the gears"
+            )
+        return prior
     return called(stated_gears, "identify.gears", gears, robot.tau_max)
 
 

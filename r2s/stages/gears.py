@@ -89,5 +89,7 @@ def identify_gears(cfg, run, arm, recording):
     save_gears(run.folder / "gears.yaml", arm.robot, found, source)
     gears_figure(run.figure("gears"), found)
     print_table(console(), gears_table(found), "gears, 95 % intervals")
+    if unseen := [str(i + 1) for i, seen in enumerate(found.identifiable) if not seen]:
+        print(f"warning: gears of joints {', '.join(unseen)} not determined: rigid gears, or encoders on the links?")
     entry = {"stiffness_Nm_per_rad": found.drives.stiffness.tolist(), "relative_sd": found.spread.tolist()}
     return entry | {"identifiable": found.identifiable.tolist()}

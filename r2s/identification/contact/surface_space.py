@@ -91,14 +91,22 @@ def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float 
     return Gears(deflection / mean, mean, half * mean, half, True)
 
 
-def identified_gears(tau_max: np.ndarray, stiffness: np.ndarray, spread: np.ndarray) -> Gears:
-    """Return the prior of identified gears; half of the variance of the best known gear is common to all gears.
+def identified_gears(
+    tau_max: np.ndarray, stiffness: np.ndarray, spread: np.ndarray, determined: np.ndarray
+) -> Gears | None:
+    """Return the prior of identified gears, or None if slides determined less than half of them.
+
+    A gear that the slides did not determine deflects like the mean of the others. Half of the variance of the best
+    known gear is common to all gears.
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints. stiffness: (n,) Nm/rad. spread: (n,) relative standard
-            deviation of the stiffness; at most WIDEST counts, because of the bound FARTHEST.
+            deviation of the stiffness; at most WIDEST counts, because of the bound FARTHEST. determined: (n,) bool.
     """
-    deflection, spread = tau_max / stiffness, np.minimum(spread, WIDEST)
+    if 2 * determined.sum() < len(determined):
+        return None
+    deflection = np.where(determined, tau_max / stiffness, (tau_max / stiffness)[determined].mean())
+    spread = np.where(determined, np.minimum(spread, WIDEST), WIDEST)
     mean, common = float(deflection.mean()), float(spread.min() / np.sqrt(2.0))
     return Gears(deflection / mean, mean, common * mean, np.sqrt(spread**2 - common**2), True)
 

@@ -21,6 +21,7 @@ from r2s.recordings.recording import Recording
 
 DRAWS = 400  # posterior draws
 MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 7
+STIFF = np.log(20.0)  # a second search begins with gears so stiff that they resonate above all lines
 # Prior: mean and standard deviation, of the logarithm unless stated otherwise
 DEFLECTION = 0.0055, 0.6  # rad, of a strain wave gear at the joint's largest torque (contact/surface_space.py)
 ROTOR = 0.2, 0.7  # inertia of the rotor beyond the model's, relative to the joint's links
@@ -145,12 +146,14 @@ def identify_gears(
     problem = gear_problem(arm.robot, arm.space.dynamics(arm.x), slides)
     n = arm.robot.n
     report(0.1, "stiffness")
-    x, _ = _minimum(problem, np.zeros(8 * n))
+    stiff = np.zeros((8, n))
+    stiff[1] = STIFF / DEFLECTION[1]
+    x = min((_minimum(problem, start) for start in (0.0 * stiff.ravel(), stiff.ravel())), key=lambda fit: fit[2])[0]
     report(0.6, "intervals")
     # the neighbors of a line may underestimate its noise; they never overestimate what the model leaves unexplained
     noise = max(1.0, float(np.sqrt(0.5 * (np.abs(problem.misfit(x)) ** 2).mean())))
     problem = replace(problem, noise=noise)
-    x, covariance = _minimum(problem, x)
+    x, covariance, _ = _minimum(problem, x)
     covariance = covariance[n : 2 * n, n : 2 * n] * DEFLECTION[1] ** 2
     sd = np.sqrt(np.diag(covariance))
     drives = problem.drives(x)
@@ -164,11 +167,20 @@ def identify_gears(
     )  # fmt: skip
 
 
-def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum x (8 n,) near `start` and its covariance (8 n, 8 n).
+def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the minimum x (8 n,) near `start`, its covariance (8 n, 8 n) and its cost.
 
-    The loss grows linearly with large residuals, because the friction ripple of a revolving motor may meet a line.
+    The loss grows linearly with large residuals of the data, because the friction ripple of a revolving motor may
+    meet a line.
     """
-    fit = least_squares(problem.residual, start, loss="soft_l1")
+    count = problem.slides.sigma.size * 2
+
+    def loss(z: np.ndarray, /) -> np.ndarray:
+        """Return the loss of squared residuals z and two derivatives: soft l1 for the data, z for the prior."""
+        root = np.sqrt(1.0 + z[:count])
+        rest = np.stack([z[count:], np.ones(len(start)), np.zeros(len(start))])
+        return np.concatenate([np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3]), rest], 1)
+
+    fit = least_squares(problem.residual, start, loss=loss)  # type: ignore[arg-type]
     jacobian = np.asarray(fit.jac)
-    return fit.x, np.linalg.inv(jacobian.T @ jacobian)
+    return fit.x, np.linalg.inv(jacobian.T @ jacobian), float(fit.cost)
