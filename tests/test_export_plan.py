@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT, conf
-from test_export import POLICY, arm_of, bare, compare, drawn, hostile, loaded, runs_in  # noqa: F401
+from test_export import ROUNDINGS, arm_of, bare, compare, drawn, hostile, loaded, runs_in  # noqa: F401
 
 from r2s import commands
 from r2s.arm.policy_runner import PolicyRunner
@@ -104,7 +104,7 @@ def test_the_torque_of_the_model_is_that_of_r2s(panda, arm, family):
 
 def test_the_runtime_follows_a_plan_as_r2s_does(planned, runtime):
     """Near a plan, beyond its end, and at hostile states."""
-    assert compare(planned, runtime, along(planned, 200, 100)) < POLICY
+    assert compare(planned, runtime, along(planned, 200, 100)) < ROUNDINGS
 
 
 @pytest.mark.slow
@@ -112,7 +112,7 @@ def test_the_runtime_follows_a_plan_as_r2s_does(planned, runtime):
 def test_so_it_does_for_ten_thousand_cycles(tmp_path, control):
     """Under both controllers; the calm motion is longer than its plan."""
     exported = export(tmp_path, f"control={control}")
-    assert compare(exported, loaded(exported.folder), along(exported, 10_000, 1500)) < POLICY
+    assert compare(exported, loaded(exported.folder), along(exported, 10_000, 1500)) < ROUNDINGS
 
 
 @pytest.mark.slow

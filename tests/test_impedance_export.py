@@ -4,7 +4,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from test_export import COMPILER, LAW_NM, LIBFRANKA, POLICY, compare, drawn, hostile, loaded
+from test_export import COMPILER, LAW_NM, LIBFRANKA, ROUNDINGS, compare, drawn, hostile, loaded
 from test_impedance import FRICTIONLESS, PANDA, REACH, N, Pose
 from test_impedance_feedforward import bristle_model, random_model
 
@@ -120,12 +120,12 @@ def exported(tmp_path_factory):
 
 
 def test_a_bundle_does_what_r2s_does(exported):
-    assert compare(exported, loaded(exported.folder), hostile(exported.robot, exported.task, 300)) < POLICY
+    assert compare(exported, loaded(exported.folder), hostile(exported.robot, exported.task, 300)) < ROUNDINGS
 
 
 @pytest.mark.slow
 def test_it_does_so_for_ten_thousand_cycles(exported):
-    assert compare(exported, loaded(exported.folder), hostile(exported.robot, exported.task, 10_000)) < POLICY
+    assert compare(exported, loaded(exported.folder), hostile(exported.robot, exported.task, 10_000)) < ROUNDINGS
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
