@@ -157,7 +157,7 @@ def identify_gears(variant: str, seed: int) -> tuple[Path, Path]:
 
 def gear_error(run: Path, variant: str, seed: int) -> str:
     """Return the largest error, %, of the identified stiffness among the strong joints."""
-    stiffness = load_gears(run, ROBOT.n, "slides")[0]
+    stiffness = load_gears(run, ROBOT, "slides")[0]
     true = make_twin(ROBOT, variant=variant, seed=seed)._hidden[STIFF]
     strong = ROBOT.tau_max > 0.5 * ROBOT.tau_max.max()
     error = (100 * (stiffness / true - 1.0))[strong]
@@ -196,11 +196,12 @@ def judged_twin(variant: str, seed: int) -> tuple[dict[str, Score], dict[str, st
     )
     if variant == "elastic":
         slides, behind = identify_gears(variant, seed)
-        known_gears["gears 1 to 4, %"] = gear_error(slides, variant, seed)
-        for how, again in (("stated", identify_with_gears(variant, seed)), ("identified", behind)):
+        known_gears[GEARS[2]] = gear_error(slides, variant, seed)
+        pairs = zip(GEARS, (identify_with_gears(variant, seed), behind), strict=False)
+        for column, again in pairs:
             known, its = load_contact(again), yaml.safe_load((again / "contact.yaml").read_text())
-            scores[f" with {how} gears"] = score(known.surface, known.interval, truth)
-            known_gears[f"with {how} gears, %"] = slope_error(known, its, truth)
+            scores[f" {column.removesuffix(', %')}"] = score(known.surface, known.interval, truth)
+            known_gears[column] = slope_error(known, its, truth)
     rigid = document["rigid_gears"]["parameters"]["slope_at_10N"]["value"]
     held_out = json.loads((run / "summary.json").read_text())["contact"]["validation"]["force_rmse_N"]
     return scores, {

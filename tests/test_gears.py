@@ -9,6 +9,8 @@ from conftest import ROOT, conf
 from test_cli import r2s
 
 from r2s.arm.gear_motions import check_gear_motions, record_gear_motions
+from r2s.arm.interface import ArmStopped
+from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twins.elastic_joints import STIFF
 from r2s.arm.twins.elastic_twin import ElasticTwin
 from r2s.errors import UserError
@@ -29,6 +31,7 @@ from r2s.identification.gears.gears_file import load_gears, save_gears
 from r2s.identification.gears.response import Drives, Slides, motor_response, slides_of
 from r2s.identification.parameter_file import save_parameters
 from r2s.identification.parameters import ParameterEstimate
+from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.recordings.recording import Recording
 
@@ -92,13 +95,16 @@ def responding(arm, x):
 
 @pytest.mark.long
 def test_the_stiffness_of_the_gears_is_identified(arm, drives, found):
-    """Within three standard deviations for each of seven joints, and within a twentieth for the strong ones."""
+    """Within three standard deviations for each of seven joints, and within a twentieth for the strong ones.
+
+    The model is exact here, so the residual has the size of the noise: misfits above 1 would be errors of the sigma.
+    """
     true = gear_problem(arm.robot, arm.space.dynamics(arm.x), found.slides).drives(drives)
     error = np.log(found.drives.stiffness / true.stiffness)
     assert (np.abs(error) < 3 * found.spread).all()
     assert np.abs(error[:4]).max() < 0.05
     assert found.identifiable.all()
-    assert (found.misfit < 1.2).all()
+    assert found.misfit.max() < 1.2
 
 
 @pytest.mark.slow
@@ -159,7 +165,7 @@ def test_other_motors_that_move_are_accounted_for(arm, drives):
 @pytest.mark.long
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_shipped_robot_can_slide(name):
-    """The motions pass all checks, and the multisine stays within its shares and never stops the joint."""
+    """The motions pass all checks, slide at a constant speed, and the multisine stays within its shares."""
     robot = load_robot(**conf(f"robot/{name}"))
     check_gear_motions(robot)
     for j in range(robot.n):
@@ -182,10 +188,11 @@ def test_the_multisine_has_its_lines_alone():
 
 
 def test_a_slow_arm_slides_slowly():
-    """A speed share scales the speed; the motion begins and ends at rest, and its derivatives agree."""
-    motion = gear_motion(PANDA, 5, 0.3)
-    assert np.abs(motion.dq).max() == pytest.approx(0.3 * SPEED * PANDA.dq_max[5])
-    check_motion(PANDA, motion)
+    """Well within its speed limits; the motion begins and ends at rest, and its derivatives agree."""
+    for share, speed in ((0.3, SPEED), (0.1, 0.03)):
+        motion = gear_motion(PANDA, 5, share)
+        assert np.abs(motion.dq).max() == pytest.approx(speed * PANDA.dq_max[5])
+        check_motion(PANDA, motion)
 
 
 BAD = {
@@ -196,9 +203,10 @@ BAD = {
     "slow": (lambda r: rows(r, slice(None, None, 5)), r"trajectory 0: 200 Hz, expected 300 Hz or more"),
     "quiet": (
         lambda r: replace(r, tau=noise(r)),
-        r"the torque of joint 1 does not have the multisine of data\.gears",
+        r"no slide of joint 1 with the multisine of data\.gears: the lines of its torque exceed their neighbors",
     ),
-    "missing": (lambda r: rows(r, r.trajectory // 4 != 4), r"no slide of joint 5; every joint must slide in turn"),
+    "missing": (lambda r: rows(r, r.trajectory // 4 != 4), r"no slide of joint 5 .*: every joint must slide in turn"),
+    "gap": (lambda r: rows(r, np.abs(r.t - 1.0) > 4e-3), r"trajectory 0: a gap of 8 ms, allowed up to 4\.2 ms"),
 }
 
 
@@ -218,16 +226,29 @@ def test_recordings_that_show_no_gears_are_one_line(recording, what):
     assert "\n" not in str(caught.value)
 
 
+def test_a_few_lost_samples_change_little(recording):
+    """One state in a hundred is lost, as r2s accepts of an arm: the lines stay where they are."""
+    lost = np.random.default_rng(0).uniform(size=len(recording.t)) < 0.01
+    lost[np.flatnonzero(np.diff(recording.trajectory, prepend=-1))] = False  # but not the ends
+    lost[np.flatnonzero(np.diff(recording.trajectory, append=-1))] = False
+    lost[1:] &= ~lost[:-1]
+    whole, some = slides_of(recording), slides_of(rows(recording, ~lost))
+    np.testing.assert_array_equal(some.joint, whole.joint)
+    error = np.abs(some.response - whole.response) / whole.sigma
+    assert np.median(error) < 1.0
+
+
 @pytest.mark.long
 def test_the_file_gives_back_the_gears(tmp_path, found):
     """To six digits; files of another arm, and others, are refused in one line."""
     save_gears(tmp_path / "gears.yaml", PANDA, found, {"run": "here"})
-    stiffness, spread, determined = load_gears(tmp_path, PANDA.n, "identify.gears.stiffness")
+    stiffness, spread, determined = load_gears(tmp_path, PANDA, "identify.gears.stiffness")
     assert determined.all()
     np.testing.assert_allclose(stiffness, found.drives.stiffness, rtol=1e-5)
     np.testing.assert_allclose(spread, found.spread, rtol=1e-5)
-    with pytest.raises(UserError, match=r"^identify\.gears\.stiffness: expected gears of 6 joints, got 7 in "):
-        load_gears(tmp_path, 6, "identify.gears.stiffness")
+    other = r"^identify\.gears\.stiffness: expected gears of 'iiwa14' \(7 joints\), got 'panda' \(7\) in "
+    with pytest.raises(UserError, match=other):
+        load_gears(tmp_path, load_robot(**conf("robot/iiwa14")), "identify.gears.stiffness")
     for text in (
         "stiffness: {value: [1, -2], relative_sd: [0.1, 0.1], identifiable: [true, true]}",
         "7",
@@ -236,7 +257,7 @@ def test_the_file_gives_back_the_gears(tmp_path, found):
     ):
         (tmp_path / "gears.yaml").write_text(text)
         with pytest.raises(UserError, match=r"^x: .*gears\.yaml is not a gears\.yaml of r2s \("):
-            load_gears(tmp_path, 2, "x")
+            load_gears(tmp_path, PANDA, "x")
 
 
 def test_identified_gears_keep_their_variance():
@@ -283,9 +304,30 @@ def test_the_command_writes_gears_from_a_file(tmp_path, calibration, recording, 
     run = tmp_path / "identify" / "gears"
     assert "joint 7" in done.stdout
     assert all((run / name).is_file() for name in ("parameters.yaml", "posterior.npz", "figures/gears.png"))
-    stiffness, spread, _ = load_gears(run, PANDA.n, "gears")
+    stiffness, spread, _ = load_gears(run, PANDA, "gears")
     np.testing.assert_allclose(stiffness, found.drives.stiffness, rtol=1e-4)  # parameters.yaml rounds the arm
     np.testing.assert_allclose(spread, found.spread, rtol=1e-2)
+
+
+@pytest.mark.slow
+def test_a_stop_keeps_the_finished_joints():
+    """The arm stops while joint 2 slides: the exception has the slides of joint 1."""
+    arm = SimulatedArm(
+        PANDA, nominal_dynamics(PANDA, phi1=1.0, phi2=20.0, phi3=0.0), position_noise=0.0, velocity_noise=0.0
+    )
+    send, sent = arm.command, []
+
+    def command(tau):
+        sent.append(tau)
+        if len(sent) > 1.5 * len(gear_motion(PANDA, 0).t):
+            raise ArmStopped("a collision reflex")
+        send(tau)
+
+    arm.command = command
+    with pytest.raises(ArmStopped) as stop:
+        record_gear_motions(arm)
+    assert np.ptp(stop.value.recording.q, axis=0).argmax() == 0
+    assert len(stop.value.recording.stretches) == len(slides())
 
 
 @pytest.mark.slow
@@ -294,7 +336,7 @@ def test_the_command_lets_a_twin_slide(tmp_path, calibration):
     done = r2s("stage=identify", *calibration, "arm.variant=elastic", "arm.seed=3", "data.gears=true", "name=gears")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "identify" / "gears" / "gears.npz").is_file()
-    stiffness, spread, _ = load_gears(tmp_path / "identify" / "gears", PANDA.n, "gears")
+    stiffness, spread, _ = load_gears(tmp_path / "identify" / "gears", PANDA, "gears")
     assert (np.abs(np.log(stiffness / ElasticTwin(PANDA, 3)._hidden[STIFF])) < 3 * spread).all()
 
 
@@ -302,6 +344,11 @@ WRONG = {
     "data.gears=true": "data.gears: give the arm, identified from free motion, by calibration=RUN_FOLDER",
     "data.gears=true data.presses=6 calibration=x": "data.gears: cannot be combined with data.presses; identify the",
     "data.gears=maybe calibration=x": "data.gears: expected true or false, got 'maybe'",
+    "data=recording data.gears=true calibration=x": "data.gears: expected a file with slides, got True",
+    "data=recording data.gears=a.npz data.path=b.npz calibration=x": "data.gears: cannot be combined with data.path",
+    "data.gears=true data.torque=measured calibration=x": "data.gears: gears need commanded torque",
+    "data.gears=true identify.gears.stiffness=1e4 calibration=x": "data.gears: identifies the stiffness that",
+    "stage=pipeline data.gears=true": "data.gears: stage=pipeline identifies the arm from free motion",
     "data=recording data.gears=nowhere.npz calibration=x": "nowhere.npz",
     "data=recording data.gears=a.npz data.torque=measured calibration=x": "gears need commanded torque",
 }
@@ -309,7 +356,7 @@ WRONG = {
 
 @pytest.mark.parametrize("words", WRONG)
 def test_wrong_words_are_one_line(words):
-    done = r2s("stage=identify", *words.split())
+    done = r2s(*(() if "stage=" in words else ("stage=identify",)), *words.split())
     assert done.returncode == 2
     assert WRONG[words] in done.stdout + done.stderr
     assert "Traceback" not in done.stderr

@@ -1,15 +1,16 @@
 """Record an arm while each joint in turn slides slowly under a multisine torque, to identify its gears."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from r2s.arm.interface import Arm, speed_share
+from r2s.arm.interface import Arm, ArmStopped, speed_share
 from r2s.arm.realtime import Timing
 from r2s.arm.recorder import record
 from r2s.errors import UserError
 from r2s.excitation.motion_checks import Space, check_limits, check_space, check_torque
-from r2s.excitation.multisine import PERIOD_S, gear_motion, multisine, slides
+from r2s.excitation.multisine import PERIOD_S, TORQUE_SHARE, gear_motion, multisine, slides
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
@@ -23,7 +24,7 @@ def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
         motion = gear_motion(robot, joint, share)
         try:
             check_limits(robot, motion)
-            check_torque(robot, motion)
+            check_torque(replace(robot, tau_max=(1.0 - TORQUE_SHARE) * robot.tau_max), motion)
             check_space(robot, motion, space=space)
         except UserError as error:
             raise UserError(f"data.gears: slide of joint {joint + 1} about robot.q_home: {error}") from None
@@ -41,18 +42,30 @@ def record_gear_motions(
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped, UserError: as in `r2s.arm.recorder.record`.
+        ArmStopped: as in `r2s.arm.recorder.record`; the exception's `recording` contains the slides of the completed
+            joints, if any.
+        UserError: as in `r2s.arm.recorder.record`.
     """
-    robot, share, parts = arm.robot, speed_share(arm), []
+    robot, share = arm.robot, speed_share(arm)
+    parts: list[tuple[np.ndarray, ...]] = []
     for joint in range(robot.n):
         added = np.zeros((len(gear_motion(robot, joint, share).t), robot.n))
         added[:, joint] = multisine(robot, joint, share)
-        out = record(arm, gear_motion(robot, joint, share), added=added, timing=timing)
+        try:
+            out = record(arm, gear_motion(robot, joint, share), added=added, timing=timing)
+        except ArmStopped as stop:
+            stop.recording = _recording(parts, robot.name) if parts else None
+            raise
         parts += [(out.q[rows], out.dq[rows], out.tau[rows], out.t[rows]) for rows in slides()]
         if progress is not None:
             progress(joint + 1, robot.n)
+    return _recording(parts, robot.name)
+
+
+def _recording(parts: list[tuple[np.ndarray, ...]], name: str) -> Recording:
+    """Return the recording of slides, each with q, dq, tau and t."""
     q, dq, tau, t = (np.concatenate(x) for x in zip(*parts, strict=True))
     index = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     starts = np.repeat([part[3][0] for part in parts], [len(part[0]) for part in parts])
     t = t - starts + index * (PERIOD_S + PAUSE_S)
-    return Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=index, name=robot.name)
+    return Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=index, name=name)

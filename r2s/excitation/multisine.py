@@ -16,25 +16,32 @@ PERIOD_S = 2.0  # s, of the multisine; also the time of steady sliding in each l
 LEGS = 4  # slides per joint, to and fro
 RAMP_S, SETTLE_S = 0.5, 0.25  # s, to the sliding speed; until the tracking loop has settled (5 of its time constants)
 LEG_S = 2 * RAMP_S + SETTLE_S + PERIOD_S
-SPEED = 0.07  # sliding speed / dq_max: 0.15 rad/s of a Panda's strong joints, above the Stribeck velocity
+# Sliding speed / dq_max: 0.15 rad/s for a Panda's strong joints, above usual Stribeck velocities (0.01 to 0.1 rad/s)
+SPEED = 0.07
+SLOW_SHARE = 0.3  # largest sliding speed as a share of a reduced speed limit
 # Lines spread over the resonances of arms, 10 to 80 Hz
 LINES_HZ = np.unique(np.round(np.geomspace(6.0, 120.0, 24) * PERIOD_S)) / PERIOD_S
-RIPPLE = 0.05  # velocity of each line / sliding speed, so that their sum never stops the joint
+RIPPLE = 0.05  # velocity of each line / sliding speed; 24 lines then rarely reach the sliding speed
 RATE_SHARE, TORQUE_SHARE = 0.4, 0.05  # largest torque rate / dtau_max and torque / tau_max of the multisine
 DRAWS = 200  # random phases tried; those with the lowest peak torque rate are used
 MARGIN = 0.15  # rad, distance kept to the position limits
 
 
-def gear_motion(robot: Robot, joint: int, speed_share: float = 1.0) -> Excitation:
-    """Return a motion of one joint: LEGS slides to and fro at constant speed about home; the other joints rest.
+def slide_speed(robot: Robot, joint: int, speed_share: float = 1.0) -> float:
+    """Return the sliding speed, rad/s; `speed_share` scales the arm's speed limits, see `arm.speed_share`.
 
-    speed_share: factor on the joint's speed, for arms with a speed limit.
+    The speed decreases only for small shares, because a joint that slides too slowly sticks.
     """
+    return float(min(SPEED, SLOW_SHARE * speed_share) * robot.dq_max[joint])
+
+
+def gear_motion(robot: Robot, joint: int, speed_share: float = 1.0) -> Excitation:
+    """Return a motion of one joint: LEGS slides to and fro at `slide_speed` about home; the other joints rest."""
     rows = round(LEG_S / SIM_DT)
     t = np.arange(LEGS * rows + 1) * SIM_DT
     leg = np.minimum(np.arange(len(t)) // rows, LEGS - 1)
     within = t - leg * LEG_S
-    speed = SPEED * speed_share * robot.dq_max[joint]
+    speed = slide_speed(robot, joint, speed_share)
     rise, fall = within / RAMP_S, (LEG_S - within) / RAMP_S
     x = np.clip(np.minimum(rise, fall), 0.0, 1.0)
     steady = np.clip(within - RAMP_S, 0.0, SETTLE_S + PERIOD_S)
@@ -67,7 +74,7 @@ def multisine(robot: Robot, joint: int, speed_share: float = 1.0) -> np.ndarray:
     motion = gear_motion(robot, joint, speed_share)
     inertia = 1 / np.linalg.inv(mass_matrix(robot, robot.q_home[None])[0])[joint, joint]  # other joints free
     omega = 2 * np.pi * LINES_HZ
-    speed = SPEED * speed_share * robot.dq_max[joint]
+    speed = slide_speed(robot, joint, speed_share)
     rate = RATE_SHARE * robot.dtau_max[joint] / np.sqrt(len(omega) / 2)
     amplitude = np.minimum(RIPPLE * speed * inertia * omega, rate / omega)
     t = np.arange(round(PERIOD_S / SIM_DT)) * SIM_DT

@@ -86,6 +86,10 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
         number = sum(summary["trials"].values())
         return f"best of {number} trials: {summary['best']['value']:.4g}"
     if stage == "identify" and "validation" not in summary:
+        if "gears" in summary:
+            found = summary["gears"]
+            count, seen = len(found["identifiable"]), sum(found["identifiable"])
+            return f"gears up to {max(found['stiffness_Nm_per_rad']):.3g} Nm/rad, {seen} of {count} determined"
         found = summary["contact"]
         return f"surface {found['slope_N_per_m']:.3g} N/m, friction {found['friction']:.2g}"
     if stage == "identify":

@@ -65,11 +65,14 @@ def stated_stiffness(cfg, robot):
     if not isinstance(gears, dict):
         raise UserError(f"identify.gears: expected identify.gears.stiffness= and .accuracy=, got {gears!r}")
     if isinstance(folder := gears.get("stiffness"), str):
-        found = load_gears(located(folder), robot.n, "identify.gears.stiffness")
-        if (prior := identified_gears(robot.tau_max, *found)) is None:
-            raise UserError(
-                f"identify.gears.stiffness: the slides in {folder} determined fewer than half of the gears"
-            )
+        found = load_gears(located(folder), robot, "identify.gears.stiffness")
+        try:
+            prior = identified_gears(robot.tau_max, *found)
+        except UserError as error:
+            raise UserError(f"identify.gears.{error} ({folder})") from None
+        if prior is None:
+            few = "the slides determined fewer than half of the gears"
+            raise UserError(f"identify.gears.stiffness: {few} in {folder}")
         return prior
     return called(stated_gears, "identify.gears", gears, robot.tau_max)
 

@@ -7,12 +7,25 @@ from r2s.stages.data import check_data, read_file
 
 ALONE = "identify the gears first, then name their run folder: identify.gears.stiffness=RUN_FOLDER"
 
+OTHERS = (
+    *("path", "validation", "ramps", "presses", "contact", "contact_validation"),
+    *("loaded", "declared_payload", "payload", "excitation"),
+)
+
 
 def check_alone(cfg):
     """Raise UserError if data.gears is combined with another recording or lacks the identified arm."""
-    for key in ("presses", "contact", "loaded"):
-        if cfg.data.get(key):
+    from omegaconf import OmegaConf
+
+    for key in OTHERS:
+        if not OmegaConf.is_missing(cfg.data, key) and cfg.data.get(key):
             raise UserError(f"data.gears: cannot be combined with data.{key}; {ALONE}")
+    if cfg.data.torque not in (None, "commanded"):
+        raise UserError(f"data.gears: gears need commanded torque, not data.torque={cfg.data.torque}")
+    if (cfg.identify.get("gears") or {}).get("stiffness") is not None:
+        raise UserError("data.gears: identifies the stiffness that identify.gears.stiffness gives; leave one out")
+    if cfg.data.kind == "recording" and not isinstance(cfg.data.gears, str):
+        raise UserError(f"data.gears: expected a file with slides, got {cfg.data.gears!r}; data=arm records slides")
     if not cfg.calibration:
         raise UserError("data.gears: give the arm, identified from free motion, by calibration=RUN_FOLDER")
 
@@ -21,12 +34,10 @@ def gear_file(robot, file):
     """Return the recording in data.gears and its path; file: `FileData` of the config.
 
     Raises:
-        UserError: data.torque is not commanded, or the file is invalid.
+        UserError: the file is invalid.
     """
     from r2s.identification.checks import check_recording
 
-    if file.torque not in (None, "commanded"):
-        raise UserError(f"data.gears: gears need commanded torque, not data.torque={file.torque}")
     path = located(file.gears)
     recording = read_file(robot, file, path, torque="commanded")
     check_recording(robot, recording)
@@ -48,7 +59,7 @@ def recorded_slides(cfg, run, robot):
     """Let the arm slide joint by joint, and return the recording; a resumed run reads its existing recording.
 
     Raises:
-        Stopped: the arm stopped.
+        Stopped: the arm stopped; gears_until_stop.npz contains the slides of the joints completed before, if any.
     """
     from r2s.arm.gear_motions import record_gear_motions
     from r2s.arm.interface import ArmStopped
@@ -65,6 +76,8 @@ def recorded_slides(cfg, run, robot):
                 show = lambda k, n: progress(k / n, f"{k} joints")  # noqa: E731
                 out = record_gear_motions(arm, progress=show, timing=timing)
         except ArmStopped as stop:
+            if stop.recording is not None:
+                stop.recording.save(run.folder / "gears_until_stop.npz")
             raise Stopped(f"while the joints slid: {stop}; resume={run.folder} starts again") from None
         finally:
             for row in timing.table():

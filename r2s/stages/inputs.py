@@ -12,6 +12,7 @@ PARENTS = (
     "adapt.calibration",
     "estimate.surface",
     "dr.surface",
+    "identify.gears.stiffness",
 )  # config keys that name a run folder
 FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; the commit determines files of the package
 # files of a run folder that another job may read
@@ -19,6 +20,7 @@ READ = (
     *("config.yaml", "overrides.yaml", "policy.yaml", "summary.json", "measures.json", "evaluations.csv"),
     *("parameters.yaml", "posterior.npz", "contact.yaml", "contact_posterior.npz", "policy.pt", "timing.csv"),
     *("train.npz", "validation.npz", "ramps.npz", "contact.npz", "episodes_*"),
+    *("gears.yaml", "gears.npz"),
 )
 
 
@@ -28,7 +30,8 @@ def parents_of(cfg) -> list[str]:
 
     copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # a resumed run reads these copies
     keys = [k for k in PARENTS if not (cfg.resume and k in copies and (Path(cfg.resume) / copies[k]).is_file())]
-    return [str(Path(str(value))) for key in keys if (value := OmegaConf.select(cfg, key))]
+    values = [OmegaConf.select(cfg, key) for key in keys]
+    return [str(Path(value)) for value in values if isinstance(value, str) and value]
 
 
 def files_of(cfg, parents: Iterable[str]) -> list[Path]:

@@ -261,7 +261,10 @@ def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrid
 def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
     """Before the arm moves, raise UserError if identification or training would refuse an override."""
     first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
-    identify.make_parts(compose_step(first["identify"], "stage=identify"))
+    step = compose_step(first["identify"], "stage=identify")
+    if step.data.get("gears"):
+        raise UserError("data.gears: stage=pipeline identifies the arm from free motion; use stage=identify")
+    identify.make_parts(step)
     for label, words in trained.items():
         step = compose_step(words, f"the training '{label}'")
         for word in words:

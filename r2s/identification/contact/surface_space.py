@@ -82,19 +82,28 @@ def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float 
     if not (np.isfinite(own) & (own > 0)).all():
         raise UserError(f"stiffness: expected positive numbers, Nm/rad, got {stiffness}")
     deflection, half = tau_max / own, accuracy / np.sqrt(2.0)
-    mean, most = float(deflection.mean()), SOFTEST / (1.0 + 2.0 * half)
+    mean = _mean_deflection(deflection, half)
+    return Gears(deflection / mean, mean, half * mean, half, True)
+
+
+def _mean_deflection(deflection: np.ndarray, width: float) -> float:
+    """Return the mean of the deflections (n,) rad; raise UserError if it is not far below SOFTEST.
+
+    width: relative standard deviation of the mean.
+    """
+    mean, most = float(deflection.mean()), SOFTEST / (1.0 + 2.0 * width)
     if mean > most:
         raise UserError(
             f"stiffness: robot.tau_max would twist these gears by {mean:.3g} rad, allowed are {most:.2g} rad; "
             "the unit is Nm/rad"
         )
-    return Gears(deflection / mean, mean, half * mean, half, True)
+    return mean
 
 
 def identified_gears(
     tau_max: np.ndarray, stiffness: np.ndarray, spread: np.ndarray, determined: np.ndarray
 ) -> Gears | None:
-    """Return the prior of identified gears, or None if slides determined less than half of them.
+    """Return the prior of identified gears, or None if slides determined fewer than half of them.
 
     A gear that the slides did not determine deflects like the mean of the others. Half of the variance of the best
     known gear is common to all gears.
@@ -107,7 +116,8 @@ def identified_gears(
         return None
     deflection = np.where(determined, tau_max / stiffness, (tau_max / stiffness)[determined].mean())
     spread = np.where(determined, np.minimum(spread, WIDEST), WIDEST)
-    mean, common = float(deflection.mean()), float(spread.min() / np.sqrt(2.0))
+    common = float(spread.min() / np.sqrt(2.0))
+    mean = _mean_deflection(deflection, common)
     return Gears(deflection / mean, mean, common * mean, np.sqrt(spread**2 - common**2), True)
 
 

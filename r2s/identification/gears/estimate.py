@@ -20,9 +20,11 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 DRAWS = 400  # posterior draws
+FTOL, XTOL = 1e-5, 1e-4  # a search ends when a step changes the cost or x by less than this share
 MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 7
-STIFF = np.log(20.0)  # a second search begins with gears so stiff that they resonate above all lines
-# Prior: mean and standard deviation, of the logarithm unless stated otherwise
+STIFF = np.log(20.0)  # if a gear is not determined, a second search begins with gears that resonate above all lines
+# Prior: mean and standard deviation, of the logarithm unless stated otherwise. Wide; no source gives these values for
+# a robot, and they matter only for light wrists, whose motors hardly feel the link.
 DEFLECTION = 0.0055, 0.6  # rad, of a strain wave gear at the joint's largest torque (contact/surface_space.py)
 ROTOR = 0.2, 0.7  # inertia of the rotor beyond the model's, relative to the joint's links
 GEAR_DAMPING = 0.04, 0.7  # relative to critical damping; 0.01 to 0.1 for metal gears
@@ -40,7 +42,8 @@ class GearEstimate:
     Attributes:
         drives: the estimate. draws: (S, n) Nm/rad, posterior draws of the stiffness.
         identifiable: (n,) bool, whether the data determine each stiffness.
-        misfit: (n,), RMS of each joint's residual in standard deviations. tau_max: (n,) Nm.
+        misfit: (n,), RMS of each joint's residual in standard deviations; a misfit above 1 widens the joint's
+            interval. tau_max: (n,) Nm.
         slides: the measured spectra. response: (W, F) rad/Nm, the estimate's response.
     """
 
@@ -66,7 +69,7 @@ class GearProblem:
         slides: measured spectra. mass: (W, n, n) kg m^2, mass matrices of the links. tensors: (n, W, n, n) kg m^2,
             their parts due to each link's inertia tensor. nominal: prior means.
         critical: (n,) critical damping of a gear per sqrt(stiffness). viscous: (n,) Nm s/rad, prior deviation.
-        noise: factor on `slides.sigma`.
+        noise: factor (W, 1) on `slides.sigma`.
     """
 
     slides: Slides
@@ -75,7 +78,7 @@ class GearProblem:
     nominal: Drives
     critical: np.ndarray
     viscous: np.ndarray
-    noise: float = 1.0
+    noise: np.ndarray | float = 1.0
 
     def drives(self, x: np.ndarray) -> Drives:
         """Return the drives at x (8 n,)."""
@@ -146,25 +149,32 @@ def identify_gears(
     problem = gear_problem(arm.robot, arm.space.dynamics(arm.x), slides)
     n = arm.robot.n
     report(0.1, "stiffness")
-    stiff = np.zeros((8, n))
-    stiff[1] = STIFF / DEFLECTION[1]
-    x = min((_minimum(problem, start) for start in (0.0 * stiff.ravel(), stiff.ravel())), key=lambda fit: fit[2])[0]
+    x, covariance, cost = _minimum(problem, np.zeros(8 * n))
+    if not _determined(covariance).all():
+        stiff = np.zeros((8, n))
+        stiff[1] = STIFF / DEFLECTION[1]
+        again = _minimum(problem, stiff.ravel())
+        x = again[0] if again[2] < cost else x
     report(0.6, "intervals")
-    # the neighbors of a line may underestimate its noise; they never overestimate what the model leaves unexplained
-    noise = max(1.0, float(np.sqrt(0.5 * (np.abs(problem.misfit(x)) ** 2).mean())))
-    problem = replace(problem, noise=noise)
+    # the neighbors of a line may underestimate what the model leaves unexplained
+    size = np.abs(problem.misfit(x)) ** 2
+    misfit = np.sqrt(0.5 * np.array([size[slides.joint == i].mean() for i in range(n)]))
+    problem = replace(problem, noise=np.maximum(misfit, 1.0)[slides.joint, None])
     x, covariance, _ = _minimum(problem, x)
-    covariance = covariance[n : 2 * n, n : 2 * n] * DEFLECTION[1] ** 2
-    sd = np.sqrt(np.diag(covariance))
     drives = problem.drives(x)
     rng = np.random.default_rng(seed)
-    steps = rng.multivariate_normal(np.zeros(n), covariance + MODEL**2 * np.eye(n), DRAWS)
-    rms = np.sqrt(0.5 * np.abs(problem.misfit(x)) ** 2).mean(1)
-    misfit = np.array([rms[slides.joint == i].mean() for i in range(n)])
+    spread = covariance[n : 2 * n, n : 2 * n] * DEFLECTION[1] ** 2 + MODEL**2 * np.eye(n)
+    steps = rng.multivariate_normal(np.zeros(n), spread, DRAWS)
     return GearEstimate(
-        drives, drives.stiffness * np.exp(steps), sd < DEFLECTION[1] / SHARPER, misfit, arm.robot.tau_max, slides,
+        drives, drives.stiffness * np.exp(steps), _determined(covariance), misfit, arm.robot.tau_max, slides,
         problem.response(x),
     )  # fmt: skip
+
+
+def _determined(covariance: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: whether the data determine the stiffness, given the covariance (8 n, 8 n) of x."""
+    n = len(covariance) // 8
+    return np.diag(covariance)[n : 2 * n] < 1.0 / SHARPER**2  # the prior's variance is 1
 
 
 def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -181,6 +191,6 @@ def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.nd
         rest = np.stack([z[count:], np.ones(len(start)), np.zeros(len(start))])
         return np.concatenate([np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3]), rest], 1)
 
-    fit = least_squares(problem.residual, start, loss=loss)  # type: ignore[arg-type]
+    fit = least_squares(problem.residual, start, loss=loss, ftol=FTOL, xtol=XTOL)  # type: ignore[arg-type]
     jacobian = np.asarray(fit.jac)
     return fit.x, np.linalg.inv(jacobian.T @ jacobian), float(fit.cost)

@@ -36,17 +36,18 @@ def save_gears(path: Path, robot: Robot, found: GearEstimate, source: Mapping[st
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
-def load_gears(folder: str | Path, n: int, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def load_gears(folder: str | Path, robot: Robot, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stiffness (n,) Nm/rad, its relative standard deviation (n,), and whether it was determined (n,).
 
     folder: run folder, or gears.yaml. where: the option with which the user named it, for error messages.
 
     Raises:
-        UserError: the file is missing or damaged, or belongs to an arm with another number of joints.
+        UserError: the file is missing or damaged, or belongs to another robot.
     """
     path = run_file(folder, "gears.yaml", where)
     try:
-        found = yaml.safe_load(path.read_text())["stiffness"]
+        document = yaml.safe_load(path.read_text())
+        found, of = document["stiffness"], str(document["robot"])
         values = np.array(found["value"], dtype=float), np.array(found["relative_sd"], dtype=float)
         if any(x.ndim != 1 or not (np.isfinite(x) & (x > 0)).all() for x in values):
             raise ValueError("expected a list of positive numbers")
@@ -54,6 +55,8 @@ def load_gears(folder: str | Path, n: int, where: str) -> tuple[np.ndarray, np.n
     except (*DAMAGED, TypeError, AttributeError, yaml.YAMLError) as error:
         seen = " ".join(str(error).split())
         raise UserError(f"{where}: {path} is not a gears.yaml of r2s ({seen})") from None
-    if any(x.shape != (n,) for x in (*values, determined)):
-        raise UserError(f"{where}: expected gears of {n} joints, got {len(values[0])} in {path}")
+    if of != robot.name or any(x.shape != (robot.n,) for x in (*values, determined)):
+        raise UserError(
+            f"{where}: expected gears of '{robot.name}' ({robot.n} joints), got '{of}' ({len(values[0])}) in {path}"
+        )
     return *values, determined

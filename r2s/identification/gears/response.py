@@ -10,11 +10,14 @@ from r2s.recordings.recording import Recording
 
 RATE = 2.5  # least number of samples per period of the fastest line
 EXCITED = 3.0  # a line of the torque must exceed its unexcited neighbors by this factor, in the median over the lines
+GAP = 0.5  # longest gap between samples, in periods of the fastest line
+MOVED = 3.0  # another motor counts as moving at a line if its amplitude exceeds its noise by this factor
 NEIGHBORS = 6  # number of unexcited lines next to an excited one from which its noise is estimated
 LOWEST = (
     4  # lowest line, in periods per slide, that counts as a neighbor: below, ramps and drift leak into the spectrum
 )
-LINEAR = 0.03  # least standard deviation of a response, relative: friction is not exactly constant
+# least standard deviation of a response, relative, from the elastic twins 0 to 3: friction is not exactly constant
+LINEAR = 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +27,8 @@ class Slides:
     Attributes:
         joint: (W,) index of the sliding joint. q: (W, n) rad, mean angles. speed: (W,) rad/s, mean speed.
         angles: (W, F, n) rad, amplitudes of all motor angles. torque: (W, F) Nm, of the sliding joint's command.
-        sigma: (W, F) rad/Nm, standard deviation of `response`.
+            The amplitude of another motor is 0 where it is not clear of noise.
+        sigma: (W, F) rad/Nm, standard deviation of the real and of the imaginary part of `response`.
     """
 
     joint: np.ndarray
@@ -44,33 +48,47 @@ class Slides:
 def slides_of(recording: Recording) -> Slides:
     """Return the spectra of a recording of slides; each trajectory is a slide of one joint for PERIOD_S or more.
 
+    Slides whose torque has no multisine are dropped; lost samples are interpolated.
+
     Raises:
-        UserError: a slide is too short, or its torque has no multisine; the sampling is too slow or irregular; or a
-            joint has no slide.
+        UserError: a slide is too short, the sampling is too slow or has gaps, or a joint has no slide with the
+            multisine.
     """
-    rows = []
+    rows, faint = [], dict[int, float]()
     for stretch in recording.stretches:
         t, q, tau = recording.t[stretch], recording.q[stretch], recording.tau[stretch]
         name = f"data.gears: trajectory {int(recording.trajectory[stretch.start])}"
         step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
-        count = round(PERIOD_S / step) if np.isfinite(step) else 0
-        if len(t) < count + 1 or count == 0:
-            raise UserError(f"{name} lasts {t[-1] - t[0]:.3g} s, expected a steady slide of {PERIOD_S:g} s or more")
+        if t[-1] - t[0] < PERIOD_S - 0.5 * step or not np.isfinite(step):
+            raise UserError(f"{name} lasts {t[-1] - t[0]:.4g} s, expected a steady slide of {PERIOD_S:g} s or more")
         if (least := RATE * LINES_HZ[-1]) > 1 / step:
-            raise UserError(
-                f"{name}: {1 / step:.4g} Hz, expected {least:g} Hz or more for lines to {LINES_HZ[-1]:g} Hz"
-            )
-        if np.abs(np.diff(t[: count + 1]) - step).max() > 0.5 * step:
-            raise UserError(f"{name}: the time steps vary; expected every sample of {1e3 * step:g} ms")
-        rows.append(_spectra(t[: count + 1], q[: count + 1], tau[:count], name))
-    slides = Slides(*(np.array(x) for x in zip(*rows, strict=True)))
-    if missing := sorted(set(range(recording.n_joints)) - set(slides.joint.tolist())):
-        raise UserError(f"data.gears: no slide of joint {missing[0] + 1}; every joint must slide in turn")
-    return slides
+            lines = f"for lines to {LINES_HZ[-1]:g} Hz"
+            raise UserError(f"{name}: {1 / step:.4g} Hz, expected {least:g} Hz or more {lines}")
+        if (gap := float(np.diff(t).max())) > GAP / LINES_HZ[-1]:
+            raise UserError(f"{name}: a gap of {1e3 * gap:.3g} ms, allowed up to {1e3 * GAP / LINES_HZ[-1]:.2g} ms")
+        at = np.linspace(0.0, PERIOD_S, round(PERIOD_S / step) + 1)
+        q, tau = (np.stack([np.interp(at, t - t[0], x) for x in values.T], 1) for values in (q, tau))
+        joint, clear, row = _spectra(q, tau[:-1])
+        if clear < EXCITED:
+            faint[joint] = clear
+        else:
+            rows.append(row)
+    found = {row[0] for row in rows}
+    for joint in range(recording.n_joints):
+        if joint not in found:
+            why = "every joint must slide in turn"
+            if joint in faint:
+                why = f"the lines of its torque exceed their neighbors {faint[joint]:.2g} times, expected {EXCITED:g}"
+            raise UserError(f"data.gears: no slide of joint {joint + 1} with the multisine of data.gears: {why}")
+    return Slides(*(np.array(x) for x in zip(*rows, strict=True)))
 
 
-def _spectra(t: np.ndarray, q: np.ndarray, tau: np.ndarray, name: str) -> tuple:
-    """Return one row of each field of `Slides` from a slide with end point: t (N + 1,), q (N + 1, n), tau (N, n)."""
+def _spectra(q: np.ndarray, tau: np.ndarray) -> tuple[int, float, tuple]:
+    """Return a slide's joint, the median ratio of its torque's lines to their neighbors, and a row of `Slides`.
+
+    Args:
+        q: (N + 1, n) rad, angles during one period, with its end. tau: (N, n) Nm, commands.
+    """
     count, joint = len(tau), int(np.ptp(q, axis=0).argmax())
     line = np.linspace(0.0, 1.0, count + 1)[:, None] * (q[-1] - q[0])  # a constant speed has no spectrum of its own
     angles = np.fft.rfft(q[:-1] - line[:-1], axis=0) * 2 / count
@@ -78,16 +96,13 @@ def _spectra(t: np.ndarray, q: np.ndarray, tau: np.ndarray, name: str) -> tuple:
     lines = np.round(LINES_HZ * PERIOD_S).astype(int)
     others = np.setdiff1d(np.arange(LOWEST, int(1.25 * lines[-1])), lines)
     near = others[np.argsort(np.abs(others - lines[:, None]), axis=1, kind="stable")[:, :NEIGHBORS]]
-    seen = np.abs(torque[lines]) / np.sqrt((np.abs(torque[near]) ** 2).mean(1))
-    if (clear := float(np.median(seen))) < EXCITED:
-        raise UserError(
-            f"{name}: the torque of joint {joint + 1} does not have the multisine of data.gears; its lines exceed "
-            f"their neighbors {clear:.2g} times, expected {EXCITED:g} or more"
-        )
-    noise = np.sqrt((np.abs(angles[near, joint]) ** 2).mean(1)) / np.abs(torque[lines])
-    sigma = np.hypot(noise, LINEAR * np.abs(angles[lines, joint] / torque[lines]))
-    speed = float(q[-1, joint] - q[0, joint]) / float(t[-1] - t[0])
-    return joint, q.mean(0), speed, angles[lines], torque[lines], sigma
+    clear = float(np.median(np.abs(torque[lines]) / np.sqrt((np.abs(torque[near]) ** 2).mean(1))))
+    noise = np.sqrt((np.abs(angles[near]) ** 2).mean(1))  # (F, n), of complex amplitudes
+    moved, own = np.where(np.abs(angles[lines]) > MOVED * noise, angles[lines], 0.0), angles[lines, joint]
+    moved[:, joint] = own
+    sigma = np.hypot(noise[:, joint] / np.sqrt(2.0), LINEAR * np.abs(own)) / np.abs(torque[lines])
+    speed = float(q[-1, joint] - q[0, joint]) / PERIOD_S
+    return joint, clear, (joint, q.mean(0), speed, moved, torque[lines], sigma)
 
 
 @dataclass(frozen=True, eq=False)
