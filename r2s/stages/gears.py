@@ -6,7 +6,6 @@ from r2s.stages.build import console
 from r2s.stages.data import check_data, read_file
 
 ALONE = "identify the gears first, then name their run folder: identify.gears.stiffness=RUN_FOLDER"
-
 OTHERS = (
     *("path", "validation", "ramps", "presses", "contact", "contact_validation"),
     *("loaded", "declared_payload", "payload", "excitation"),

@@ -21,7 +21,7 @@ from r2s.recordings.recording import Recording
 
 DRAWS = 400  # posterior draws
 FTOL, XTOL = 1e-5, 1e-4  # a search ends when a step changes the cost or x by less than this share
-MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 7
+MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 4
 STIFF = np.log(20.0)  # if a gear is not determined, a second search begins with gears that resonate above all lines
 # Prior: mean and standard deviation, of the logarithm unless stated otherwise. Wide; no source gives these values for
 # a robot, and they matter only for light wrists, whose motors hardly feel the link.

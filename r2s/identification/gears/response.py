@@ -16,7 +16,7 @@ NEIGHBORS = 6  # number of unexcited lines next to an excited one from which its
 LOWEST = (
     4  # lowest line, in periods per slide, that counts as a neighbor: below, ramps and drift leak into the spectrum
 )
-# least standard deviation of a response, relative, from the elastic twins 0 to 3: friction is not exactly constant
+# least standard deviation of a response, relative, from the elastic twins 1 to 3: friction is not exactly constant
 LINEAR = 0.06
 
 
