@@ -348,6 +348,8 @@ WRONG = {
     "data=recording data.gears=a.npz data.path=b.npz calibration=x": "data.gears: cannot be combined with data.path",
     "data.gears=true data.torque=measured calibration=x": "data.gears: gears need commanded torque",
     "data.gears=true identify.gears.stiffness=1e4 calibration=x": "data.gears: identifies the stiffness that",
+    "data=recording data.contact=5 calibration=x": "data.contact: expected a file, got 5",
+    "data=recording data.loaded=true calibration=x": "data.loaded: expected a file, got True",
     "stage=pipeline data.gears=true": "data.gears: stage=pipeline identifies the arm from free motion",
     "data=recording data.gears=nowhere.npz calibration=x": "nowhere.npz",
     "data=recording data.gears=a.npz data.torque=measured calibration=x": "gears need commanded torque",

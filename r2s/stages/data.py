@@ -147,6 +147,9 @@ def file_data(cfg, path=None):
     for key in ("path", "validation"):
         if isinstance(given[key], list | dict):
             raise UserError(f"data.{key}: expected one file here, got {len(given[key])}; give it as data.{key}=FILE")
+    for key in ("contact", "contact_validation", "loaded", "gears"):
+        if given.get(key) and not isinstance(given[key], str):
+            raise UserError(f"data.{key}: expected a file, got {given[key]!r}")
     given |= {k: str(located(str(given[k]))) for k in ("path", "validation", "ramps") if given[k]}
     if given.get("contact") and given["torque"] is None:
         given["torque"] = "commanded"
