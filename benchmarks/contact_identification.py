@@ -157,7 +157,7 @@ def identify_gears(variant: str, seed: int) -> tuple[Path, Path]:
 
 def gear_error(run: Path, variant: str, seed: int) -> str:
     """Return the largest error, %, of the identified stiffness among the strong joints."""
-    stiffness = load_gears(run, ROBOT, "slides")[0]
+    stiffness = load_gears(run, ROBOT, "slides")["stiffness"]
     true = make_twin(ROBOT, variant=variant, seed=seed)._hidden[STIFF]
     strong = ROBOT.tau_max > 0.5 * ROBOT.tau_max.max()
     error = (100 * (stiffness / true - 1.0))[strong]

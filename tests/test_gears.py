@@ -14,7 +14,7 @@ from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twins.elastic_joints import STIFF
 from r2s.arm.twins.elastic_twin import ElasticTwin
 from r2s.errors import UserError
-from r2s.excitation.motion_checks import check_motion
+from r2s.excitation.motion_checks import check_derivatives, check_motion
 from r2s.excitation.multisine import (
     LINES_HZ,
     PERIOD_S,
@@ -71,7 +71,8 @@ def planned():
     """Return a recording of slides without any response to the multisine."""
     q, tau = [], []
     for j in range(PANDA.n):
-        motion, wave = gear_motion(PANDA, j), multisine(PANDA, j)
+        motion = gear_motion(PANDA, j)
+        wave = multisine(PANDA, j, motion)
         for rows in slides():
             q.append(motion.q[rows])
             tau.append(wave[rows, None] * np.eye(PANDA.n)[j])
@@ -169,7 +170,9 @@ def test_every_shipped_robot_can_slide(name):
     robot = load_robot(**conf(f"robot/{name}"))
     check_gear_motions(robot)
     for j in range(robot.n):
-        motion, torque = gear_motion(robot, j), multisine(robot, j)
+        motion = gear_motion(robot, j)
+        torque = multisine(robot, j, motion)
+        check_derivatives(robot, motion)
         assert np.abs(torque).max() <= TORQUE_SHARE * robot.tau_max[j] * (1 + 1e-9)
         fade = 1.05  # the fade adds a little to the rate
         assert np.abs(np.diff(torque)).max() / SIM_DT <= fade * RATE_SHARE * robot.dtau_max[j]
@@ -181,7 +184,7 @@ def test_every_shipped_robot_can_slide(name):
 def test_the_multisine_has_its_lines_alone():
     """In the steady slides, all power is at LINES_HZ."""
     for rows in slides():
-        spectrum = np.abs(np.fft.rfft(multisine(PANDA, 1)[rows][:-1]))
+        spectrum = np.abs(np.fft.rfft(multisine(PANDA, 1, gear_motion(PANDA, 1))[rows][:-1]))
         lines = np.round(LINES_HZ * PERIOD_S).astype(int)
         rest = np.delete(spectrum, lines)
         assert rest.max() < 1e-9 * spectrum[lines].min()
@@ -242,10 +245,10 @@ def test_a_few_lost_samples_change_little(recording):
 def test_the_file_gives_back_the_gears(tmp_path, found):
     """To six digits; files of another arm, and others, are refused in one line."""
     save_gears(tmp_path / "gears.yaml", PANDA, found, {"run": "here"})
-    stiffness, spread, determined = load_gears(tmp_path, PANDA, "identify.gears.stiffness")
-    assert determined.all()
-    np.testing.assert_allclose(stiffness, found.drives.stiffness, rtol=1e-5)
-    np.testing.assert_allclose(spread, found.spread, rtol=1e-5)
+    gears = load_gears(tmp_path, PANDA, "identify.gears.stiffness")
+    assert gears["determined"].all()
+    np.testing.assert_allclose(gears["stiffness"], found.drives.stiffness, rtol=1e-5)
+    np.testing.assert_allclose(gears["spread"], found.spread, rtol=1e-5)
     other = r"^identify\.gears\.stiffness: expected gears of 'iiwa14' \(7 joints\), got 'panda' \(7\) in "
     with pytest.raises(UserError, match=other):
         load_gears(tmp_path, load_robot(**conf("robot/iiwa14")), "identify.gears.stiffness")
@@ -264,7 +267,7 @@ def test_identified_gears_keep_their_variance():
     """Each gear's prior has its own standard deviation, part of which all gears share."""
     spread = np.linspace(0.02, 0.1, PANDA.n)
     all_seen = np.ones(PANDA.n, dtype=bool)
-    gears = identified_gears(PANDA.tau_max, 150.0 * PANDA.tau_max, spread, all_seen)
+    gears = identified_gears(PANDA.tau_max, stiffness=150.0 * PANDA.tau_max, spread=spread, determined=all_seen)
     np.testing.assert_allclose(gears.scatter**2 + (gears.width / gears.center) ** 2, spread**2)
     space = SurfaceSpace(np.zeros(3), np.eye(3)[2], PANDA.tau_max, gears)
     u, weight = space.prior(9 + PANDA.n)
@@ -277,11 +280,12 @@ def test_identified_gears_keep_their_variance():
 def test_gears_that_slides_did_not_determine_are_like_the_others():
     """Their stiffness in the file counts for nothing; with less than half determined, there is no prior."""
     seen = np.arange(PANDA.n) < 4
-    stiffness = np.where(seen, 150.0, 1.0) * PANDA.tau_max
-    gears = identified_gears(PANDA.tau_max, stiffness, np.full(PANDA.n, 0.02), seen)
+    found = {"stiffness": np.where(seen, 150.0, 1.0) * PANDA.tau_max, "spread": np.full(PANDA.n, 0.02)}
+    gears = identified_gears(PANDA.tau_max, **found, determined=seen)
     np.testing.assert_allclose(gears.center * gears.shape, 1 / 150.0)
     assert gears.scatter[4:].min() > 10 * gears.scatter[:4].max()
-    assert identified_gears(PANDA.tau_max, stiffness, np.full(PANDA.n, 0.02), np.arange(PANDA.n) < 3) is None
+    with pytest.raises(UserError, match=r"^stiffness: slides determined 3 of 7 gears, expected half$"):
+        identified_gears(PANDA.tau_max, **found, determined=np.arange(PANDA.n) < 3)
 
 
 @pytest.fixture
@@ -304,9 +308,11 @@ def test_the_command_writes_gears_from_a_file(tmp_path, calibration, recording, 
     run = tmp_path / "identify" / "gears"
     assert "joint 7" in done.stdout
     assert all((run / name).is_file() for name in ("parameters.yaml", "posterior.npz", "figures/gears.png"))
-    stiffness, spread, _ = load_gears(run, PANDA, "gears")
-    np.testing.assert_allclose(stiffness, found.drives.stiffness, rtol=1e-4)  # parameters.yaml rounds the arm
-    np.testing.assert_allclose(spread, found.spread, rtol=1e-2)
+    gears = load_gears(run, PANDA, "gears")
+    np.testing.assert_allclose(
+        gears["stiffness"], found.drives.stiffness, rtol=1e-4
+    )  # parameters.yaml rounds the arm
+    np.testing.assert_allclose(gears["spread"], found.spread, rtol=1e-2)
 
 
 @pytest.mark.slow
@@ -336,8 +342,8 @@ def test_the_command_lets_a_twin_slide(tmp_path, calibration):
     done = r2s("stage=identify", *calibration, "arm.variant=elastic", "arm.seed=3", "data.gears=true", "name=gears")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "identify" / "gears" / "gears.npz").is_file()
-    stiffness, spread, _ = load_gears(tmp_path / "identify" / "gears", PANDA, "gears")
-    assert (np.abs(np.log(stiffness / ElasticTwin(PANDA, 3)._hidden[STIFF])) < 3 * spread).all()
+    gears = load_gears(tmp_path / "identify" / "gears", PANDA, "gears")
+    assert (np.abs(np.log(gears["stiffness"] / ElasticTwin(PANDA, 3)._hidden[STIFF])) < 3 * gears["spread"]).all()
 
 
 WRONG = {

@@ -49,10 +49,11 @@ def record_gear_motions(
     robot, share = arm.robot, speed_share(arm)
     parts: list[tuple[np.ndarray, ...]] = []
     for joint in range(robot.n):
-        added = np.zeros((len(gear_motion(robot, joint, share).t), robot.n))
-        added[:, joint] = multisine(robot, joint, share)
+        motion = gear_motion(robot, joint, share)
+        added = np.zeros_like(motion.q)
+        added[:, joint] = multisine(robot, joint, motion)
         try:
-            out = record(arm, gear_motion(robot, joint, share), added=added, timing=timing)
+            out = record(arm, motion, added=added, timing=timing)
         except ArmStopped as stop:
             stop.recording = _recording(parts, robot.name) if parts else None
             raise

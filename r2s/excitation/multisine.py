@@ -7,13 +7,15 @@ the link, and the response reveals the gear's stiffness (r2s/identification/gear
 """
 
 import numpy as np
+from scipy.integrate import cumulative_simpson
 
+from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
 from r2s.physics.rigid_body import mass_matrix
 from r2s.physics.robot import SIM_DT, Robot
 
 PERIOD_S = 2.0  # s, of the multisine; also the time of steady sliding in each leg
-LEGS = 4  # slides per joint, to and fro
+LEGS = 4  # slides per joint, to and fro; an even number
 RAMP_S, SETTLE_S = 0.5, 0.25  # s, to the sliding speed; until the tracking loop has settled (5 of its time constants)
 LEG_S = 2 * RAMP_S + SETTLE_S + PERIOD_S
 # Sliding speed / dq_max: 0.15 rad/s for a Panda's strong joints, above usual Stribeck velocities (0.01 to 0.1 rad/s)
@@ -37,27 +39,21 @@ def slide_speed(robot: Robot, joint: int, speed_share: float = 1.0) -> float:
 
 def gear_motion(robot: Robot, joint: int, speed_share: float = 1.0) -> Excitation:
     """Return a motion of one joint: LEGS slides to and fro at `slide_speed` about home; the other joints rest."""
-    rows = round(LEG_S / SIM_DT)
-    t = np.arange(LEGS * rows + 1) * SIM_DT
-    leg = np.minimum(np.arange(len(t)) // rows, LEGS - 1)
-    within = t - leg * LEG_S
-    speed = slide_speed(robot, joint, speed_share)
-    rise, fall = within / RAMP_S, (LEG_S - within) / RAMP_S
-    x = np.clip(np.minimum(rise, fall), 0.0, 1.0)
-    steady = np.clip(within - RAMP_S, 0.0, SETTLE_S + PERIOD_S)
-    area = RAMP_S * (x**6 - 3 * x**5 + 2.5 * x**4)  # integral of the velocity profile over a ramp
-    way = np.where(rise <= fall, area, RAMP_S - area) + steady
-    total = RAMP_S + SETTLE_S + PERIOD_S
-    forth = leg % 2 == 0
-    q = np.tile(robot.q_home, (len(t), 1))
-    dq, ddq = np.zeros_like(q), np.zeros_like(q)
-    half = 0.5 * speed * total
+    speed, t = slide_speed(robot, joint, speed_share), np.arange(round(LEG_S / SIM_DT)) * SIM_DT
+    rise = minimum_jerk(np.zeros(1), np.full(1, speed), RAMP_S, t[:, None])  # speed, acceleration, jerk
+    fall = minimum_jerk(np.zeros(1), np.full(1, speed), RAMP_S, t[:, None] - (LEG_S - RAMP_S))
+    v, a = ((up - down)[:, 0] for up, down in zip(rise[:2], fall[:2], strict=True))
+    way = cumulative_simpson(v, dx=SIM_DT, initial=0.0)
+    half = 0.5 * speed * (LEG_S - RAMP_S)
     center = np.clip(robot.q_home[joint], robot.q_min[joint] + MARGIN + half, robot.q_max[joint] - MARGIN - half)
-    q[:, joint] = center + speed * (np.where(forth, way, total - way) - 0.5 * total)
-    sign = np.where(forth, 1.0, -1.0)
-    dq[:, joint] = sign * speed * (6 * x**5 - 15 * x**4 + 10 * x**3)
-    ddq[:, joint] = sign * np.where(rise <= fall, 1.0, -1.0) * speed / RAMP_S * (30 * x**4 - 60 * x**3 + 30 * x**2)
-    return Excitation(t, q, dq, ddq)
+    forth = np.stack([center - half + way, v, a])
+    back = np.stack([center + half - way, -v, -a])
+    end = [[center - half], [0.0], [0.0]]
+    legs = np.concatenate([np.tile(np.concatenate([forth, back], 1), LEGS // 2), end], 1)
+    q, dq, ddq = np.zeros((3, legs.shape[1], robot.n))
+    q[:] = robot.q_home
+    q[:, joint], dq[:, joint], ddq[:, joint] = legs
+    return Excitation(np.arange(len(q)) * SIM_DT, q, dq, ddq)
 
 
 def slides() -> list[slice]:
@@ -66,15 +62,14 @@ def slides() -> list[slice]:
     return [slice(k, k + rows + 1) for k in (leg * round(LEG_S / SIM_DT) + first for leg in range(LEGS))]
 
 
-def multisine(robot: Robot, joint: int, speed_share: float = 1.0) -> np.ndarray:
-    """Return the multisine torque (T,) Nm for all rows of `gear_motion`; it fades in and out with the speed.
+def multisine(robot: Robot, joint: int, motion: Excitation) -> np.ndarray:
+    """Return the multisine torque (T,) Nm for all rows of a `gear_motion`; it fades in and out with the speed.
 
     Light joints get a multisine of constant velocity amplitude, heavy joints one of constant torque rate.
     """
-    motion = gear_motion(robot, joint, speed_share)
     inertia = 1 / np.linalg.inv(mass_matrix(robot, robot.q_home[None])[0])[joint, joint]  # other joints free
     omega = 2 * np.pi * LINES_HZ
-    speed = slide_speed(robot, joint, speed_share)
+    speed = np.abs(motion.dq[:, joint]).max()
     rate = RATE_SHARE * robot.dtau_max[joint] / np.sqrt(len(omega) / 2)
     amplitude = np.minimum(RIPPLE * speed * inertia * omega, rate / omega)
     t = np.arange(round(PERIOD_S / SIM_DT)) * SIM_DT

@@ -90,6 +90,8 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
             found = summary["gears"]
             count, seen = len(found["identifiable"]), sum(found["identifiable"])
             return f"gears up to {max(found['stiffness_Nm_per_rad']):.3g} Nm/rad, {seen} of {count} determined"
+        if "payload" in summary:
+            return f"payload {summary['payload']['mass_kg']:.3g} kg"
         found = summary["contact"]
         return f"surface {found['slope_N_per_m']:.3g} N/m, friction {found['friction']:.2g}"
     if stage == "identify":

@@ -249,11 +249,16 @@ def opened_source(cfg, robot, noise):
     yield SimulatedArm(robot, dynamics, **sensors, seed=cfg.data.excitation_seed + noise)
 
 
-def within_speed_share(cfg, robot):
-    """Return the robot for planning a recorded motion, with the speed limits scaled by arm.speed_share."""
+def planned_speed_share(cfg):
+    """Return arm.speed_share for planning a recorded motion; 1 if no arm records."""
     share = cfg.arm.get("speed_share", 1.0) if cfg.data.kind == "arm" else 1.0
     check_number("arm.speed_share", share, "(0, 1]")
-    return replace(robot, dq_max=share * robot.dq_max)
+    return share
+
+
+def within_speed_share(cfg, robot):
+    """Return the robot for planning a recorded motion, with the speed limits scaled by arm.speed_share."""
+    return replace(robot, dq_max=planned_speed_share(cfg) * robot.dq_max)
 
 
 def check_source(cfg, robot):

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import Stopped, UserError
+from r2s.errors import UserError
 from r2s.files import located
 from r2s.stages.build import console
 from r2s.stages.data import read_file
+from r2s.stages.recordings import recorded_once
 
 ARM = ("parameters.yaml", "posterior.npz")
 
@@ -65,15 +66,9 @@ def stated_stiffness(cfg, robot):
     if not isinstance(gears, dict):
         raise UserError(f"identify.gears: expected identify.gears.stiffness= and .accuracy=, got {gears!r}")
     if isinstance(folder := gears.get("stiffness"), str):
+        called(stated_gears, "identify.gears", gears | {"stiffness": None}, robot.tau_max)  # checks the rest
         found = load_gears(located(folder), robot, "identify.gears.stiffness")
-        try:
-            prior = identified_gears(robot.tau_max, *found)
-        except UserError as error:
-            raise UserError(f"identify.gears.{error} ({folder})") from None
-        if prior is None:
-            few = "the slides determined fewer than half of the gears"
-            raise UserError(f"identify.gears.stiffness: {few} in {folder}")
-        return prior
+        return called(identified_gears, "identify.gears", found, robot.tau_max)
     return called(stated_gears, "identify.gears", gears, robot.tau_max)
 
 
@@ -101,37 +96,19 @@ def press_parts(cfg, robot, arm):
 
 
 def pressed_surface(cfg, run, arm, plan):
-    """Let the arm press on the surface, and return the `ContactData`; a resumed run reads its existing recording.
-
-    Raises:
-        Stopped: the arm stopped; contact_until_stop.npz contains the paths completed before the stop, if any.
-    """
-    from r2s.arm.interface import ArmStopped
+    """Let the arm press on the surface, and return the `ContactData`; see `recorded_once`."""
     from r2s.arm.presses import record_presses
-    from r2s.arm.realtime import Timing
-    from r2s.progress import Progress
-    from r2s.recordings.readers import read
     from r2s.stages.build import opened_arm
 
-    path = run.folder / "contact.npz"
-    if not path.is_file():
-        progress, timing = Progress("press and slide on the surface", in_cycle=True), Timing()
-        dynamics = arm.space.dynamics(arm.x)
+    def press(progress, timing):
         how = {"seed": cfg.data.excitation_seed, "timing": timing}
-        try:
-            with opened_arm(cfg, plan.model.robot, 3, plan) as connected:
-                show = lambda k, n: progress(k / n, f"{k} paths")  # noqa: E731
-                out = record_presses(connected, plan, dynamics, cfg.data.presses, **how, progress=show)
-        except ArmStopped as stop:
-            if stop.recording is not None:
-                stop.recording.save(run.folder / "contact_until_stop.npz")
-            raise Stopped(f"while the arm pressed: {stop}; resume={run.folder} goes on") from None
-        finally:
-            for row in timing.table():
-                run.log("timing", {"motion": "contact", **row})
-        out.save(path)
-        progress.close(f"{out.duration:.1f} s of presses")
-    return ContactData(read(path, torque="commanded"), None, [path])
+        with opened_arm(cfg, plan.model.robot, 3, plan) as connected:
+            show = lambda k, n: progress(k / n, f"{k} paths")  # noqa: E731
+            dynamics = arm.space.dynamics(arm.x)
+            return record_presses(connected, plan, dynamics, cfg.data.presses, **how, progress=show)
+
+    recording = recorded_once(run, "contact", "press and slide on the surface", press)
+    return ContactData(recording, None, [run.folder / "contact.npz"])
 
 
 def calibrated_arm(cfg, robot):

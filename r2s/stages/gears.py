@@ -1,9 +1,10 @@
 """stage=identify data.gears: identify the stiffness of elastic gears; write gears.yaml."""
 
-from r2s.errors import Stopped, UserError
+from r2s.errors import UserError
 from r2s.files import located
-from r2s.stages.build import console
-from r2s.stages.data import check_data, read_file
+from r2s.stages.build import check_source, console, opened_source, planned_speed_share
+from r2s.stages.data import check_data, file_data, read_file
+from r2s.stages.recordings import recorded_once
 
 ALONE = "identify the gears first, then name their run folder: identify.gears.stiffness=RUN_FOLDER"
 OTHERS = (
@@ -29,14 +30,11 @@ def check_alone(cfg):
         raise UserError("data.gears: give the arm, identified from free motion, by calibration=RUN_FOLDER")
 
 
-def gear_file(robot, file):
-    """Return the recording in data.gears and its path; file: `FileData` of the config.
-
-    Raises:
-        UserError: the file is invalid.
-    """
+def slides_in_file(cfg, robot):
+    """Return the recording in data.gears=FILE and its path; raise UserError if the file is invalid."""
     from r2s.identification.checks import check_recording
 
+    file = file_data(cfg, cfg.data.gears)
     path = located(file.gears)
     recording = read_file(robot, file, path, torque="commanded")
     check_recording(robot, recording)
@@ -46,44 +44,22 @@ def gear_file(robot, file):
 def check_motions(cfg, robot):
     """Raise UserError if the settings of data=arm are invalid, or if a joint cannot slide about home."""
     from r2s.arm.gear_motions import check_gear_motions
-    from r2s.stages.build import check_source, within_speed_share
 
     check_data(cfg)
     check_source(cfg, robot)
-    share = within_speed_share(cfg, robot).dq_max[0] / robot.dq_max[0]
-    check_gear_motions(robot, share)
+    check_gear_motions(robot, planned_speed_share(cfg))
 
 
 def recorded_slides(cfg, run, robot):
-    """Let the arm slide joint by joint, and return the recording; a resumed run reads its existing recording.
-
-    Raises:
-        Stopped: the arm stopped; gears_until_stop.npz contains the slides of the joints completed before, if any.
-    """
+    """Let the arm slide joint by joint, and return the recording; see `recorded_once`."""
     from r2s.arm.gear_motions import record_gear_motions
-    from r2s.arm.interface import ArmStopped
-    from r2s.arm.realtime import Timing
-    from r2s.progress import Progress
-    from r2s.recordings.readers import read
-    from r2s.stages.build import opened_source
 
-    path = run.folder / "gears.npz"
-    if not path.is_file():
-        progress, timing = Progress("slide joint by joint", in_cycle=True), Timing()
-        try:
-            with opened_source(cfg, robot, 4) as arm:
-                show = lambda k, n: progress(k / n, f"{k} joints")  # noqa: E731
-                out = record_gear_motions(arm, progress=show, timing=timing)
-        except ArmStopped as stop:
-            if stop.recording is not None:
-                stop.recording.save(run.folder / "gears_until_stop.npz")
-            raise Stopped(f"while the joints slid: {stop}; resume={run.folder} starts again") from None
-        finally:
-            for row in timing.table():
-                run.log("timing", {"motion": "gears", **row})
-        out.save(path)
-        progress.close(f"{out.duration:.1f} s of slides")
-    return read(path, torque="commanded")
+    def slide(progress, timing):
+        with opened_source(cfg, robot, 4) as arm:
+            show = lambda k, n: progress(k / n, f"{k} joints")  # noqa: E731
+            return record_gear_motions(arm, progress=show, timing=timing)
+
+    return recorded_once(run, "gears", "slide joint by joint", slide)
 
 
 def identify_gears(cfg, run, arm, recording):

@@ -12,7 +12,7 @@ from r2s.stages.contact import (
     stated_stiffness,
 )
 from r2s.stages.data import file_data
-from r2s.stages.gears import check_alone, check_motions, gear_file, identify_gears, recorded_slides
+from r2s.stages.gears import check_alone, check_motions, identify_gears, recorded_slides, slides_in_file
 from r2s.stages.payload import identify_load, loaded_data, torque_of_calibration
 
 
@@ -43,45 +43,37 @@ def with_known_arm(cfg):
 def identify_with_known_arm(cfg, overrides, key):
     """Identify gears, a surface or a payload with the model of `calibration=`; write the corresponding file."""
     robot = make_robot(cfg)
+    files, entry, identified = _prepared(cfg, robot, key)
+    with open_run(cfg, overrides, files) as run:
+        found = identified(run)
+        keep_calibration(cfg, run)
+        run.summary({entry: found})
+    print(f"written: {run.folder}")
+
+
+def _prepared(cfg, robot, key):
+    """Check all inputs; return the files to read, the key in summary.json, and a function of the run.
+
+    The function records what no file contains, identifies, writes files and tables, and returns the entry.
+    """
     if key == "gears":
-        _identify_gears(cfg, overrides, robot)
-        return
+        if cfg.data.kind == "recording":
+            slides, path = slides_in_file(cfg, robot)
+            arm = calibrated_arm(cfg, robot)
+            return [path], key, lambda run: identify_gears(cfg, run, arm, slides)
+        check_motions(cfg, robot)
+        arm = calibrated_arm(cfg, robot)
+        return [], key, lambda run: identify_gears(cfg, run, arm, recorded_slides(cfg, run, robot))
     stated_stiffness(cfg, robot)
     if key == "presses":
         arm = calibrated_arm(cfg, robot)
         plan = press_parts(cfg, robot, arm)
-        with open_run(cfg, overrides) as run:
-            entry = identify_surface(cfg, run, arm, pressed_surface(cfg, run, arm, plan))
-            keep_calibration(cfg, run)
-            run.summary({"contact": entry})
-        print(f"written: {run.folder}")
-        return
+        return [], "contact", lambda run: identify_surface(cfg, run, arm, pressed_surface(cfg, run, arm, plan))
     file = file_data(cfg, cfg.data[key])
     if key == "contact":
         data = contact_data(cfg, robot, file)
-    else:
-        data = loaded_data(cfg, robot, file, torque_of_calibration(cfg, file.torque))
+        arm = calibrated_arm(cfg, robot)
+        return data.files, key, lambda run: identify_surface(cfg, run, arm, data)
+    data = loaded_data(cfg, robot, file, torque_of_calibration(cfg, file.torque))
     arm = calibrated_arm(cfg, robot)
-    with open_run(cfg, overrides, data.files) as run:
-        entry = (identify_surface if key == "contact" else identify_load)(cfg, run, arm, data)
-        keep_calibration(cfg, run)
-        run.summary({"contact" if key == "contact" else "payload": entry})
-    print(f"written: {run.folder}")
-
-
-def _identify_gears(cfg, overrides, robot):
-    """Identify the gears from data.gears=FILE, or from a motion of the arm; write gears.yaml."""
-    recording, files = None, []
-    if cfg.data.kind == "recording":
-        recording, path = gear_file(robot, file_data(cfg, cfg.data.gears))
-        files = [path]
-    else:
-        check_motions(cfg, robot)
-    arm = calibrated_arm(cfg, robot)
-    with open_run(cfg, overrides, files) as run:
-        if recording is None:
-            recording = recorded_slides(cfg, run, robot)
-        entry = identify_gears(cfg, run, arm, recording)
-        keep_calibration(cfg, run)
-        run.summary({"gears": entry})
-    print(f"written: {run.folder}")
+    return data.files, "payload", lambda run: identify_load(cfg, run, arm, data)

@@ -1,4 +1,4 @@
-"""Find and read the recordings for stage=identify and `r2s check`; each file has one kind of torque.
+"""Find, read or make the recordings for stage=identify and `r2s check`; each file has one kind of torque.
 
 `data.path` and `data.validation` each name a file, a pattern such as "logs/*.csv", a dict such as
 {path: FILE, torque: motor}, or a list of these. A key of the dict overrides the setting of the same name in `data`.
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, choices, nearest, nearest_file
+from r2s.errors import Stopped, UserError, choices, nearest, nearest_file
 from r2s.files import located
 from r2s.stages.data import check_other_motion, file_data, read_file
 from r2s.stages.parts import plain
@@ -163,3 +163,35 @@ def whole(recordings, label=""):
 
     own = [replace(r, name=r.name or label) for label, r in recordings.items()]
     return joined(own) if len(own) > 1 else next(iter(recordings.values()))
+
+
+def recorded_once(run, name, label, record):
+    """Return the recording NAME.npz of a run; record it unless the run, if resumed, already has it.
+
+    Args:
+        label: what the arm does, for progress and messages.
+        record: called with `Progress` and `Timing`; returns the recording, of commanded torque.
+
+    Raises:
+        Stopped: the arm stopped; NAME_until_stop.npz contains the motions completed before the stop, if any.
+    """
+    from r2s.arm.interface import ArmStopped
+    from r2s.arm.realtime import Timing
+    from r2s.progress import Progress
+    from r2s.recordings.readers import read
+
+    path = run.folder / f"{name}.npz"
+    if not path.is_file():
+        progress, timing = Progress(label, in_cycle=True), Timing()
+        try:
+            out = record(progress, timing)
+        except ArmStopped as stop:
+            if stop.recording is not None:
+                stop.recording.save(run.folder / f"{name}_until_stop.npz")
+            raise Stopped(f"{label}: {stop}; resume={run.folder} records again") from None
+        finally:
+            for row in timing.table():
+                run.log("timing", {"motion": name, **row})
+        out.save(path)
+        progress.close(f"{out.duration:.1f} s recorded")
+    return read(path, torque="commanded")

@@ -101,9 +101,9 @@ def _mean_deflection(deflection: np.ndarray, width: float) -> float:
 
 
 def identified_gears(
-    tau_max: np.ndarray, stiffness: np.ndarray, spread: np.ndarray, determined: np.ndarray
-) -> Gears | None:
-    """Return the prior of identified gears, or None if slides determined fewer than half of them.
+    tau_max: np.ndarray, *, stiffness: np.ndarray, spread: np.ndarray, determined: np.ndarray
+) -> Gears:
+    """Return the prior of identified gears.
 
     A gear that the slides did not determine deflects like the mean of the others. Half of the variance of the best
     known gear is common to all gears.
@@ -111,9 +111,12 @@ def identified_gears(
     Args:
         tau_max: (n,) Nm, largest torques of the joints. stiffness: (n,) Nm/rad. spread: (n,) relative standard
             deviation of the stiffness; at most WIDEST counts, because of the bound FARTHEST. determined: (n,) bool.
+
+    Raises:
+        UserError: slides determined fewer than half of the gears, or the gears are too soft.
     """
     if 2 * determined.sum() < len(determined):
-        return None
+        raise UserError(f"stiffness: slides determined {determined.sum()} of {len(determined)} gears, expected half")
     deflection = np.where(determined, tau_max / stiffness, (tau_max / stiffness)[determined].mean())
     spread = np.where(determined, np.minimum(spread, WIDEST), WIDEST)
     common = float(spread.min() / np.sqrt(2.0))

@@ -20,6 +20,7 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 DRAWS = 400  # posterior draws
+BLOCKS, STIFFNESS = 8, 1  # values per joint in a vector x: the fields of `Drives` and the link's tensor; index
 FTOL, XTOL = 1e-5, 1e-4  # a search ends when a step changes the cost or x by less than this share
 MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 4
 STIFF = np.log(20.0)  # if a gear is not determined, a second search begins with gears that resonate above all lines
@@ -67,7 +68,8 @@ class GearProblem:
 
     Attributes:
         slides: measured spectra. mass: (W, n, n) kg m^2, mass matrices of the links. tensors: (n, W, n, n) kg m^2,
-            their parts due to each link's inertia tensor. nominal: prior means.
+            their parts due to each link's inertia tensor.
+        rotor: (n,) kg m^2, stiffness: (n,) Nm/rad, prior medians.
         critical: (n,) critical damping of a gear per sqrt(stiffness). viscous: (n,) Nm s/rad, prior deviation.
         noise: factor (W, 1) on `slides.sigma`.
     """
@@ -75,19 +77,19 @@ class GearProblem:
     slides: Slides
     mass: np.ndarray
     tensors: np.ndarray
-    nominal: Drives
+    rotor: np.ndarray
+    stiffness: np.ndarray
     critical: np.ndarray
     viscous: np.ndarray
     noise: np.ndarray | float = 1.0
 
     def drives(self, x: np.ndarray) -> Drives:
         """Return the drives at x (8 n,)."""
-        rotor, stiff, damping, loop, viscous, delay, lag, _ = x.reshape(8, -1)
-        d = self.nominal
-        stiffness = d.stiffness * np.exp(DEFLECTION[1] * stiff)
+        rotor, stiff, damping, loop, viscous, delay, lag, _ = x.reshape(BLOCKS, -1)
+        stiffness = self.stiffness * np.exp(DEFLECTION[1] * stiff)
         critical = self.critical * np.sqrt(stiffness)
         return Drives(
-            rotor=d.rotor * np.exp(ROTOR[1] * rotor),
+            rotor=self.rotor * np.exp(ROTOR[1] * rotor),
             stiffness=stiffness,
             damping=critical * GEAR_DAMPING[0] * np.exp(GEAR_DAMPING[1] * damping),
             loop=critical * LOOP_DAMPING[0] * np.exp(LOOP_DAMPING[1] * loop),
@@ -98,7 +100,7 @@ class GearProblem:
 
     def response(self, x: np.ndarray) -> np.ndarray:
         """Return the response (W, F) rad/Nm at x (8 n,)."""
-        scale = np.exp(TENSOR * x.reshape(8, -1)[7]) - 1.0
+        scale = np.exp(TENSOR * x.reshape(BLOCKS, -1)[-1]) - 1.0
         return motor_response(self.slides, self.mass + np.tensordot(scale, self.tensors, 1), self.drives(x))
 
     def misfit(self, x: np.ndarray) -> np.ndarray:
@@ -125,11 +127,11 @@ def gear_problem(robot: Robot, dynamics: Dynamics, slides: Slides) -> GearProble
         tensors.append(masses(replace(dynamics, inertia=inertia), slides.q) - mass)
     own = 1 / np.diag(np.linalg.inv(masses(dynamics, robot.q_home[None])[0]))  # kg m^2, with all other joints free
     rotor = dynamics.armature + ROTOR[0] * own
-    zero = np.zeros(robot.n)
-    nominal = Drives(rotor, robot.tau_max / DEFLECTION[0], zero, zero, zero, zero, zero)
+    stiffness = robot.tau_max / DEFLECTION[0]
     speed = np.array([np.abs(slides.speed[slides.joint == i]).mean() for i in range(robot.n)])
     critical = 2 * np.sqrt(rotor * own / (rotor + own))
-    return GearProblem(slides, mass, np.array(tensors), nominal, critical, VISCOUS * dynamics.level / speed)
+    viscous = VISCOUS * dynamics.level / speed
+    return GearProblem(slides, mass, np.array(tensors), rotor, stiffness, critical, viscous)
 
 
 def identify_gears(
@@ -149,10 +151,10 @@ def identify_gears(
     problem = gear_problem(arm.robot, arm.space.dynamics(arm.x), slides)
     n = arm.robot.n
     report(0.1, "stiffness")
-    x, covariance, cost = _minimum(problem, np.zeros(8 * n))
+    x, covariance, cost = _minimum(problem, np.zeros(BLOCKS * n))
     if not _determined(covariance).all():
-        stiff = np.zeros((8, n))
-        stiff[1] = STIFF / DEFLECTION[1]
+        stiff = np.zeros((BLOCKS, n))
+        stiff[STIFFNESS] = STIFF / DEFLECTION[1]
         again = _minimum(problem, stiff.ravel())
         x = again[0] if again[2] < cost else x
     report(0.6, "intervals")
@@ -163,7 +165,7 @@ def identify_gears(
     x, covariance, _ = _minimum(problem, x)
     drives = problem.drives(x)
     rng = np.random.default_rng(seed)
-    spread = covariance[n : 2 * n, n : 2 * n] * DEFLECTION[1] ** 2 + MODEL**2 * np.eye(n)
+    spread = _of_stiffness(covariance) * DEFLECTION[1] ** 2 + MODEL**2 * np.eye(n)
     steps = rng.multivariate_normal(np.zeros(n), spread, DRAWS)
     return GearEstimate(
         drives, drives.stiffness * np.exp(steps), _determined(covariance), misfit, arm.robot.tau_max, slides,
@@ -171,10 +173,15 @@ def identify_gears(
     )  # fmt: skip
 
 
+def _of_stiffness(covariance: np.ndarray) -> np.ndarray:
+    """Return the covariance (n, n) of the stiffness values in x, given the covariance (8 n, 8 n) of x."""
+    n = len(covariance) // BLOCKS
+    return covariance.reshape(BLOCKS, n, BLOCKS, n)[STIFFNESS, :, STIFFNESS]
+
+
 def _determined(covariance: np.ndarray) -> np.ndarray:
     """Return (n,) bool: whether the data determine the stiffness, given the covariance (8 n, 8 n) of x."""
-    n = len(covariance) // 8
-    return np.diag(covariance)[n : 2 * n] < 1.0 / SHARPER**2  # the prior's variance is 1
+    return np.diag(_of_stiffness(covariance)) < 1.0 / SHARPER**2  # the prior's variance is 1
 
 
 def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

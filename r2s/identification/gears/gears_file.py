@@ -36,8 +36,8 @@ def save_gears(path: Path, robot: Robot, found: GearEstimate, source: Mapping[st
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
-def load_gears(folder: str | Path, robot: Robot, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return stiffness (n,) Nm/rad, its relative standard deviation (n,), and whether it was determined (n,).
+def load_gears(folder: str | Path, robot: Robot, where: str) -> dict[str, np.ndarray]:
+    """Return the arguments `stiffness`, `spread` and `determined` of `identified_gears`.
 
     folder: run folder, or gears.yaml. where: the option with which the user named it, for error messages.
 
@@ -48,15 +48,15 @@ def load_gears(folder: str | Path, robot: Robot, where: str) -> tuple[np.ndarray
     try:
         document = yaml.safe_load(path.read_text())
         found, of = document["stiffness"], str(document["robot"])
-        values = np.array(found["value"], dtype=float), np.array(found["relative_sd"], dtype=float)
-        if any(x.ndim != 1 or not (np.isfinite(x) & (x > 0)).all() for x in values):
+        out = {"stiffness": found["value"], "spread": found["relative_sd"]}
+        out = {name: np.array(values, dtype=float) for name, values in out.items()}
+        if any(x.ndim != 1 or not (np.isfinite(x) & (x > 0)).all() for x in out.values()):
             raise ValueError("expected a list of positive numbers")
-        determined = np.array(found["identifiable"], dtype=bool)
+        out["determined"] = np.array(found["identifiable"], dtype=bool)
     except (*DAMAGED, TypeError, AttributeError, yaml.YAMLError) as error:
         seen = " ".join(str(error).split())
         raise UserError(f"{where}: {path} is not a gears.yaml of r2s ({seen})") from None
-    if of != robot.name or any(x.shape != (robot.n,) for x in (*values, determined)):
-        raise UserError(
-            f"{where}: expected gears of '{robot.name}' ({robot.n} joints), got '{of}' ({len(values[0])}) in {path}"
-        )
-    return *values, determined
+    if of != robot.name or any(x.shape != (robot.n,) for x in out.values()):
+        expected, got = f"'{robot.name}' ({robot.n} joints)", f"'{of}' ({len(out['spread'])})"
+        raise UserError(f"{where}: expected gears of {expected}, got {got} in {path}")
+    return out

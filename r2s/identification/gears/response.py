@@ -13,9 +13,7 @@ EXCITED = 3.0  # a line of the torque must exceed its unexcited neighbors by thi
 GAP = 0.5  # longest gap between samples, in periods of the fastest line
 MOVED = 3.0  # another motor counts as moving at a line if its amplitude exceeds its noise by this factor
 NEIGHBORS = 6  # number of unexcited lines next to an excited one from which its noise is estimated
-LOWEST = (
-    4  # lowest line, in periods per slide, that counts as a neighbor: below, ramps and drift leak into the spectrum
-)
+LOWEST = 4  # periods per slide of the lowest neighbor; ramps and drift leak into lower lines
 # least standard deviation of a response, relative, from the elastic twins 1 to 3: friction is not exactly constant
 LINEAR = 0.06
 
