@@ -56,6 +56,7 @@ def _prepared(cfg, robot, key):
 
     The function records what no file contains, identifies, writes files and tables, and returns the entry.
     """
+    stated_stiffness(cfg, robot)  # checks identify.gears
     if key == "gears":
         if cfg.data.kind == "recording":
             slides, path = slides_in_file(cfg, robot)
@@ -64,7 +65,6 @@ def _prepared(cfg, robot, key):
         check_motions(cfg, robot)
         arm = calibrated_arm(cfg, robot)
         return [], key, lambda run: identify_gears(cfg, run, arm, recorded_slides(cfg, run, robot))
-    stated_stiffness(cfg, robot)
     if key == "presses":
         arm = calibrated_arm(cfg, robot)
         plan = press_parts(cfg, robot, arm)

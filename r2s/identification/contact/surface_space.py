@@ -116,7 +116,9 @@ def identified_gears(
         UserError: slides determined fewer than half of the gears, or the gears are too soft.
     """
     if 2 * determined.sum() < len(determined):
-        raise UserError(f"stiffness: slides determined {determined.sum()} of {len(determined)} gears, expected half")
+        raise UserError(
+            f"stiffness: slides determined {determined.sum()} of {len(determined)} gears, expected at least half"
+        )
     deflection = np.where(determined, tau_max / stiffness, (tau_max / stiffness)[determined].mean())
     spread = np.where(determined, np.minimum(spread, WIDEST), WIDEST)
     common = float(spread.min() / np.sqrt(2.0))
