@@ -38,7 +38,7 @@ ARMS = {  # N: momentum observer with the true parameters, moving and at rest, f
     "stribeck": (0.87, 1.94),
 }
 NOTE = (
-    "Normal force in contact, RMSE. The constants of the filter were chosen on these three arms and on twins 0 to 4; "
+    "Normal force in contact, RMSE. The constants of the filter were chosen on these three arms and on twins 0 to 5; "
     f"twins from {JUDGING['rigid'].start} (rigid) and {JUDGING['elastic'].start} (elastic) are for judging. fused: "
     "with the identified surface, and with the same surface moved by 0.3 mm along its normal. seen: share of "
     "time in motion with more than 5 N in which a contact is reported. A touch includes its bounces, if the tip "

@@ -103,6 +103,9 @@ STIFFNESS = 4e4  # N/m, assumed stiffness of the surroundings: force per motion 
 FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s, largest force rate from STIFFNESS; s, correlation time of the force rate
 TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s, if innovations exceed TOUCH variances; gain of a low-pass
 HAND_RATE = 0.3  # N/sqrt(s), random walk of the force, also on an arm at rest
+# share of the mean breakaway torque: standard deviation of an edge; on elastic twins 0 to 3 and 5, values of 0.05 to
+# 0.2 give equal results (the identified edges of twins 1 and 5 are 12 % too low)
+EDGE_ERROR = 0.1
 EDGE_SHARE = 0.7  # per cycle: share by which friction beyond a breakaway edge is moved back to the edge
 # share of the force variance that a creeping tip would cause on stiff surroundings; this share with bristles, where
 # joints creep without breaking away (a surface of 9e4 N/m)
