@@ -118,6 +118,16 @@ def test_free_motion_is_no_contact():
     assert not touches.any()
 
 
+def test_an_arm_without_friction_has_a_finite_force():
+    """Edges of zero, with a tip on the axis of the last joint, which no force can move."""
+    robot = replace(ROBOT, tool=Tool(np.array([0.0, 0.0, 0.09]), 0.01))
+    none = replace(truth(), phi=0.0 * truth().phi)
+    observer, zero = WrenchObserver(robot, none), np.zeros(7)
+    for k in range(200):
+        observer(ROBOT.q_home, zero, 1e-3 * k * BAND)
+    assert np.isfinite(observer.force).all()
+
+
 @pytest.mark.long
 def test_a_joint_that_breaks_away_late_is_no_contact():
     """Stiction holds the wrist up to 1.2 times the identified breakaway torque while other joints move: no force.

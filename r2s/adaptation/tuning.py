@@ -106,7 +106,7 @@ HAND_RATE = 0.3  # N/sqrt(s), random walk of the force, also on an arm at rest
 # share of the mean breakaway torque: standard deviation of an edge; on elastic twins 0 to 3 and 5, values of 0.05 to
 # 0.2 give equal results (the identified edges of twins 1 and 5 are 12 % too low)
 EDGE_ERROR = 0.1
-EDGE_SHARE = 0.7  # per cycle: share by which friction beyond a breakaway edge is moved back to the edge
+EDGE_SHARE = 0.7  # per cycle: share by which friction beyond an exact breakaway edge is moved back to the edge
 # share of the force variance that a creeping tip would cause on stiff surroundings; this share with bristles, where
 # joints creep without breaking away (a surface of 9e4 N/m)
 CREEP_SHARE, BRISTLE_CREEP = 0.3, 5.0

@@ -12,7 +12,7 @@ The uncertainty of a joint's friction depends on whether the joint moves (wrench
   between the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of
   a uniform distribution between the edges. If the friction family has bristles, the joint angle determines the
   bristle deflection and thereby the friction, with a smaller variance. The edges have an error themselves
-  (EDGE_ERROR): a joint that breaks away later than identified must not look like a force.
+  (EDGE_ERROR): while other joints move, a joint that breaks away later than identified must not look like a force.
 The filter assumes that the wrench changes when the tip moves against stiff surroundings. If all joints rest, the
 filter assumes that only a person's hand changes the force. Joint friction hides any force change that is too small to
 make a joint slide.
@@ -244,7 +244,8 @@ def _keep_within_edges(noise, state):
             if variance > hidden:
                 _update(state, gain, mean - friction, hidden * variance / (variance - hidden))
             if beyond != 0.0:  # leave P unchanged: repeated use of an edge adds no information
-                state.x[:] += tuning.EDGE_SHARE * beyond / (variance + noise.edge_error[j] ** 2) * (P @ gain)
+                total = max(variance + noise.edge_error[j] ** 2, 1e-9)  # a joint may have no friction at all
+                state.x[:] += tuning.EDGE_SHARE * beyond / total * (P @ gain)
 
 
 @njit(cache=True, error_model="numpy")

@@ -164,7 +164,7 @@ def resist(dq, spring, most, held):
 
 @njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
-    """Add the adapter's torque, or in a stop `Memory.held`, to the effort `target` (n,) Nm of arm i."""
+    """Add the adapter's torque to the effort `target` (n,) Nm of arm i; during a stop, add `Memory.held` instead."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:

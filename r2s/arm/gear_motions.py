@@ -18,7 +18,7 @@ PAUSE_S = 1.0  # s added to the clock between two slides
 
 
 def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
-    """Raise UserError unless all joints can slide about home; `share` scales the speeds (`speed_share`)."""
+    """Raise UserError unless the slides of all joints keep the limits; `share` (`speed_share`) scales the speeds."""
     space = Space(robot)
     for joint in range(robot.n):
         motion = gear_motion(robot, joint, share)

@@ -230,9 +230,9 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
     """Fit torque from `start` (P,) in reweighted rounds; return the last round's solution u (P,) and problem.
 
-    If values are far outside of narrow priors, a fit to link-side torque has several minima. With the first weights,
-    which come from the nominal arm, a fit may keep cable torque near zero and distort friction. If `start` is
-    nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
+    If true values are far outside of narrow priors, a fit to link-side torque has several minima. With the first
+    weights, which come from the nominal arm, a fit may keep cable torque near zero and distort friction. If `start`
+    is nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
     problem's priors. r2s uses the second fit if it is more likely than the first and clearly lowers the error of a
     joint. Unmodeled effects may also make the second fit more likely, but hardly lower its error.
     """

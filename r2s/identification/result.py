@@ -139,7 +139,7 @@ def conclude(
         problem: the solved problem.
         space: the parameter space, with the breakaway torques and the stiction model estimated after the fit.
         sure: the posterior, as a dict with the fields of `Posterior`.
-        full: {"draws": (S, P)}, draws on the unit cube from a second model, with the same weight as draws of `sure`.
+        full: {"draws": (S, P)}, posterior draws of a second model; each draw has the same weight as a draw of `sure`.
         story: further fields of `IdentificationResult`: history, families, edges, refused.
     """
     u = np.array(sure["u"], dtype=float)

@@ -5,9 +5,9 @@ only env_steps is limited, runs with equal seeds and equal numbers of threads ag
 resumption. If minutes are limited, the curriculum depends on the clock.
 
 The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
-one core, steps and updates alternate, with the same result as in parallel. Physics and updates do not share OpenMP
-threads, because shared threads would slow down physics and updates: after an update, the threads spin for
-milliseconds on cores that the physics needs, and on a busy machine, each barrier waits for a suspended thread.
+one core, steps and updates alternate, with the same result as in parallel. Physics and updates have
+separate OpenMP threads. After an update, shared threads would spin for milliseconds on cores that the physics needs.
+On a busy machine, every barrier would also wait for threads that the operating system has suspended.
 """
 
 import copy

@@ -10,7 +10,7 @@ A control law is a compiled function `law(q, dq, command, parameters, memory, ou
 
 Training runs a control law in MuJoCo's callback (mujoco_callback.py), and every arm runs the same law in the driver
 (r2s/arm/driver.py) or in an exported bundle. The package r2s/control selects the control law and its parameters. The
-control laws are in r2s/physics, the folder of MuJoCo's callback, because numba caches compiled code per folder.
+control laws are in r2s/physics, beside MuJoCo's callback, because numba keeps one cache of compiled code per folder.
 """
 
 from collections.abc import Callable

@@ -262,7 +262,7 @@ def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
 
 @njit(cache=True, error_model="numpy")
 def feedforward(q, parameters, frames, jacobian, memory, at, out):
-    """Add torques against friction, gravity-compensation errors, offset and drag to `out`.
+    """Add to `out` the torques that compensate friction, offset, drag, and errors of gravity compensation.
 
     at: index of dq_r in `memory`.
     """

@@ -141,7 +141,7 @@ def check_limits(
 def check_masses(
     model: mujoco.MjModel, path: Path, gravity: np.ndarray, home: np.ndarray, torque: np.ndarray
 ) -> None:
-    """Raise UserError if a link's mass or tensor is implausible; gravity: (3,) m/s^2. torque: (n,) Nm, limits."""
+    """Raise UserError if a link has an implausible mass or inertia tensor; torque: (n,) Nm, torque limits."""
     each = np.bincount(model.body_weldid, model.body_mass, model.nbody)[model.jnt_bodyid]
     names = [model.body(k).name or f"link {i + 1}" for i, k in enumerate(model.jnt_bodyid)]
     data = mujoco.MjData(model)

@@ -8,8 +8,8 @@ the low-pass (r2s/physics/actuation.py). The safety filter consists of three lim
   (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within the acceleration limit, Gauss'
   principle of least constraint selects the one nearest to the effort: the effort plus torques of fictitious joint
   stops. Joint friction only widens the acceleration limit, so overestimated friction never accelerates a joint.
-- Rate limit: the filter clips the torque, and limits the torque rate by one factor for all joints. With one factor
-  for all joints, the command moves straight from the last command to the new torque, within the convex set of the
+- Rate limit: the filter clips each joint's torque, then multiplies the torque rates of all joints by the same factor.
+  The command therefore moves straight from the last command to the new torque, within the convex set of the
   acceleration limit. With a separate factor for each joint, the command could violate the acceleration limit if two
   joint axes are almost parallel.
 
@@ -251,7 +251,7 @@ def _widen(dq, out, friction, limits, work):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _stop_torque(ddq, low, high, work, root):
-    """Write the torque (n,) Nm of fictitious joint stops into row _STOP of `work`, which contains M^-1.
+    """Write the torque (n,) Nm of fictitious joint stops into row _STOP of `work`; other rows of `work` contain M^-1.
 
     The torque `stop` solves the linear complementarity problem low <= ddq + M^-1 stop <= high: a stop acts only at a
     bound and pushes inward. The solver is block principal pivoting (Judice and Pires, Computers & Operations Research

@@ -123,7 +123,7 @@ def make_adapter(cfg, robot, source):
 
 
 def calibration_of(cfg, source):
-    """Return the run folder with the adapter's model: adapt.calibration, or the calibration of the policy's training.
+    """Return the run folder of the adapter's model: adapt.calibration or, by default, that of the policy's training.
 
     If the training folder contains a copy of an identified model, prefer the folder of the identification, because
     only that folder contains recordings.

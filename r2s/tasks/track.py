@@ -268,7 +268,7 @@ class TrackTask(BaseTask):
         return at_time(goals, self._at(t), ahead_s, self.ctrl_hz)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of impedance control: planned position, m, and velocity, m/s, at t (m,) s."""
+        """Return the impedance target (m, 6) at the times t (m,) s: planned position (m) and velocity (m/s)."""
         now = goals[np.arange(len(goals)), self._at(t)]
         return np.concatenate([now[:, X], now[:, V]], axis=1)
 
@@ -322,7 +322,7 @@ class TrackTask(BaseTask):
         }
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return -path_rmse_mm - 100 stopped, where `stopped` is a share of the paths."""
+        """Return -(path_rmse_mm + 100 stopped); `stopped` is the share of the paths that a stop ended."""
         return -(row["path_rmse_mm"] if np.isfinite(row["path_rmse_mm"]) else 1e3) - 100 * row["stopped"]
 
     def _at(self, t: np.ndarray) -> np.ndarray:

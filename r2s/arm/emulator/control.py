@@ -74,7 +74,7 @@ class Control:
     Args:
         arm: the arm. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
         version: version of the FCI. faults, max_missed: see `Emulator`.
-        desk: values of settings in `DESK`, such as {"m_ee": 0.73}; they change the box's arm model, not the arm.
+        desk: values of settings in `DESK`, such as {"m_ee": 0.73}; they change only the arm model in the control box.
     """
 
     def __init__(

@@ -237,12 +237,12 @@ class TorqueResidual:
     def _changes(
         self, x: np.ndarray, stepped: np.ndarray
     ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
-        """Return the torque error (T, n) at x, and [(parameter block, indices in x, change from x to `stepped`)].
+        """Return the torque error (T, n) at x, and a list of (parameter block, indices in x, change).
 
-        `change` is a change of torque (T, n) or, for L link parameters, of standard parameters (n, 10 n, L). Changes
-        of standard parameters need no evaluation, because torque is linear in standard parameters. Other parameters
-        of a joint, such as its friction, affect only this joint's torque, so one evaluation changes the values of all
-        joints.
+        The change results from a step of the block from x to `stepped`. It is a change of torque (T, n) or, for L
+        link parameters, of standard parameters (n, 10 n, L). Changes of standard parameters need no evaluation,
+        because torque is linear in standard parameters. Other parameters of a joint, such as its friction, affect
+        only this joint's torque, so one evaluation changes the values of all joints.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]

@@ -48,7 +48,7 @@ class _Arm(NamedTuple):
 def log_arms(
     stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Sequence[Episode]], error: Measure
 ) -> None:
-    """Log one arm per label, side by side; the distance plot has the unit of the measure `error`."""
+    """Show one arm per label, side by side, in the viewer; distances are in the unit of the measure `error`."""
     stream.log("arms", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     model, palette, starts = robot.model(gravity=False), colours(episodes), starts_of(episodes)
     for i, (label, sequence) in enumerate(episodes.items()):
@@ -184,7 +184,7 @@ def _poses(model: mujoco.MjModel, q: np.ndarray) -> dict[int, tuple[np.ndarray, 
 
 
 def _shapes(stream: rr.RecordingStream, model: mujoco.MjModel, body: int, path: str, colour: str) -> None:
-    """Log the geoms of one link in the link's frame; dark geoms (joints) have the arm's color."""
+    """Log the geoms of one link in the link's frame; geoms that are dark in the model get the arm's color."""
     for geom in _shown_geoms(model)[model.geom_bodyid[_shown_geoms(model)] == body]:
         own = 255 * model.geom_rgba[geom, :3]
         own = rgb(colour) if own.mean() < 100 else own
