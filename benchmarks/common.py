@@ -5,10 +5,12 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from datetime import date
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ import yaml
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 NUMBER = r"\d+(\.\d+)?"
+CONSTANT = rf"[A-Z_]+={NUMBER}"
 PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
 ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments; scripts not listed check their own
     "algorithms": ("page",),
@@ -25,7 +28,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments
     "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"(rigid|elastic)_\d+"),
     "grid": ("page",),
     "press": (r"env_steps=[1-9]\d*", r"policies=[1-9]\d*", r"(rigid|elastic)_\d+"),
-    "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
+    "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", CONSTANT, r"\d+"),
     "searches": (NUMBER,),
     "transfer": ("page", "twins", "noise", r"\d+"),
     "twins": (r"variant=(rigid|elastic)", r"\d+"),
@@ -164,6 +167,25 @@ def identify_twins(twins: Iterable[tuple[str, int, Path]], root: Path) -> None:
         for v, s, folder in twins
         if not (folder / "posterior.npz").is_file()
     )
+
+
+def set_constants(constants: dict[str, str]) -> None:
+    """Set constants in all modules of r2s/adaptation, in a new process: compiled code contains the old values."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("r2s.adaptation.")]
+    names = {
+        name for module in modules for name, x in vars(module).items() if isinstance(x, float) and name.isupper()
+    }
+    for name in constants:
+        if name not in names:
+            near = get_close_matches(name, names, 1)
+            sys.exit(f"error: no number {name} in r2s/adaptation" + (f"; did you mean {near[0]}?" if near else ""))
+    if constants and "R2S_TUNED" not in os.environ:
+        with tempfile.TemporaryDirectory() as folder:
+            own = {"R2S_TUNED": "1", "NUMBA_CACHE_DIR": folder}
+            sys.exit(subprocess.run([sys.executable, *sys.argv], env=os.environ | own).returncode)
+    for module in modules:
+        for name in constants.keys() & vars(module).keys():
+            setattr(module, name, float(constants[name]))
 
 
 def cells(table, values: dict[str, float]) -> dict[str, str]:

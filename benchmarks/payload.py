@@ -23,17 +23,13 @@ of the time. A word in capitals sets a constant of r2s/adaptation: HUBER=1.0 OUT
 these words in their names, and the script only prints the tables.
 """
 
-import os
-import subprocess
 import sys
-import tempfile
 import time
-from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import JUDGING, MACHINE, RESULTS, ROOT, identify_twins, markdown_rows, put_table
+from common import JUDGING, MACHINE, RESULTS, ROOT, identify_twins, markdown_rows, put_table, set_constants
 from payload_parts import FALL, PIECE, SECONDS, TAU_S, WARMS, events, folder, identified, load, quiet, warming
 
 PARTS = {"events": events, "quiet": quiet, "warming": warming, "load": load}
@@ -126,25 +122,6 @@ def caption(part: str, rows: pd.DataFrame) -> str:
         "median and worst of the joints, errors relative to the change.",
         "load": f"{each} motions of {SECONDS:g} s of {len(count)} twins, each with all four declarations.",
     }[part]
-
-
-def set_constants(constants: dict[str, str]) -> None:
-    """Set constants in all modules of r2s/adaptation, in a new process: compiled code contains the old values."""
-    modules = [module for name, module in sys.modules.items() if name.startswith("r2s.adaptation.")]
-    names = {
-        name for module in modules for name, x in vars(module).items() if isinstance(x, float) and name.isupper()
-    }
-    for name in constants:
-        if name not in names:
-            near = get_close_matches(name, names, 1)
-            sys.exit(f"error: no number {name} in r2s/adaptation" + (f"; did you mean {near[0]}?" if near else ""))
-    if constants and "R2S_TUNED" not in os.environ:
-        with tempfile.TemporaryDirectory() as folder:
-            own = {"R2S_TUNED": "1", "NUMBA_CACHE_DIR": folder}
-            sys.exit(subprocess.run([sys.executable, *sys.argv], env=os.environ | own).returncode)
-    for module in modules:
-        for name in constants.keys() & vars(module).keys():
-            setattr(module, name, float(constants[name]))
 
 
 def requested_twins(words: dict[str, str], seeds: list[int]) -> list[tuple[str, int]]:

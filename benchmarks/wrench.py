@@ -1,13 +1,14 @@
 """Force without a sensor: independent arms and hidden twins that press and slide, with the truth.
 
-    python benchmarks/wrench.py [--arms FOLDER] [--twins rigid_0,elastic_0,...]
+    python benchmarks/wrench.py [--arms FOLDER] [--twins rigid_0,elastic_0,...] [NAME=VALUE ...]
 
 arms    FOLDER/<name> with train, validation, ramps and contact recordings and the truth, no part of this repository;
         identified with the defaults of stage=identify and data.contact (benchmarks/contact_identification.py)
 twins   variant_seed: recordings of benchmarks/press_twins.py on the surface of the seed, identified from free motion
 
 Finished identifications in runs/identify are not repeated. The contact thresholds come from free motion; false alarms
-are counted in ramps.npz and wherever a press recording touches nothing. Writes benchmarks/results/wrench.md.
+are counted in ramps.npz and wherever a press recording touches nothing. Writes benchmarks/results/wrench.md; with
+other values of constants of r2s/adaptation (NAME=VALUE), only prints the rows.
 
 moving, rest: RMSE of the normal force in contact without the first 50 ms of a touch (`impact`); at rest every joint
 has been below 3 mrad/s for 30 ms. inside: share of force components within their 95 % interval.
@@ -21,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import JUDGING, ROBOT, ROOT, identify_twins, markdown_rows, write_page
+from common import CONSTANT, JUDGING, ROBOT, ROOT, identify_twins, markdown_rows, set_constants, write_page
 from contact_identification import identify_arm
 from press_twins import armed, press_twin, twin_run
 
@@ -131,7 +132,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--arms", default=str(ROOT.parent / "shared/data/contact_arms"), help="'' leaves them out")
     parser.add_argument("--twins", default="rigid_0,rigid_1,rigid_2,elastic_0,elastic_1,elastic_2")
+    parser.add_argument("constants", nargs="*", metavar="NAME=VALUE", help="of r2s/adaptation; writes no page")
     options = parser.parse_args()
+    if wrong := [word for word in options.constants if not re.fullmatch(CONSTANT, word)]:
+        parser.error(f"'{wrong[0]}': expected NAME=VALUE, such as EDGE_ERROR=0.2")
+    set_constants(dict(word.split("=") for word in options.constants))
     if options.arms and not Path(options.arms).is_dir():
         parser.error(f"--arms: no folder {options.arms}; --arms '' leaves the independent arms out")
     words = [word for word in options.twins.split(",") if word]
@@ -147,6 +152,8 @@ def main() -> None:
         judged = " (judging)" if seed in JUDGING[variant] else ""
         rows[f"{variant} twin {seed}{judged}"] = twin(variant, seed)
         print(variant, seed, rows[f"{variant} twin {seed}{judged}"], flush=True)
+    if options.constants:
+        return
     command = "python benchmarks/wrench.py" + f" --twins {options.twins}" * (
         options.twins != parser.get_default("twins")
     )

@@ -310,9 +310,8 @@ def test_the_command_writes_gears_from_a_file(tmp_path, calibration, recording, 
     assert "gears up to" in r2s("list", "--root", str(tmp_path)).stdout
     assert all((run / name).is_file() for name in ("parameters.yaml", "posterior.npz", "figures/gears.png"))
     gears = load_gears(run, PANDA, "gears")
-    np.testing.assert_allclose(
-        gears["stiffness"], found.drives.stiffness, rtol=1e-4
-    )  # parameters.yaml rounds the arm
+    # parameters.yaml rounds the arm
+    np.testing.assert_allclose(gears["stiffness"], found.drives.stiffness, rtol=1e-4)
     np.testing.assert_allclose(gears["spread"], found.spread, rtol=1e-2)
 
 

@@ -106,7 +106,7 @@ def test_kept_recordings_are_made_once(tmp_path):
 
 
 def test_a_constant_changes_in_every_module(monkeypatch):
-    from payload import set_constants
+    from common import set_constants
 
     from r2s.adaptation import estimator, tuning
 

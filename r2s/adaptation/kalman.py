@@ -9,8 +9,8 @@ The state of an arm with n joints has N = 10 + 4 n components:
 
 The filter processes the momentum residual of one joint after the other. Breakaway or a vibrating gear causes large
 residuals for one or two spans of 20 ms. Huber's function (Robust Statistics, 1981) therefore reduces the weight of
-innovations beyond HUBER standard deviations. A payload change causes
-large innovations for longer, so the filter still follows it.
+innovations beyond HUBER standard deviations. A payload change causes large innovations for longer, so the filter
+still follows it.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
 """Tuning constants of the package adaptation, each with unit and source.
 
 Constants without a named source are estimates of the order of magnitude. benchmarks/payload.py tested all constants
-together on development twins (seeds 0 to 9). The argument NAME=VALUE of benchmarks/payload.py changes one constant
-for a test.
+together on development twins (seeds 0 to 9). The argument NAME=VALUE of benchmarks/payload.py and of
+benchmarks/wrench.py changes one constant for a test.
 """
 
 import numpy as np
@@ -103,8 +103,8 @@ STIFFNESS = 4e4  # N/m, assumed stiffness of the surroundings: force per motion 
 FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s, largest force rate from STIFFNESS; s, correlation time of the force rate
 TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s, if innovations exceed TOUCH variances; gain of a low-pass
 HAND_RATE = 0.3  # N/sqrt(s), random walk of the force, also on an arm at rest
-# share of the mean breakaway torque: standard deviation of an edge; on elastic twins 0 to 3 and 5, values of 0.05 to
-# 0.2 give equal results (the identified edges of twins 1 and 5 are 12 % too low)
+# share of the mean breakaway torque: standard deviation of an edge (identified 12 % too low for joint 7 of elastic
+# twins 1 and 5); benchmarks/wrench.py EDGE_ERROR=0.05 and 0.2 give equal results on elastic twins 0 to 5
 EDGE_ERROR = 0.1
 EDGE_SHARE = 0.7  # per cycle: share by which friction beyond an exact breakaway edge is moved back to the edge
 # share of the force variance that a creeping tip would cause on stiff surroundings; this share with bristles, where

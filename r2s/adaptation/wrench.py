@@ -165,8 +165,7 @@ def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
     edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))
     presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
     rest = tuning.INERTIA_SHARE, tuning.SPEED_NOISE, tuning.ANGLE_NOISE, tuning.FORCE_FLOOR * robot.payload_max[0]
-    edge_error = tuning.EDGE_ERROR * 0.5 * (edges[:, 1] - edges[:, 0])
-    return WrenchNoise(friction, np.ascontiguousarray(edges), edge_error, presliding, *rest)
+    return WrenchNoise(friction, np.ascontiguousarray(edges), presliding, *rest)
 
 
 def observe_recording(

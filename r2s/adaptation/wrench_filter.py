@@ -244,7 +244,8 @@ def _keep_within_edges(noise, state):
             if variance > hidden:
                 _update(state, gain, mean - friction, hidden * variance / (variance - hidden))
             if beyond != 0.0:  # leave P unchanged: repeated use of an edge adds no information
-                total = max(variance + noise.edge_error[j] ** 2, 1e-9)  # a joint may have no friction at all
+                error = tuning.EDGE_ERROR * 0.5 * (noise.edges[j, 1] - noise.edges[j, 0])
+                total = max(variance + error**2, 1e-9)  # a joint may have no friction at all
                 state.x[:] += tuning.EDGE_SHARE * beyond / total * (P @ gain)
 
 

@@ -28,7 +28,6 @@ class WrenchNoise(NamedTuple):
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a joint in motion
     edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway torque: at rest, friction stays between them
-    edge_error: np.ndarray  # (n,) Nm, standard deviation of the edges
     presliding: np.ndarray  # (n,) rad, decay length of presliding; 0: a joint sticks until it breaks away
     inertia: float  # inertia error as a share of a joint's net torque
     speed: float  # rad/s, white noise of measured speeds
