@@ -154,7 +154,7 @@ def test_a_simulated_arm_reports_its_contact(panda):
         ("table", r"^arm\.surface: expected false, true, box or \{point: \[3\], normal: \[3\]\}, got 'table'$"),
         (
             {"point": [0, 0, 0], "normall": [0, 0, 1]},
-            r"^arm\.surface: unknown key 'normall'; did you mean 'normal'\?$",
+            r"^arm\.surface: unknown key 'normall'; allowed: point, normal; did you mean 'normal'\?$",
         ),
         ({"point": [0, 0, 0], "normal": [0, 0, 0]}, r"^arm\.surface: expected \{point: 3 numbers in m, normal: 3"),
         ({"point": [0, 0], "normal": [0, 0, 1]}, r"^arm\.surface: expected \{point: 3 numbers in m, normal: 3"),

@@ -226,6 +226,9 @@ def test_a_tool_is_read_with_the_robot(tmp_path):
     file.write_text('{"tip_in_flange_m": [0.0, 0.01], "radius_m": 0.01}')
     with pytest.raises(UserError, match=r"^robot\.tool: tool\.json: tip_in_flange_m: expected 3 numbers"):
         load_robot(tool=str(file))
+    file.write_text('{"tip": [0.0, 0.0, 0.06], "radius_m": 0.01}')
+    with pytest.raises(UserError, match=r"^robot\.tool: tool\.json: unknown key 'tip'; allowed: tip_in_flange_m, "):
+        load_robot(tool=str(file))
     with pytest.raises(UserError, match=r"^robot\.tool: no such file: .*tol\.json; did you mean 'tool\.json'"):
         load_robot(tool=str(tmp_path / "tol.json"))
     with pytest.raises(UserError, match=r"^robot\.tool: .*directory"):

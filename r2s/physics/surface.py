@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.errors import UserError, nearest, nearest_file
+from r2s.errors import UserError, instead_of, nearest_file
 from r2s.files import located
 
 TINY = np.finfo(float).tiny
@@ -142,7 +142,7 @@ def load_tool(path: str | Path) -> Tool:
         raise UserError(f"robot.tool: {file}: expected an object with tip_in_flange_m and radius_m")
     for key in values:
         if key not in TOOL_KEYS:
-            raise UserError(f"robot.tool: {file.name}: unknown key '{key}'{nearest(key, TOOL_KEYS)}")
+            raise UserError(f"robot.tool: {file.name}: unknown key '{key}'; {instead_of(key, TOOL_KEYS)}")
     try:
         tip = np.array(values["tip_in_flange_m"], dtype=float)
         radius, mass = float(values["radius_m"]), float(values.get("mass_kg", 0.0))

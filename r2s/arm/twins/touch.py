@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.errors import UserError, nearest
+from r2s.errors import UserError, instead_of
 from r2s.physics import box
 from r2s.physics.box import TableFrame, check_size, standing_box, table_frame
 from r2s.physics.contact import near
@@ -172,7 +172,7 @@ def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):
         if key not in ("point", "normal"):
-            raise UserError(f"arm.surface: unknown key '{key}'{nearest(key, ('point', 'normal'))}")
+            raise UserError(f"arm.surface: unknown key '{key}'; {instead_of(key, ('point', 'normal'))}")
     try:
         point, normal = (np.array(values[key], dtype=float).reshape(3) for key in ("point", "normal"))
         length = float(np.linalg.norm(normal))
