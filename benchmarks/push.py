@@ -32,7 +32,7 @@ from common import (
 from r2s.tasks.push_measures import PUSH
 
 RUNS = ROOT / "runs" / "push"
-EPISODES = 8
+EPISODES = 20
 TWINS, POLICIES = "The reference on twins", "Policies on twins"
 SEEDS = range(190, 195)  # nothing was chosen on them
 ALGO = "algo=tqc", "algo.gamma=0.98", "budget.minutes=null"

@@ -38,12 +38,14 @@ from r2s.tasks.tip_task import TipTask
 POSE, START = slice(0, 6), 6  # columns of a goal: pose of the box, then the start posture
 BEHIND = 0.04  # m, gap between tip and box at the start
 FAR_M, FAR_RAD, GAP_M, FINE_M, LEVEL_M = 0.1, 0.5, 0.05, 0.02, 0.02  # m, rad: tanh scales
+CLEAR_M = 0.01  # m, clearance below which the term `table` is negative; without the term the tip rubs on the table
 WEIGHTS = {
     "distance": 1.0,
     "yaw": 0.5,
     "precision": 1.0,
     "gap": 0.3,
     "height": 0.3,
+    "table": 1.0,
     "smoothness": 1.0,
     "filter_penalty": 1.0,
 }
@@ -270,11 +272,12 @@ class PushTask(TipTask):
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance d (m,) m of the box from its goal, and the reward terms (m, 7).
+        """Return the distance d (m,) m of the box from its goal, and the reward terms (m, 8).
 
         Terms, with the yaw error e: distance = -tanh(d / 10 cm); yaw = -tanh(|e| / 0.5 rad); precision =
         `near`(d, 10 cm, 3 cm) `near`(|e|, 0.5 rad, 10 degrees); gap = -tanh(distance of the tip from the box / 5 cm);
-        height = -tanh(height error of the tip / 2 cm); smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2);
+        height = -tanh(height error of the tip / 2 cm); table = -tanh(u / 1 cm), u being the depth by which the tip's
+        lowest point is less than 1 cm above the table; smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2);
         filter_penalty = -`State.limited`.
         """
         place, _ = self.tip(state.q)
@@ -284,7 +287,8 @@ class PushTask(TipTask):
         gap = (np.linalg.norm(beyond.clip(0.0), axis=1) - self.tip_radius).clip(0.0)
         precise = near(d, FAR_M, GOOD_M) * near(yaw, FAR_RAD, GOOD_RAD)
         level = np.tanh(np.abs(place[:, 2] - self.height) / LEVEL_M)
-        terms = [-np.tanh(d / FAR_M), -np.tanh(yaw / FAR_RAD), precise, -np.tanh(gap / GAP_M), -level]
+        low = np.tanh((CLEAR_M + self.tip_radius - place[:, 2]).clip(0.0) / CLEAR_M)
+        terms = [-np.tanh(d / FAR_M), -np.tanh(yaw / FAR_RAD), precise, -np.tanh(gap / GAP_M), -level, -low]
         return d, np.stack([*terms, -rough(ddq), -state.limited], axis=1)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
