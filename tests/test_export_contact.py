@@ -293,6 +293,10 @@ PLANS = {
     "target deeper": (lambda plan: changed(plan, 7, 20, plan[7, 20] - 0.3), "row 7 of the plan: the setpoint's ta"),
     "setpoint too hard": (lambda plan: changed(plan, 7, 27, 1000.0), "row 7 of the plan: a setpoint with normal and"),
     "setpoint turned": (lambda plan: changed(plan, 7, 24, 0.1), "row 7 of the plan: a setpoint with normal and"),
+    "target too fast": (
+        lambda plan: changed(plan, 7, 21, 3.0),
+        "row 7 of the plan: a target velocity of 3 m/s; the training had up to ",
+    ),
     "measured force": (lambda plan: changed(plan, 7, 29, 1.0), "row 7 of the plan: a setpoint with normal and force"),
     "another start": (lambda plan: changed(plan, 0, 12, 0.5), "mm from where the plan begins"),
 }
@@ -336,6 +340,9 @@ def test_every_plan_of_a_task_is_accepted(words):
         check_surface_plan(contract, model, plan)
         with pytest.raises(BundleError, match="row 7 of the plan: the setpoint's target is 30"):
             check_surface_plan(contract, model, changed(plan, 7, begin + 1, plan[7, begin + 1] + 0.3))
+        if plan.shape[1] > begin + 12:  # a target that slides has a feedforward force
+            with pytest.raises(BundleError, match="row 7 of the plan: a feedforward force of 100 N; the training had"):
+                check_surface_plan(contract, model, changed(plan, 7, begin + 12, 100.0))
 
 
 def test_a_motion_begins_where_its_plan_does(pressing):

@@ -28,7 +28,7 @@ from r2s.export.plan import Follower, plan_of
 from r2s.export.push import PushLimit
 from r2s.export.surface import SurfaceFollower, check_surface_plan
 
-FORMAT = 7
+FORMAT = 8
 
 
 def seal_of(contract: dict[str, Any]) -> str:

@@ -16,7 +16,9 @@ from r2s.export.plan import NO_PLAN, finite_plan
 
 WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
 NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and the target in the plan's first row
-CONTACT = slice(6, 12)  # in a setpoint of control=hybrid: normal, force N, measured force N, whether measured
+# in a setpoint: velocity of the target m/s; for control=hybrid: normal, force N, measured force N, whether measured;
+# for a target that slides: feedforward force N
+VELOCITY, CONTACT, PULL = slice(3, 6), slice(6, 12), slice(12, 15)
 ROUNDING = 1e-6  # m and N, tolerance with which a plan is compared with the training's ranges
 
 
@@ -74,7 +76,8 @@ def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
     """Raise BundleError if the setpoint, which commands the controller, differs from target, normal or force.
 
     The target lies between the targets of a row and of the next row, because the setpoint of a target that slides is
-    valid for the middle of the control period.
+    valid for the middle of the control period. Further errors are a target velocity or a feedforward force that is
+    larger than during training.
 
     Args:
         goal: entry `goal` of the contract. plan: (rows, columns), a plan on a surface.
@@ -93,6 +96,16 @@ def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
     if off.max() > ROUNDING:
         row = int(off.argmax())
         raise BundleError(f"row {row} of the plan: the setpoint's target is {1e3 * off[row]:.1f} mm off the plan's")
+    for what, columns, most, unit in (
+        ("a target velocity", VELOCITY, goal["trained"]["target_m_per_s"], "m/s"),
+        ("a feedforward force", PULL, goal["trained"]["feedforward_N"], "N"),
+    ):
+        size = np.linalg.norm(setpoint[:, columns], axis=1)
+        if size.max() > most + ROUNDING:
+            row = int(size.argmax())
+            raise BundleError(
+                f"row {row} of the plan: {what} of {size[row]:.3g} {unit}; the training had up to {most:.3g} {unit}"
+            )
     if setpoint.shape[1] < CONTACT.stop:
         return
     own = goal["trained"]["contact"]

@@ -7,7 +7,7 @@ import numpy as np
 from r2s.arm.clients.collision_thresholds import thresholds_for
 from r2s.errors import UserError
 from r2s.export.push import PUSH_NUMBER, STOPS
-from r2s.export.surface import columns_of
+from r2s.export.surface import PULL, VELOCITY, columns_of
 from r2s.physics import contact_stop as stop
 from r2s.physics import push_limit as law
 from r2s.physics.payload import ee_pose
@@ -15,6 +15,9 @@ from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
 from r2s.tasks.surface_task import LAG_M, REGULAR, START, SurfaceTask
 from r2s.tasks.task import Task
+
+EXAMPLES = 64  # random goals, whose largest target velocity and feedforward force determine the allowed values
+SPARE = 1.25  # allowed value / largest value of the examples, because other goals may have larger values
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
@@ -41,6 +44,7 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
     trained |= {"place_m": task.place, "tilt_rad": float(np.radians(task.tilt)), "force_N": list(task.force)}
     trained |= {"depth_m": [-float(task.clearance + radius), deepest]}
     trained |= {"contact": None if contact is None else contact.tolist()}  # normal and force N if not the plan's
+    trained |= _largest_setpoints(robot, task)
     site, axes = ee_pose(robot)
     return {
         "kind": "surface",
@@ -54,6 +58,17 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
         "tip_m": (site + axes @ tool.tip).tolist(),  # type: ignore[union-attr]
         "regular_m2": REGULAR,
         "trained": trained | {"seconds": task.episode_s},
+    }
+
+
+def _largest_setpoints(robot: Robot, task: SurfaceTask) -> dict[str, float]:
+    """Return the largest allowed target velocity, m/s, and feedforward force, N, of a setpoint; 0 if it has none."""
+    control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
+    goals = task.goals(robot, np.random.default_rng(0), EXAMPLES)
+    rows = np.vstack([control.setpoint(task, t, np.tile(goal, (len(t), 1))) for goal in goals])
+    return {
+        name: SPARE * float(np.linalg.norm(rows[:, columns], axis=1).max())
+        for name, columns in (("target_m_per_s", VELOCITY), ("feedforward_N", PULL))
     }
 
 
