@@ -12,6 +12,7 @@ from r2s.arm.ramp import ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.identification.friction.static_friction import SIGMA
 from r2s.identification.structure.cross_validation import held_out
+from r2s.identification.structure.forward_selection import forward_selection
 from r2s.identification.terms import add_terms
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import COULOMB, STRIBECK
@@ -139,6 +140,15 @@ def test_replays_that_disagree_with_torque_are_refused(hard, arm):  # noqa: F811
     speeds = np.linspace(-1, 1, 20)[:, None] * np.ones(3)
     off = [r.dynamics.friction(speeds) - r.dynamics.offset for r in (both, alone)]  # what motion tells
     np.testing.assert_allclose(*off, rtol=0, atol=5e-3)
+
+
+def test_an_uncertain_candidate_does_not_end_the_selection():
+    """`link` lowers the mean error most, but only in two of 16 blocks; `load` lowers it a little in all of them."""
+    link, load = np.zeros(16), np.full(16, 0.2) + 0.01 * np.arange(16)
+    link[:2] = 4.0
+    gains = {"link": link, "load": load, "drag": np.zeros(16)}
+    assert link.mean() > load.mean()
+    assert forward_selection(lambda chosen: np.full(16, 5.0) - sum(gains[c] for c in chosen), list(gains)) == ["load"]
 
 
 def test_a_link_takes_the_place_of_its_tensor():

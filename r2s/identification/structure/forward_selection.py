@@ -4,7 +4,7 @@ Terms are correlated, such as offset with cable drag, or mass with center of mas
 distorts the fitted values of correlated terms, so forward selection adds only terms that improve the prediction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -24,9 +24,10 @@ def select_terms(
 ) -> dict[str, list[bool]]:
     """Return {"entered": list of bool}: whether forward selection adds each of the `candidates` to `terms`.
 
-    Each round adds the best candidate, until no candidate lowers the mean error over half-second blocks by more than
-    CLEARLY standard errors. Because torque is linear in most parameters, each fold is fitted once without candidates;
-    one Gauss-Newton step from this fit then evaluates a set of candidates.
+    Each round considers the candidates that lower the mean error over half-second blocks by more than CLEARLY
+    standard errors, and adds the candidate with the smallest error. If there is no such candidate, the selection
+    ends. Because torque is linear in most parameters, each fold is fitted once without candidates; one Gauss-Newton
+    step from this fit then evaluates a set of candidates.
     """
     space, folds = cv.space(terms), []
     for k, fold in enumerate(cv.split(space, blocks=BLOCKS, slowest=slowest)):
@@ -39,17 +40,31 @@ def select_terms(
         """Return the squared error (blocks,) of a model with the `chosen` candidates; joints have equal weight."""
         return np.concatenate([f.squares(chosen) for f in folds]) @ alike
 
+    chosen = forward_selection(score, candidates)
+    return {"entered": [name in chosen for name in candidates]}
+
+
+def forward_selection(score: Callable[[Sequence[str]], np.ndarray], candidates: Sequence[str]) -> list[str]:
+    """Return the selected candidates, in the order of their selection; see `select_terms`.
+
+    score: function that maps a set of candidates to squared errors (blocks,).
+    """
     chosen: list[str] = []
     best = score(chosen)
     while left := [name for name in candidates if name not in chosen]:
-        trials = [score([*chosen, name]) for name in left]
-        k = int(np.argmin([t.mean() for t in trials]))
-        less = best - trials[k]
-        if less.mean() <= CLEARLY * less.std() / np.sqrt(len(less)):  # without held-out rows, both sides are 0
+        trials = {name: score([*chosen, name]) for name in left}
+        clear = [name for name in left if _clearly_better(best - trials[name])]
+        if not clear:
             break
-        chosen.append(left[k])
-        best = trials[k]
-    return {"entered": [name in chosen for name in candidates]}
+        chosen.append(min(clear, key=lambda name: trials[name].mean()))
+        best = trials[chosen[-1]]
+    return chosen
+
+
+def _clearly_better(less: np.ndarray) -> bool:
+    """Return whether the mean of the error's decrease `less` (blocks,) exceeds CLEARLY standard errors."""
+    # without held-out rows, both sides are 0
+    return bool(less.mean() > CLEARLY * less.std() / np.sqrt(len(less)))
 
 
 class _LinearizedFold:
