@@ -25,7 +25,7 @@ PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 MOST_SEED = 2**32 - 1  # largest seed that all generators of NumPy accept
 ABSENT = "not there"
-# keys that skip_completed does not compare: a run's folder, display and number of cores
+# keys in which skip_completed allows differences: run folder, display, number of cores and the like
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
 
 
@@ -41,7 +41,7 @@ def main():
             from r2s.commands import run_command
 
             return run_command(sys.argv[1:])
-        sys.path.append(os.getcwd())  # a user's parts are modules of the working folder
+        sys.path.append(os.getcwd())  # a config may name modules in the working folder
         sys.argv[1:] = extended(sys.argv[1:])
         parser = get_args_parser()
         parser.error = lambda message: sys.exit(fail(f"{message}; see {PROGRAM} --help"))  # type: ignore[method-assign]
@@ -72,7 +72,7 @@ def run_hydra(typed):
             os.environ[FAILED] = str(errors)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints exceptions of launchers and exits
             os.environ.setdefault(GROUP, default_name(typed.overrides))
-        else:  # not a sweep: the job itself ends with its exit status
+        else:  # without a sweep, a failed job ends this process
             os.environ.pop(FAILED, None)
         try:
             job()
@@ -130,7 +130,7 @@ def resumed(cfg, overrides):
     if extra := [o for o in overrides if not o.startswith(("resume=", "trust=", "device="))]:
         raise UserError(f"resume: a run continues with its own config; leave out {' '.join(extra)}")
     before = run_config(folder, cfg.trust)
-    if before.stage == "tune":  # trainings of the search use the overrides in the folder again
+    if before.stage == "tune":  # the search's trainings reuse the overrides in its folder
         os.environ[TRUST] = ",".join(modules(cfg.trust))
     if before.stage not in RESUMABLE:
         raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: {choices(RESUMABLE)}")
@@ -182,7 +182,7 @@ def differing(saved, cfg, most=3, counts=lambda key: True):
 
 
 def typed_overrides(folder):
-    """Return the overrides with which the user started the run in a folder."""
+    """Return the overrides with which the user started the run in the run folder `folder`."""
     from r2s.runs import read_meta
 
     words = loaded(folder / "overrides.yaml")
@@ -234,7 +234,7 @@ def end_workers():
 
 
 def end_job(error):
-    """Print an error, then exit with status 2; in a sweep, append the error to the sweep's error file instead."""
+    """Print an error and exit with status 2; in a sweep, do not exit but append it to the sweep's error file."""
     status = fail(error)
     if FAILED not in os.environ:
         sys.exit(status)

@@ -62,7 +62,7 @@ def run_command(words: Sequence[str]) -> None:
     )
     converting.add_argument("--trust", help=TRUSTED)
     commands.add_parser("engines", help="the physics engines: version, or how to install it")
-    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first, since KEY=VALUE may repeat
+    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first: KEY=VALUE allows many words
     others = [w for w in words[1:] if not w.startswith(("to=", "trust="))]
     typed, unknown = parser.parse_known_args([words[0], *options, *others])
     if unknown:
@@ -123,7 +123,7 @@ def export(typed: Namespace) -> None:
     from r2s.stages.build import CONF, is_learner, make_dynamics, make_robot, make_task, plain
     from r2s.stages.transfer import trained_config
 
-    sys.path.append(os.getcwd())  # a user's parts are modules of the working folder
+    sys.path.append(os.getcwd())  # a config may name modules in the working folder
     source, trained = trained_config(Namespace(policy=typed.run, trust=typed.trust), "export")
     if not is_learner(trained):
         raise UserError(f"export: algo={trained.algo.name} has no network to export ({source})")
@@ -143,7 +143,7 @@ def check(typed: Namespace) -> None:
     if not any(word.split("=")[0].split(".")[0] == "data" for word in typed.override):
         check_arm(typed)
         return
-    sys.path.append(os.getcwd())  # a user's robot is a module of the working folder
+    sys.path.append(os.getcwd())  # a config may name modules in the working folder
     check_data(composed("check", typed.override, JUDGED), typed.to)
 
 
@@ -207,7 +207,7 @@ def convert(typed: Namespace) -> None:
         raise UserError(f"to: expected FILE.mcap, or a folder for a LeRobotDataset, got {typed.to}")
     if typed.to.exists():
         raise UserError(f"to: {typed.to} exists")
-    sys.path.append(os.getcwd())  # a user's robot is a module of the working folder
+    sys.path.append(os.getcwd())  # a config may name modules in the working folder
     cfg = composed("convert", ["data=recording", *typed.override], CONVERTED)
     groups = {w.lstrip("+~").split("=")[0].split(".")[0] for w in typed.override}
     if (typed.file.parent / "config.yaml").is_file() and "robot" not in groups:
@@ -251,7 +251,7 @@ def viewable(folder: Path) -> Path:
 
 
 def arm_config(folder: Path, trust: str | None = None) -> Any:
-    """Return the config that describes the robot of a run: the training's for a transfer, else the run's own.
+    """Return the config that describes a run's robot: for a transfer the training's config, otherwise the run's own.
 
     Raises:
         UserError: the file cannot be read or names an untrusted module.
@@ -260,11 +260,11 @@ def arm_config(folder: Path, trust: str | None = None) -> Any:
 
     from r2s.stages.run_config import checked, loaded, run_config
 
-    path = folder / "policy.yaml"  # of stage=transfer, whose config.yaml has the default robot
+    path = folder / "policy.yaml"  # written by stage=transfer; its config.yaml contains the default robot
     if not path.is_file():
         return run_config(folder, trust)
     cfg = loaded(path)
-    return checked(OmegaConf.masked_copy(cfg, [k for k in ARM if k in cfg]), path, trust)  # not its task and policy
+    return checked(OmegaConf.masked_copy(cfg, [k for k in ARM if k in cfg]), path, trust)  # only the arm
 
 
 def robot_of(folders: Sequence[Path], trust: str | None = None):

@@ -2,8 +2,8 @@
 
 numba caches a compiled function and recompiles the function when its source file changes. But numba does not notice
 changes in other files from which cached code calls functions. After a change in physics/safety_filter.py, numba would
-therefore run arm/driver.py with the old filter. After a change in a compiled module of r2s/physics or of a package
-such as r2s/arm, this module makes numba recompile the functions of the package. A change in a module from which a
+therefore run arm/driver.py with the old filter. This module makes numba recompile the functions of a package such as
+r2s/arm after a change in a compiled module of this package or of r2s/physics. A change in a module from which a
 compiled module imports constants also causes a recompilation. Compiled code may call functions only in its own
 package and in r2s/physics.
 """

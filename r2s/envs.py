@@ -61,7 +61,7 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
         TypeError: a name in `settings` is not in SETTINGS. UserError: a value or an override is wrong.
     """
     for name in settings:
-        if name not in SETTINGS:  # TypeError: only then does sb3 try again without render_mode
+        if name not in SETTINGS:  # after a TypeError, stable-baselines3 omits render_mode
             raise TypeError(f"unexpected keyword argument '{name}'; {instead_of(name, SETTINGS)}")
     words = [_word(k, v) for k, v in settings.items() if v is not None]
     if isinstance(overrides, str):

@@ -8,7 +8,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from types import ModuleType
 
-FAILED = "R2S_FAILED"  # environment variable that a sweep sets: file for the errors of its jobs
+FAILED = "R2S_FAILED"  # environment variable that a sweep sets: path of the file for the errors of its jobs
 
 
 class UserError(ValueError):

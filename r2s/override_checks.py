@@ -75,7 +75,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             return [o for o in loader.repository.get_group_options(group) if o != NO_OPTION]  # type: ignore[attr-defined]
 
         groups = {g: options(g) for g in loader.list_groups("") if g != "hydra"}
-        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # may select a launcher
+        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # may name a launcher
         of_groups = {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")}
         if of_hydra:
             _check_hydra(of_hydra, [*own, *experiments], of_groups)
@@ -155,7 +155,7 @@ def _jobs(
 
     Raises:
         UserError: -m is missing for a sweep, or the value of a group is wrong.
-        UnknownOption, HydraException: an override is refused; `_first_mistake` explains the error to the user.
+        UnknownOption, HydraException: an override is refused; `_first_mistake` then makes the message for the user.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
 

@@ -19,7 +19,7 @@ class Progress:
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
         self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
-        # time and share (not 0 in a resumed run) of the current part's first call, and share of the last call
+        # time and share at the first call in the current part (share > 0 in a resumed run); share at the last call
         self._part, self._first, self._share = self._began, -1.0, 0.0
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._bar: Bar | None = None
@@ -60,7 +60,7 @@ class Progress:
         now = time.perf_counter()
         if share < 0.5 * self._share or share < 1.0 <= self._share:  # the next part begins, such as another search
             self._first = -1.0
-            if self._bar:  # a full bar is treated as finished and would not show the time
+            if self._bar:  # rich treats a full bar as finished and hides its time
                 began = self._bar.tasks[0].start_time
                 self._bar.reset(self._task)
                 self._bar.tasks[0].start_time = began

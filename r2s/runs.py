@@ -71,7 +71,7 @@ class Run:
     """
 
     def __init__(self, root: Path, job: Job, *, resume: str | Path | None = None, exact_name: bool = False):
-        self._began = self._noted = time.monotonic()  # the wall clock may jump
+        self._began = self._noted = time.monotonic()  # monotonic: the wall clock may jump
         self._earlier: list[dict[str, Any]] = []  # earlier parts of a resumed run
         self._tables: dict[str, Any] = {}
         self.tracker: Any = None
@@ -151,7 +151,7 @@ class Run:
             for _, file in self._tables.values():
                 file.close()
             self._write_meta()
-        except OSError:  # if the disk is full, meta.json keeps the status running, as after a kill
+        except OSError:  # on a full disk, the status in meta.json remains running, as after a kill
             if error is None:
                 raise
         finally:
@@ -228,7 +228,7 @@ class Run:
         try:
             rows = [[float(v) if v else math.nan for v in row] for row in csv.reader(lines[1:])]
             kept = [dict(zip(head, row, strict=True)) for row in rows if row[head.index(column)] <= most]
-            # a finished run ends with two evaluations at the same step: drop the second, which a resumed run repeats
+            # a finished run has two evaluations at its last step: drop the second, which a resumed run repeats
             last = next((k for k, row in enumerate(kept) if row[column] == most), len(kept))
             del kept[last + 1 :]
         except ValueError as error:

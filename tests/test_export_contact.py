@@ -341,7 +341,7 @@ def test_every_plan_of_a_task_is_accepted(words):
         with pytest.raises(BundleError, match="row 7 of the plan: the setpoint's target is 30"):
             check_surface_plan(contract, model, changed(plan, 7, begin + 1, plan[7, begin + 1] + 0.3))
         if plan.shape[1] > begin + 12:  # a target that slides has a feedforward force
-            with pytest.raises(BundleError, match="row 7 of the plan: a feedforward force of 100 N; the training had"):
+            with pytest.raises(BundleError, match="row 7 of the plan: a feedforward force of 100 N; the"):
                 check_surface_plan(contract, model, changed(plan, 7, begin + 12, 100.0))
 
 

@@ -63,7 +63,7 @@ class AdapterContext:
 def observer(context: AdapterContext, filter_s: float) -> Adapter:
     """Return the disturbance observer of `adapt=observer`; raise UserError unless filter_s is above 0.
 
-    The observer's model has no declared payload: what the arm compensates itself is no disturbance.
+    The observer's model omits the declared payload: the arm compensates the payload's weight itself.
     """
     bare = replace(context.dynamics, declared_payload=np.zeros(4))
     return context.gated(Observer(make_arm_model(context.robot, bare), filter_s))

@@ -1,7 +1,7 @@
 """Convert an identified arm to arrays for compiled functions: links, friction and latency.
 
-A table for each joint, with a column for each speed and the rows FORWARD, BACKWARD and SPEED_ONLY, represents any
-friction law. At the presliding deflection z in [-1, 1], friction is z * FORWARD + SPEED_ONLY if z >= 0, else
+A table per joint represents any friction law. The table has a column for each speed, and the rows FORWARD, BACKWARD
+and SPEED_ONLY. At the presliding deflection z in [-1, 1], friction is z * FORWARD + SPEED_ONLY if z >= 0, else
 z * BACKWARD + SPEED_ONLY.
 """
 

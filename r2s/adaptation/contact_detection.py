@@ -27,8 +27,8 @@ def detect(thresholds, floor, state):
 
     A force test and an impact test check the hypothesis that no force acts. An impact raises the variances of the
     wrench filter, and high variances hide the impact from the force test. When the innovations rise suddenly, the
-    impact test therefore keeps the earlier covariance for at most IMPACT cycles. The impact test low-passes the
-    force, because vibrating gears make the estimated force oscillate.
+    impact test therefore uses the covariance before the rise, for at most IMPACT cycles. The impact test low-passes
+    the force, because vibrating gears make the estimated force oscillate.
     """
     x, P, contact, calm, smooth = state.x, state.P, state.contact, state.calm, state.smooth
     n = state.joints.shape[1]

@@ -1,8 +1,8 @@
 """Freeze an adapter in contact, because adapters treat a contact force as a model error and push against the force.
 
 In contact, the gate freezes the adapter's estimate and returns the torque that the adapter added REWIND cycles before
-the gate detected the contact. The weight of a payload that the arm's model lacks is no contact: the gate passes the
-estimated payload to the wrench observer. For an adapter without an `Estimator`, the gate runs its own.
+the gate detected the contact. The weight of a payload that the arm's model lacks is not a contact, so the gate passes
+the estimated payload to the wrench observer. If the adapter has no `Estimator`, the gate runs one.
 """
 
 from typing import Any, Protocol
@@ -28,7 +28,7 @@ class ContactGate:
     """Wrap an adapter, and freeze the wrapped adapter in contact.
 
     Args:
-        adapter: the wrapped adapter; its payload estimate is that of its attribute `estimator`, if it has one.
+        adapter: the wrapped adapter; the gate uses the payload estimate of its attribute `estimator`, if present.
         wrench: observer that detects contacts.
         arm, noise: arm model and its uncertainty for the gate's own estimator.
     """

@@ -35,14 +35,14 @@ class Estimate:
     centre: np.ndarray  # (3,) m in the payload frame; nan if the mass is not significant
     centre_half: np.ndarray
     tensor: np.ndarray  # (3, 3) kg m^2 about the center, of a physical body
-    friction: np.ndarray  # (n,), ratio to the model's friction
+    friction: np.ndarray  # (n,), friction / the model's friction
     friction_half: np.ndarray
     offset: np.ndarray  # (n,) Nm, difference from the model's offset
     offset_half: np.ndarray
     rests: bool  # no joint slides
     odds: float  # log odds of a payload change
-    changed: bool  # a payload change was detected in this span
-    beyond: bool = False  # mass - mass_half exceeds the largest payload, to which compensation is limited
+    changed: bool  # whether a payload change was detected in this span
+    beyond: bool = False  # whether mass - mass_half exceeds the largest payload, which limits compensation
 
 
 class Estimator:
@@ -129,7 +129,7 @@ class Estimator:
 
     @property
     def now(self) -> Estimate:
-        """Compute and return the estimate at the end of the last 20 ms span, which would be slow in `__call__`."""
+        """The estimate at the end of the last 20 ms span; computed on request, because `__call__` must be fast."""
         if self._now is None:
             self._now = self._report(self._changed)
         return self._now
@@ -175,8 +175,8 @@ def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the physical body nearest to x (10,): mass kg, center (3,) m, tensor (3, 3) kg m^2 about the center.
 
     Mass and first moments stay unchanged, because the data determine them well. The nearest non-negative second
-    moment about the center replaces the estimated one, so the pseudo-inertia [[Sigma, h], [h, m]] is positive
-    semi-definite.
+    moment about the center replaces the estimated second moment, so the pseudo-inertia [[Sigma, h], [h, m]] is
+    positive semi-definite.
     """
     m = float(x[0])
     if m <= 0.0:

@@ -2,10 +2,10 @@
 
 The feedforward uses the payload's estimated mass and center, clipped by `plausible_payload`. For joint j, the
 estimate x with covariance P predicts the torque c = h x - g_d in Nm. The vector h consists of ten payload terms
-(gravity, Coriolis, acceleration), the model's friction, and 1 for the offset. g_d is the weight of the declared
-payload, which the arm compensates itself. The torque c has the variance s^2 = h P h^T. The
-feedforward torque is w c with a weight w. For the true torque c*, the mean square error E (w c - c*)^2 is smallest at
-w = c*^2 / (c*^2 + s^2). Because c^2 - s^2 is an unbiased estimate of c*^2, r2s chooses the weight
+(gravity, Coriolis, acceleration), the model's friction, and 1 for the offset. The torque g_d is the weight of the
+declared payload, which the arm itself compensates. The torque c has the variance s^2 = h P h^T. The feedforward
+torque is w c with a weight w. For the true torque c*, the mean square error E (w c - c*)^2 is smallest at w = c*^2 /
+(c*^2 + s^2). Because c^2 - s^2 is an unbiased estimate of c*^2, r2s chooses the weight
 
     w = max(0, 1 - s^2 / c^2).
 
@@ -78,8 +78,8 @@ def plausible_payload(x, most, out):
     """Write a payload's inertial parameters (10,) to `out`; mass and center are the estimate x, clipped to `most`.
 
     most: (2,), largest mass in kg, and largest distance in m from the payload frame to the center. The payload has
-    the tensor of a ball of water, because data hardly determine tensors, and a wrong tensor would feed back the
-    acceleration.
+    the tensor of a ball of water, because data hardly determine tensors, and a wrong tensor would act as acceleration
+    feedback.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0

@@ -10,7 +10,7 @@ The state of an arm with n joints has N = 10 + 4 n components:
 The filter processes the momentum residual of one joint after the other. Breakaway or a vibrating gear causes large
 residuals for one or two spans of 20 ms. Huber's function (Robust Statistics, 1981) therefore reduces the weight of
 innovations beyond HUBER standard deviations. A payload change causes large innovations for longer, so the filter
-still follows it.
+still follows the change.
 """
 
 from typing import NamedTuple
@@ -63,12 +63,12 @@ class Filter(NamedTuple):
     P: np.ndarray  # (N, N), covariance
     signature: np.ndarray  # (ONSETS, N, 4), response of x to a jump
     information: np.ndarray  # (ONSETS, 4, 4), information matrix of the jump
-    vector: np.ndarray  # (ONSETS, 4), information times the estimated jump
-    counts: np.ndarray  # (5,), SPANS: all spans; AT_REST: successive spans at rest; USED, NEXT, SINCE_JUMP
+    vector: np.ndarray  # (ONSETS, 4), `information` times the estimated jump
+    counts: np.ndarray  # (5,), SPANS: all spans; AT_REST: successive spans at rest; see payload_jump.py
     log_odds: np.ndarray  # (2,), MEAN: log of the mean odds of all onsets; ONSET: index of the likeliest onset
     innovations: np.ndarray  # (2, n) Nm and Nm^2, innovations and their variances
-    # (n,), variance of white noise relative to `Noise`, at least 1; grows while innovations stay large, as when a
-    # gear vibrates under a load that no recording contains
+    # (n,), variance of white noise relative to `Noise`, at least 1
+    # This variance grows while innovations stay large, for example because a gear vibrates under an unrecorded load.
     noise_scale: np.ndarray
     work: np.ndarray  # (2, N), scratch: P h^T; per joint, variance of friction due to the payload
 

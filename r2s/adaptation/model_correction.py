@@ -1,6 +1,6 @@
 """Correct the identified model by a fit to recordings without a payload.
 
-An identification omits model terms that hardly improve the fit. A payload estimate needs such terms, because a
+An identification omits model terms that hardly improve the fit. A payload estimate needs these terms, because a
 torque error of 0.1 Nm at a lever arm of 0.5 m looks like a mass of 20 g. The correction therefore fits the terms of
 every joint (`TERMS`), missing inertia and latency, mass and first moments of every link, and the compliance of every
 gear. Each parameter has a prior with mean zero and a typical standard deviation, so the fit is a ridge regression
@@ -23,8 +23,8 @@ from r2s.physics.rigid_body import regressor
 from r2s.physics.robot import Robot
 
 ROUNDS = 3  # fits, each followed by an estimate of the residuals' RMS
-# terms of a joint, s the sign of its speed v: share of its friction, offset, s |gravity|, s, s sqrt v,
-# s / (1 + v / STRIBECK_SPEED), v, s sin q, s cos q, sin q, cos q
+# terms of a joint with speed v of sign s: share of its friction, offset, s |gravity|, s, s sqrt |v|,
+# s / (1 + |v| / STRIBECK_SPEED), v, s sin q, s cos q, sin q, cos q
 SHARE, OFFSET, LOAD, LAW, ANGLE, CABLE, TERMS = 0, 1, 2, 3, 7, 9, 11
 
 

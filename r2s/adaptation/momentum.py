@@ -25,8 +25,8 @@ class MomentumTerms(NamedTuple):
     uncompensated: np.ndarray  # (n,) Nm, gravity torque of the links that gravity compensation does not cancel
     compensated: np.ndarray  # (n,) Nm, gravity torque that gravity compensation cancels
     declared: np.ndarray  # (n,) Nm, the declared payload's part of `compensated`
-    payload_p: np.ndarray  # (n, 10), the payload's columns of p
-    payload_torque: np.ndarray  # (n, 10), the payload's columns of coriolis - uncompensated
+    payload_p: np.ndarray  # (n, 10), derivative of p with respect to the payload's parameters
+    payload_torque: np.ndarray  # (n, 10), derivative of coriolis - uncompensated, likewise
 
     @staticmethod
     def empty(n: int) -> "MomentumTerms":

@@ -27,14 +27,14 @@ CYCLE, COMMAND, ENDED = range(3)  # indices of `counts`: cycles of this span, al
 BEFORE, INTEGRAL = range(2)  # rows of `model`, `friction`, `payload`: value in the last cycle; integral over the span
 # rows of `sums`: residual Nm s, friction Nm s, momentum Nm s, q, dq, motor torque Nm
 RESIDUAL, FRICTION, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
-# first index of `sums`: falling, rising side in this span; rising side, whole triangle of the last span
+# first index of `sums`: falling, rising side of triangles in this span; rising side, whole triangle of the last span
 FALLING, RISING, LAST_RISING, LAST_WHOLE = range(4)
 RISING_SUM = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of a rising side; the falling side has SPAN - 1 to 0
 STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in spans 1 and 2
 
 
 class ResidualState(NamedTuple):
-    """The state that `update_residual` keeps from cycle to cycle, for n joints."""
+    """The state of `update_residual` between cycles, for n joints."""
 
     counts: np.ndarray  # (3,): CYCLE, COMMAND, ENDED
     commands: np.ndarray  # (SLOTS, n) Nm, delay line
@@ -43,7 +43,7 @@ class ResidualState(NamedTuple):
     deflection: np.ndarray  # (n,), presliding deflection in [-1, 1]
     model: np.ndarray  # (2, n): BEFORE Nm, INTEGRAL Nm s of the model torque
     friction: np.ndarray  # (2, n): BEFORE Nm, INTEGRAL Nm s of friction
-    payload: np.ndarray  # (2, n, 10): BEFORE, INTEGRAL of the payload's columns
+    payload: np.ndarray  # (2, n, 10): BEFORE, INTEGRAL of `MomentumTerms.payload_torque`
     sums: np.ndarray  # (4, SUMS, n), triangle sums
     payload_sums: np.ndarray  # (4, n, 10)
     motor_spans: np.ndarray  # (2, n) Nm, mean motor torque of the last two spans, latest first
@@ -64,7 +64,7 @@ class MomentumResidual(NamedTuple):
     """Residual of n joints at the end of a 20 ms span; all means are over the last three spans (60 ms)."""
 
     y: np.ndarray  # (n,) Nm, the residual
-    payload: np.ndarray  # (n, 10), the payload's columns of y
+    payload: np.ndarray  # (n, 10), derivative of y with respect to the payload's parameters
     friction: np.ndarray  # (n,) Nm, mean
     friction_path: np.ndarray  # (n,) Nm, total variation of friction in the last span
     sliding: np.ndarray  # (n,), 1 if the joint slid throughout the three spans
@@ -73,7 +73,7 @@ class MomentumResidual(NamedTuple):
     torque_rate: np.ndarray  # (n,) Nm/s, mean rate of the motor torque
     q: np.ndarray  # (n,) rad, mean
     dq: np.ndarray  # (n,) rad/s, mean
-    gear: np.ndarray  # (n, n) Nm^2/rad, columns of the gears' compliance in y
+    gear: np.ndarray  # (n, n) Nm^2/rad, derivative of y with respect to the gears' compliances
 
     @staticmethod
     def empty(n: int) -> "MomentumResidual":
@@ -160,7 +160,7 @@ def _add_to_sums(state, q, dq):
 def _close_span(arm, state, out):
     """Write the residual at the end of a 20 ms span; reset all integrals to zero, so that no integral grows large."""
     whole = SPAN * SPAN  # sum of the weights of a triangle
-    scale = 1.0 / (whole * SPAN * SIM_DT)  # from sums to a change of means per second
+    scale = 1.0 / (whole * SPAN * SIM_DT)  # converts sums to the change of means per second
     sums, slid, n = state.sums, state.slid, len(out.y)
     curvature = np.empty(n)  # Nm/s^2, second derivative of the motor torque
     for j in range(n):

@@ -65,7 +65,7 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
     """Return the momentum residuals of a recording with commanded torque, from each trajectory's third span on."""
     n, out = recording.n_joints, []
-    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # array type of an arm's signals
+    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # arrays of an arm's type
     for stretch in recording.stretches:
         state, r = ResidualState.fresh(n), MomentumResidual.empty(n)
         for k in range(stretch.start, stretch.stop):
@@ -82,9 +82,9 @@ def fit_noise(
     The motion `train` yields a first model correction. The residuals of the corrected model in the motion `other`
     determine the noise. Covariances of a joint's residuals at lags of 60 to 300 ms yield the joint's model error; the
     remaining variance yields white noise that grows with the momentum rate. A factor for each joint then scales the
-    joint's noise, so that the joint's innovations have the predicted variance. A factor on the noise of all joints
-    then limits the odds of a false payload change to the number of residuals. `train` and `other` together determine
-    the returned correction and the prior means of friction and offsets.
+    joint's noise, so that the joint's innovations have the predicted variance. Finally, a common factor scales the
+    noise of all joints until the odds of a false payload change are at most the number of residuals. `train` and
+    `other` together determine the returned correction and the prior means of friction and offsets.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)

@@ -129,7 +129,7 @@ def apply_jump(filter, noise):
         for k2 in range(N):
             for m in range(JUMP):
                 filter.P[i, k2] += root[i, m] * root[k2, m]
-    widen_payload(filter.P, noise)  # the jump may have happened within the span
+    widen_payload(filter.P, noise)  # because the jump may have happened within the span
     for c in range(JUMP, BODY):
         filter.P[c, c] += noise.prior[c] ** 2
     filter.counts[USED] = 0

@@ -236,7 +236,7 @@ def contact_thresholds(robot: Robot, observer: WrenchObserver, free: Sequence[Re
     """Return the contact thresholds (2,) for one false alarm per hour, determined from recordings without contact.
 
     Args:
-        robot, observer: the arm and its observer, of which `undeclared` processes the recordings.
+        robot, observer: the arm and its observer; the copy `observer.undeclared()` processes the recordings.
         free: recordings without contact and without a declared payload, such as those of an identification.
 
     Raises:

@@ -1,9 +1,9 @@
 """Estimate external wrench, momentum and friction error with a Kalman filter, in compiled code.
 
 The state has N = w + 2 n components: the wrench at the tip in base axes, with w = 3 (force) or 6 (force and moment);
-for each of n joints, the error b of the friction f = f_model + b, Nm; and the generalized momentum p, Nm s, which is
-measured in every cycle (momentum.py). Momentum obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
-and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
+each joint's error b of the friction f = f_model + b, Nm; and each joint's generalized momentum p, Nm s. The momentum
+is measured in every cycle (momentum.py) and obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
+and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Transactions on Industrial Electronics 65(2), 2018).
 
 The uncertainty of a joint's friction depends on whether the joint moves (wrench_friction.py).
 - The momentum of a joint in motion determines the wrench precisely, because the friction error b is small and has a
@@ -11,8 +11,8 @@ The uncertainty of a joint's friction depends on whether the joint moves (wrench
 - A joint at rest yields only bounds on the wrench. Friction at rest balances all other torques, and may be any torque
   between the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of
   a uniform distribution between the edges. If the friction family has bristles, the joint angle determines the
-  bristle deflection and thereby the friction, with a smaller variance. The edges have an error themselves
-  (EDGE_ERROR): while other joints move, a joint that breaks away later than identified must not look like a force.
+  bristle deflection and thereby the friction, with a smaller variance. The edges are uncertain (EDGE_ERROR):
+  a joint that breaks away at a larger torque than identified must not look like a force while other joints move.
 The filter assumes that the wrench changes when the tip moves against stiff surroundings. If all joints rest, the
 filter assumes that only a person's hand changes the force. Joint friction hides any force change that is too small to
 make a joint slide.
@@ -147,7 +147,7 @@ def _predict(noise, state):
         net = joints[KNOWN, j] - x[w + j]
         for c in range(w):
             net += J[c, j] * x[c]
-        for i in range(N):  # P = A P A^T, in the row and the column of p
+        for i in range(N):  # P = A P A^T changes only the row and the column of p
             total = -P[w + j, i]
             for c in range(w):
                 total += J[c, j] * P[c, i]

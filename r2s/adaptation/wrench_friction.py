@@ -122,7 +122,7 @@ def _model(arm, noise, state, j, angle, side, speed, moved):
 
 @njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
-    """Detect whether joint j rests; a resting joint that creeps counts as moving for one cycle."""
+    """Detect whether joint j rests; a joint at rest that creeps is treated as moving for one cycle."""
     crept, joints[CREEP, j] = joints[CREEP, j], 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])
@@ -149,14 +149,14 @@ def _unlagged(joints, j):
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, of a moving joint's friction from an uncertain sign and from uncertain presliding.
+    """Return the variance, Nm^2, that uncertain sign and uncertain presliding cause in a moving joint's friction.
 
     If the sign of a friction f is wrong with probability p, the variance is 4 f^2 p (1 - p).
     """
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # approximately the normal cdf
-    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # presliding, whose law is uncertain
+    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # due to presliding, whose law is uncertain
     return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent)
 
 

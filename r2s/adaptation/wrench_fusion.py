@@ -1,10 +1,10 @@
 """Combine two estimates of the external force: from the momentum and from an identified surface.
 
-The joint angles yield the tip's penetration depth, and the law of the surface (r2s/physics/surface.py) yields the
-normal force F_s. The variance s^2 of F_s comes from the surface's posterior, encoder noise, and errors of the law.
-The momentum yields the force F with covariance P. A Kalman update along the normal n combines F and F_s: F' = F + P n
-(F_s - n . F) / (n . P n + s^2). Before the update, a low-pass filters F_s - n . F, because the measured angles are
-noisy.
+The joint angles yield the tip's penetration depth, and the surface's contact law (r2s/physics/surface.py) yields the
+normal force F_s. The variance s^2 of F_s comes from the surface's posterior, encoder noise, and errors of the contact
+law. The momentum yields the force F with covariance P. A Kalman update along the normal n combines F and F_s:
+F' = F + P n (F_s - n^T F) / (n^T P n + s^2). Before the update, a low-pass filters F_s - n^T F, because the measured
+angles are noisy.
 
 The force F_s is wrong if the tip touches a different surface or if the identified surface has moved. An innovation
 test (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore rejects a surface
@@ -92,7 +92,7 @@ class FusedWrench(WrenchObserver):
 
     @property
     def wrench(self) -> np.ndarray:
-        """Force (3,) N on the arm's tip in base axes, fused from joint torques and the surface's law."""
+        """Force (3,) N on the arm's tip in base axes, fused from joint torques and the surface's contact law."""
         return self._fused
 
     @property
@@ -108,7 +108,7 @@ class FusedWrench(WrenchObserver):
 
 @njit(cache=True, error_model="numpy")
 def surface_force(law, k, tip, rate):
-    """Return force, N, and depth, m, of a tip (3,) m that penetrates surface k of `law.law` at `rate` m/s."""
+    """Return force, N, and depth, m, for a tip at (3,) m that penetrates surface k of `law.law` at `rate` m/s."""
     row = law.law[k]
     depth = law.radius
     for c in range(3):
@@ -118,7 +118,7 @@ def surface_force(law, k, tip, rate):
 
 @njit(cache=True, error_model="numpy")
 def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the normal force's variance, N^2, which posterior, encoder noise and errors of the law cause."""
+    """Return the normal force's variance, N^2, due to posterior, encoder noise and errors of the contact law."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count

@@ -10,15 +10,21 @@ from r2s.physics.kinematics import POSE
 from r2s.physics.newton_euler import WORK
 
 COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
-# indices of `WrenchState.contact`: low-passed mean of the joints' squared innovations, in variances; squared force in
-# variances, 0 if no joint moves; 1 in contact; cycles of the squared force above the contact threshold, below the
-# release threshold; path of the tip, m, along which the force pointed down; squared force of the impact test, cycles
-# above its threshold; SURPRISE over the last second; cycles since a sudden rise of SURPRISE above it
+# indices of `WrenchState.contact`
+# SURPRISE: low-passed mean of the joints' squared innovations, in variances. USUAL: its mean over the last second.
+# SQUARE: squared force in units of its covariance, 0 if no joint moves. TOUCHES: 1 in contact.
+# ABOVE, BELOW: cycles of SQUARE above the contact threshold, below the release threshold.
+# HANGING: path of the tip, m, along which the force pointed down. SURPRISED: cycles with SURPRISE far above USUAL.
+# IMPACT_SQUARE, IMPACT_ABOVE: squared force of the impact test, cycles above its threshold.
 SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, USUAL, SURPRISED, ENTRIES = range(11)
-# rows of `joints`: filtered angle rad; slow, fast speed rad/s; 1 at rest; successive slow cycles; reference angle at
-# rest, motion since rest began, creep of this cycle, rad; modeled friction now, a cycle ago, Nm; known torque without
-# motor and friction, mean known torque with both, motor torque, its mean in the coming cycle, Nm; variance of the
-# measured momentum (Nm s)^2; presliding deflection; two low-passes of the momentum Nm s, mean square of its fast part
+# rows of `joints`
+# ANGLE: filtered angle, rad. SLOW, FAST: low-passed speeds, rad/s. REST: 1 at rest. QUIET: successive slow cycles.
+# ANCHOR, MOVED, CREEP: reference angle at rest, motion since rest began, creep of this cycle, rad.
+# FRICTION, FRICTION_BEFORE: modeled friction now, a cycle ago, Nm. DEFLECTION: presliding deflection.
+# TORQUE, KNOWN: known torque without motor and friction, mean known torque with both, Nm.
+# MOTOR, MOTOR_MEAN: motor torque, its mean in the coming cycle, Nm.
+# MOMENTUM_NOISE: variance of the measured momentum, (Nm s)^2. SLOW_P: low-passed momentum, Nm s.
+# FAST_P: low-passed remainder of the momentum, Nm s. SHAKE: mean square of the momentum's high-frequency part.
 ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
 MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)
 
@@ -54,7 +60,7 @@ class WrenchState(NamedTuple):
     work: np.ndarray
     column: np.ndarray  # (N,)
     mass: np.ndarray  # (n, n) kg m^2, mass matrix
-    coupling: np.ndarray  # (n, n): momentum rate of a joint at rest (row) per net torque of a sliding one (column)
+    coupling: np.ndarray  # (n, n): momentum rate of a joint at rest (row) per net torque of a sliding joint (column)
     mass_rate: np.ndarray  # (n, n) kg m^2/s, rate of the mass matrix
 
     @staticmethod

@@ -84,7 +84,7 @@ class CommandLoop:
     def damp(self, hold: np.ndarray) -> None:
         """Damp the arm to rest (see `rest`), even if a stop was requested.
 
-        The driver needs a torque limit of ADDED + REST_SHARE times tau_max to hold the largest load while it damps.
+        To hold the largest load while damping, the driver needs a torque limit of (ADDED + REST_SHARE) * tau_max.
         """
         self._reset(hold)  # a low-pass that starts at zero would drop the load for 20 ms
         self.state = self.arm.read()
@@ -162,7 +162,7 @@ class CommandLoop:
     def halt(self, reason: str) -> None:
         """Damp the arm to rest under zero command, and raise ArmStopped with `reason`.
 
-        Do nothing if the driver is already stopping the arm, because every stop deviates from the planned motion.
+        Do nothing if the driver is already stopping the arm: then the stop itself causes the deviation from the plan.
         """
         if self.driver.stopping is not None:
             return

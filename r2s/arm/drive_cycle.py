@@ -27,10 +27,10 @@ from r2s.physics.safety_filter import (
 )
 
 STILL = 0.02  # rad/s, a slower joint is treated as at rest
-# rad/s, natural frequency of the spring that `resist` adds to a joint that keeps sliding during a stop. Our choice:
-# half of RATE of the safety filter, because the filter damps this spring.
+# rad/s, natural frequency of the spring that `resist` adds to a joint that still slides during a stop
+# Our choice: half of RATE of the safety filter, because the filter damps this spring.
 SPRING = 15.0
-RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while driving a moving joint; our choice
+RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while it drives a moving joint; our choice
 ADDED = 0.3  # share of tau_max that an adapter may add; enough for friction and 1.5 kg anywhere in a Panda's reach
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
 TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` would come too near
@@ -86,7 +86,7 @@ class Given(NamedTuple):
     """Inputs of the driver of m arms in one cycle.
 
     command: (m, c), commands, used if `new` is True. added: (m, n) Nm, adapter torques, used if `adds` is True.
-    hold: (m, n) Nm, part of the target torque that a stop keeps. contact: (m,), whether each arm is in contact.
+    hold: (m, n) Nm, part of the target torque that a stop still applies. contact: (m,), whether arms are in contact.
     """
 
     command: np.ndarray

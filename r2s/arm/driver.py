@@ -3,7 +3,7 @@
 In each cycle, the driver checks that the command is finite and recent (watchdog). The control law
 (r2s/physics/control_laws.py) computes a target torque, which passes soft start and low-pass. The driver adds the
 torque of an adapter (r2s/adaptation/adapter.py). The safety filter, which training also uses
-(r2s/physics/safety_filter.py), limits the sum of target and adapter torque. Finally, the driver limits the difference
+(r2s/physics/safety_filter.py), limits the sum of target and adapter torque. Finally, the driver limits the change
 from the torque that the arm applied in the last cycle. The driver has no clock and no connection to an arm: its only
 inputs are states and commands. Tests can therefore run the driver on a million adversarial inputs.
 
@@ -40,7 +40,7 @@ from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.safety_filter import filter_limits
 
-DEADLINE_S = 0.05  # s; the driver stops an arm without a new finite command for this time, or for PERIODS if longer
+DEADLINE_S = 0.05  # s; the driver stops an arm after this time (or, if longer, PERIODS) without a new finite command
 PERIODS = 2.5  # control periods of the policy
 DAMP_S = 0.5  # s, longest time to bring an arm to rest
 Q_INSIDE = 0.02  # rad; the driver stops an arm that comes this close to a position limit

@@ -1,4 +1,4 @@
-"""Record an arm while each joint in turn slides slowly under a multisine torque, to identify its gears."""
+"""Record an arm while each joint in turn slides slowly under a multisine torque, to identify the gears."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,11 +14,11 @@ from r2s.excitation.multisine import PERIOD_S, TORQUE_SHARE, gear_motion, multis
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-PAUSE_S = 1.0  # s added to the clock between two slides
+PAUSE_S = 1.0  # s, gap in the recorded time between two slides
 
 
 def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
-    """Raise UserError unless the slides of all joints keep the limits; `share` (`speed_share`) scales the speeds."""
+    """Raise UserError unless `gear_motion` of every joint is within the limits; `share` scales the speeds."""
     space = Space(robot)
     for joint in range(robot.n):
         motion = gear_motion(robot, joint, share)
@@ -33,7 +33,7 @@ def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
 def record_gear_motions(
     arm: Arm, *, progress: Callable[[int, int], None] | None = None, timing: Timing | None = None
 ) -> Recording:
-    """Run `gear_motion` and `multisine` of each joint; return the steady slides, one trajectory each.
+    """Run `gear_motion` with `multisine` for each joint; return the slides at steady speed, one trajectory each.
 
     The rows have the format of `r2s.arm.recorder.record` with commanded torque.
 

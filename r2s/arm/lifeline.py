@@ -1,8 +1,8 @@
 """Detect the death of another process without delay.
 
 When the owner of a robust mutex dies, the kernel marks the mutex (robust_list of futex(2)) before it unmaps the
-owner's memory. A child process gets a new parent id only after the kernel has unmapped the memory of its parent, tens
-of ms later if PyTorch is loaded.
+owner's memory. A check of the parent's id would be slower: the id changes only after the kernel has unmapped the
+parent's memory, tens of ms later if PyTorch is loaded.
 """
 
 import ctypes

@@ -28,7 +28,7 @@ from r2s.tasks.task import Episodes, Task
 Progress = Callable[[int, int], None]
 Result = tuple[Episodes, list[Stop], Timing]
 CHUNK = 25  # goals
-REPORT_S = 1.0  # s, between reports of the goals that the processes have finished
+REPORT_S = 1.0  # s, longest time between two calls of `progress`
 
 
 def run_parallel_episodes(
@@ -67,7 +67,7 @@ def run_parallel_episodes(
             done[chunk] = _run_chunk(job, chunk, after(chunk * CHUNK))
     else:
         context = multiprocessing.get_context("fork")
-        finished = context.Value("l", 0)  # goals that all processes have finished
+        finished = context.Value("l", 0)  # number of goals that all processes together have finished
         given = job, finished, os.getpid()
         with ProcessPoolExecutor(min(workers, len(chunks)), context, _initialize, given) as pool:
             waiting = {pool.submit(_run_as_process, chunk): chunk for chunk in chunks}
@@ -106,7 +106,7 @@ def _initialize(job: Any, finished: Any, parent: int) -> None:
     _job, _finished = job, finished
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not a handler that the parent process may have
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not a handler inherited from the parent process
     # a parent that is killed cannot end this process, and the pool's queue never reports the parent's end
     threading.Thread(target=follow, args=(parent, threading.Event()), daemon=True, name="follow").start()
 

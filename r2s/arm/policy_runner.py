@@ -69,7 +69,7 @@ class PolicyRunner:
 
     Attributes:
         stops: stops that ended episodes early. timing: see `Timing`.
-        done: number of `place` calls after which `halted` was None, so that an episode began.
+        done: number of episodes that began, which are the `place` calls after which `halted` was None.
         speeds: (1, T, n) rad/s, joint speeds after each control step of the last episode, see `smooth_speeds`.
         halted: reason why no further episode will run (a stop request, the operator's refusal after a stop, or too
             many failed attempts to reach a start); None: further episodes may run.
@@ -211,7 +211,7 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
     """Return smoothed joint speeds (k, n) rad/s of every `every`-th cycle, from the angles (n,) rad of all cycles.
 
     The speed in cycle i is the slope at i of a parabola fitted to the angles of the cycles i - SMOOTHING_CYCLES to
-    i + SMOOTHING_CYCLES (Savitzky and Golay, Anal. Chem. 36(8), 1964).
+    i + SMOOTHING_CYCLES (Savitzky and Golay, Analytical Chemistry 36(8), 1964).
     """
     window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
     if window < 3:

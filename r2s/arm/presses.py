@@ -27,7 +27,7 @@ from r2s.recordings.recording import Recording
 from r2s.tasks.wipe import WipeTask
 
 LOADS = 0.25, 0.9  # lowest and highest force of a path, as shares of the controller's largest force
-PAUSE_S = 2.0  # s added to the clock between two paths, so that identification/contact treats them as two presses
+PAUSE_S = 2.0  # s, gap in the recorded time between two paths, which identification/contact treats as two presses
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def press_plan(
     """Return the plan for a plane whose point (3,) m and normal (3,) are known within 5 mm and 5 degrees.
 
     With `force_max`, N, and `speed_near`, m/s (see `PushLimit`), the driver limits force and closing speed. The
-    forces of the plan are then low enough that `force_max` allows them, whatever force joint friction hides.
+    plan's forces are then low enough to respect `force_max`, however much force joint friction hides.
 
     Raises:
         UserError: the robot has no tool, the plane is invalid, or a limit is out of range or too low to press.
@@ -72,7 +72,7 @@ def press_plan(
                 f"safety.force_max: {force_max:g} N is not allowed with data.presses; {least:.3g} N or more is: the "
                 f"largest force is {low:.3g} N or more, and joint friction may hide {hidden:.2g} N in each direction"
             )
-        high = min(high, (force_max - 2.0 * hidden) * (1.0 - 1e-9))  # round-off must not exceed `force_max`
+        high = min(high, (force_max - 2.0 * hidden) * (1.0 - 1e-9))  # so that round-off does not exceed `force_max`
         low *= high / (LOADS[1] * most)
     return replace(plan, force=(low, high)).pushing_within(robot, dynamics.level, force_max, speed_near)
 
@@ -92,7 +92,7 @@ def record_presses(
     The rows have the format of `r2s.arm.recorder.record`. The recorded time has gaps of PAUSE_S between paths.
 
     Args:
-        arm: the arm, which moves above the start of each path and always stops at the end.
+        arm: the arm, which moves to a posture above the start of each path, and always stops at the end.
         seed: random seed of the paths. progress: called after every path with (paths done, total).
         timing: receives the durations of the cycles. dynamics: dynamics of the arm.
 

@@ -25,7 +25,7 @@ from r2s.recordings.recording import Recording
 # The ramp
 SLOW_TAU_MAX = 40.0  # Nm: joints with at least this tau_max have a large inertia and get a slower ramp
 SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; at 4 Nm/s light links move visibly within ms
-MAX_SHARE = 0.2  # share of tau_max, default for the largest torque of a ramp
+MAX_SHARE = 0.2  # share of tau_max, default of a ramp's largest torque
 AFTER_MOTION = 5  # cycles recorded after the joint has moved
 STRAY = DEVIATION  # rad: a ramp ends if any joint moves this far; an arm this far off its pose returns to the pose
 POSE_MARGIN = 0.15  # rad from a pose to the position limits; more than any joint moves in one ramp
@@ -34,14 +34,15 @@ UNFILTERED_HZ = 1e30  # disables the driver's low-pass, because a ramp has no st
 BANDWIDTH = 20.0  # rad/s, of the three poles: well damped with 5 ms of delay and 3 ms of lag
 DAMPED_CYCLES = 20  # cycles of damping only, because a spring would slowly pull a joint back to where braking began
 BRAKE_SHARE = 0.1  # largest braking torque / tau_max: so small that the rate limit adds no delay
-BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; attempts to stop before the next ramp starts anyway
-RELEASE_CYCLES = 10  # cycles in which the torque fades, of the rest before a ramp, and of mean angles in braking
-# rad/s, mean speeds: braking ends with all joints below SLOW, the next joint below STILL; at rest: below SLIDING
+BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; stop attempts after which the next ramp starts anyway
+RELEASE_CYCLES = 10  # cycles of the torque's fade, of the rest before a ramp, and of each mean angle in braking
+# rad/s, mean speeds: braking ends when all joints are below SLOW and the next joint is below STILL
+# A joint below SLIDING is at rest.
 SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return postures (count, n) rad: home, then steps of +-0.3 rad per joint, clipped 0.2 rad inside limits."""
+    """Return postures (count, n) rad: the k-th is home +-0.3 k rad per joint, clipped 0.2 rad inside limits."""
     change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
     poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
@@ -94,7 +95,7 @@ def ramp(
     # all joints in one direction, then in the other, so that each joint rests in between
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
-    # most: a ramp's largest command, plus the command that stops a sliding joint; 2 * most bounds friction
+    # most: a ramp's largest command, plus the largest braking command; 2 * most is an upper bound of friction
     most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
     timing = timing or Timing()
     how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot), "speed_share": speed_share(arm)}
@@ -189,7 +190,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints (`next_joint` below STILL), then fade the command to `base`; repeat if a joint moves."""
+        """Brake all joints (`next_joint` to below STILL), then fade to the command `base`; repeat on motion."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -198,7 +199,7 @@ class _Drive:
             still = self.rest()
             if still.all():
                 return
-            if attempt:  # not after the first attempt, when bristles that spring back may cause motion
+            if attempt:  # not after the first attempt: bristles that spring back may still cause motion
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:

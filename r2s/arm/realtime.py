@@ -14,7 +14,7 @@ import numpy as np
 from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.physics.robot import SIM_DT
 
-PRIORITY = 80  # of SCHED_FIFO; libfranka's own thread has the highest, 99
+PRIORITY = 80  # SCHED_FIFO priority; libfranka's own thread has the highest, 99
 SWITCH_S = 1e-4  # longest wait for Python's global lock while another thread computes; the default is 5 ms
 LOCK_ALL = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT of mlockall(2): pages stay in memory after first use
 LEAST_SUCCESS = 0.99  # share of the commands that must reach the arm in time

@@ -1,12 +1,12 @@
 """Run a policy on an arm whose clock does not wait: a separate process runs the 1 kHz cycle.
 
-The arm's process continues whatever happens to the policy's process. If no new command arrives within the driver's
-deadline, the driver damps and stops the arm. A thread would not suffice, because a policy that holds Python's global
-lock blocks all threads. The processes share memory without a lock, because a killed process would not release a lock.
+The arm's process does not depend on the policy's process: if no new command arrives within the driver's deadline, the
+driver damps and stops the arm. A thread would not suffice, because a policy that holds Python's global lock blocks
+all threads. The processes share memory without a lock, because a killed process would not release a lock.
 
-The arm's process runs in its own session, so signals from the terminal do not reach this process. If the policy's or
-the arm's process receives a signal, or the policy's process ends, the arm's process damps and ends every motion,
-including the motion to a start (r2s/arm/stop_request.py).
+The arm's process runs in its own session, so signals from the terminal do not reach it. If the policy's or the arm's
+process receives a signal, or the policy's process ends, the arm's process damps and ends every motion, including the
+motion to a start (r2s/arm/stop_request.py).
 """
 
 import multiprocessing
@@ -36,7 +36,7 @@ from r2s.tasks.task import State, Task
 
 START_S = 240.0  # longest time for the arm's process to import, compile and connect to the arm
 POLL_S = 2e-4  # s between two reads of shared memory, a fifth of a cycle
-EXIT_S = 5.0  # s for the arm to come to rest at the end; 2 EXIT_S: SIGTERM to the arm's process, 4 EXIT_S: SIGKILL
+EXIT_S = 5.0  # s for the arm to come to rest; its process gets SIGTERM after 2 EXIT_S, SIGKILL after 4 EXIT_S
 READ_ATTEMPTS = 10  # most attempts to read a slot that is being written; then `Slot.read` returns None
 
 

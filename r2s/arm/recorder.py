@@ -42,8 +42,9 @@ def record(
     """Follow the excitation at 1 kHz and return the recorded motion.
 
     Row k contains the arm's state in cycle k and the time t by the arm's clock. With torque='commanded', tau[k] is
-    the command of cycle k, which the arm reports as tau_J_d in cycle k + 1. A simulation of tau[k : k + m] from
-    state k predicts q[k + 1 : k + m + 1]. With torque='measured', tau[k] is tau_J of cycle k, as in robot logs.
+    the command of cycle k, which the arm reports as tau_J_d in cycle k + 1. A simulation that starts in state k and
+    applies tau[k : k + m] predicts q[k + 1 : k + m + 1]. With torque='measured', tau[k] is tau_J of cycle k, as in
+    robot logs.
 
     Args:
         arm: the arm, which moves to the first posture of the excitation, and always stops after the recording.

@@ -22,7 +22,7 @@ GRACE_S = 2.0  # s for a motion to end (driver and `rest` need at most 0.5 s eac
 
 
 class _Request:
-    """The stop request of this process; `ending`: whether a motion is stopping; `served`: whether all have ended."""
+    """The stop request of this process; `ending`: a motion is stopping; `served`: all motions have ended."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []

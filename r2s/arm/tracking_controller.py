@@ -29,7 +29,7 @@ LOADED_DEVIATION = 0.5  # rad
 class TrackingController:
     """PD control with the nominal model's feedforward torque and an adaptive estimate of friction and offset.
 
-    The estimate of each joint is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max), where the vector theta contains
+    The estimate of each joint is theta^T (1, tanh(dq_ref / 0.03), dq_ref / dq_max), where the vector theta contains
     offset, Coulomb friction and viscous friction. The controller adapts theta during the motion, within limits, as in
     Slotine and Li (IJRR 6(3), 1987). Light wrist joints need the estimate, because their small PD gains may not
     overcome friction. The PD gains are BANDWIDTH^2 M and 2 BANDWIDTH M with the nominal mass matrix M. Gains
@@ -50,7 +50,7 @@ class TrackingController:
         self._theta = np.zeros((3, robot.n))
         friction = friction_margin(robot)
         self._theta_max = np.array([OFFSET_SHARE * robot.tau_max, friction, friction])
-        # inertia of each joint without torque on the other joints; the estimate of a light joint must adapt slowly
+        # inertia of each joint while the others are free to move; the estimate of a light joint must adapt slowly
         inertia = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
         self._gain = ADAPTATION_RATE * SIM_DT * BANDWIDTH**2 * inertia  # Nm per rad/s, see `__call__`
         self._correction = CORRECTION_SHARE * robot.tau_max

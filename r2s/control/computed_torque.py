@@ -3,7 +3,7 @@
     tau = action + ID(q_r, dq_r, ddq_r) + M(q_r) (w^2 (q_d - q) + 2 w (dq_d - dq))
 
 ID is the inverse dynamics of the identified arm, with friction and without gravity. q_d is the present reference
-position. q_r is the reference position at the later time when the torque acts, so that latency does not delay the
+position. q_r is the reference position at the time when the torque will act, so that latency does not delay the
 feedforward (Spong, Hutchinson and Vidyasagar, Robot Modeling and Control, ch. 8).
 """
 

@@ -23,7 +23,7 @@ class ControlledTask(Protocol):
     def cutoff_hz(self) -> float: ...  # noqa: D102
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return the task's limit (n,) Nm of each joint's target torque."""
+        """Return the task's limit (n,) Nm on the target torque of each joint."""
         ...
 
 
@@ -79,9 +79,9 @@ class Controller:
         return np.empty((len(t), 0))
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that holds the law's model, for example with a payload, at rest at q (n,) rad.
+        """Return the torque (n,) Nm that holds the control law's arm model, and its payload, at rest at q (n,) rad.
 
-        While the driver brings the arm to rest, the driver continues to apply this holding torque.
+        While the driver brings the arm to rest, the driver continues to apply this torque.
         """
         return np.zeros(len(q))
 

@@ -26,7 +26,8 @@ from r2s.physics.newton_euler import COM, LINK, MASS, links_of
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 
 ACTIONS = ("target", "stiffness", "both")
-# springs' share of the force that the torque limit allows in all directions at home; damping and feedforward use more
+# largest spring force as a fraction of the force that the torque limit allows in all directions in the home posture;
+# the rest of the torque limit is for damping and feedforward
 CLIP = 0.7
 CLIP_M = 0.05  # m, error at which the default spring saturates
 
@@ -178,10 +179,10 @@ def cartesian_impedance(
             null-space spring to q_home.
         hybrid: whether to control the force along a surface normal, and the impedance only along the surface. An
             action that displaces the target against the normal adds the force stiffness * displacement. If
-            `task.approaches`, the target moves into the surface, and the spring to the target limits the force, so
-            that the tip is no faster than the target.
-        normal, force: (3,) out of the surface in the base frame, and push against the normal, N. If both are None,
-            the task's values apply.
+            `task.approaches`, the target moves into the surface, and the force is at most stiffness times the depth
+            of the target below the tip, so that the tip is no faster than the target.
+        normal, force: normal (3,) out of the surface, in the base frame; contact force against the normal, N. If both
+            are None, the task's values apply.
         integral_rate: 1/s, integral gain on a measured force error. integral_max: integral limit / force_clip.
 
     Raises:
@@ -297,7 +298,7 @@ def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _action(
     action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an action's scale and offset; write to `parameters` at which indices a command contains the action."""
+    """Return an action's scale and offset; write the indices of the action in a command to `parameters`."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
     parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]

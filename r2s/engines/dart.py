@@ -22,9 +22,9 @@ class DartEngine:
 
     Args:
         robot: the arm; its MJCF defines kinematics, inertia and limits.
-        gravity: whether gravity acts. If False, the arm compensates gravity, as in libfranka.
-        masses, coms, inertias: of the n moving links, mass (n,) kg, center of mass (n, 3) m, and tensor (n, 3, 3)
-            kg m^2 about the center of mass, in link axes. If None, the MJCF's values.
+        gravity: whether gravity acts; False for an arm that compensates gravity itself, as in libfranka.
+        masses, coms, inertias: mass (n,) kg, center of mass (n, 3) m, and tensor (n, 3, 3) kg m^2 about the center of
+            mass, of the n moving links, in link axes. If None, the MJCF's values.
         armature: (n,) kg m^2, armature of the joints. If None, the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
@@ -54,8 +54,8 @@ class DartEngine:
                     raise UserError(f"{name}: expected shape {own[bodies].shape}, got {np.shape(value)}")
                 own[bodies] = value
         self.robot = robot
-        # DART has no armature A. Damping A/h plus the torque (A/h) v is exactly equivalent: the implicit step solves
-        # (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
+        # DART has no armature A. Damping D = A/h and the torque (A/h) v together are exactly equivalent to A:
+        # DART's implicit step h at speed v solves (M + h D) a = tau + (A/h) v - D v, that is, (M + A) a = tau.
         self._armature = np.array(robot.armature if armature is None else armature, dtype=float)
         self._damping = self._armature / SIM_DT
         self._counter = self._damping if self._armature.any() else None

@@ -1,4 +1,4 @@
-"""Run episodes one by one in an engine other than MuJoCo, with MuJoCo's goals, start states and random arms."""
+"""Run episodes one by one in an engine other than MuJoCo, with the goals, starts and random arms used in MuJoCo."""
 
 from collections.abc import Callable
 

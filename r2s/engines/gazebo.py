@@ -44,7 +44,7 @@ class GazeboEngine:
         os.environ.setdefault("GZ_IP", "127.0.0.1")
         os.environ.setdefault("GZ_PARTITION", f"r2s-{uuid.uuid4().hex}")  # isolates this server
         self._robot = robot
-        # SDF has no rotors: the file has damping A/h, and a torque cancels it (r2s/engines/dart.py)
+        # SDF has no rotors, so damping and a torque represent the armature, as in r2s/engines/dart.py
         self._counter = dynamics.armature / SIM_DT
         self._names = [link.joint for link in chain(robot, dynamics)[0]]
         self._joints: list = []

@@ -55,8 +55,9 @@ class GazeboClassicEngine:
 
     def __init__(self, robot: Robot, dynamics: Dynamics, physics: str = "ode"):
         self._n, self._limit = robot.n, robot.tau_max
-        # SDF has no rotors. For DART the file has damping A/h, and a torque cancels it (r2s/engines/dart.py). ODE's
-        # damping is not implicit, so with ODE the torque -A ddq acts; MuJoCo computes ddq of links with rotors.
+        # SDF has no rotors. For DART, damping and a torque represent the armature, as in r2s/engines/dart.py.
+        # ODE's damping is not implicit. For ODE, r2s therefore adds the torque -A ddq of the armature A;
+        # MuJoCo computes the acceleration ddq of the arm with rotors.
         self._rotors = None
         if physics == "ode" and dynamics.armature.any():
             self._rotors = single_arm(robot, dynamics)
@@ -108,7 +109,7 @@ class GazeboClassicEngine:
             mujoco.mj_forward(self._rotors, data)
             force -= self._rotors.dof_armature * data.qacc
         command = np.concatenate([[self._start], force, self._q, self._dq])
-        with suppress(BrokenPipeError):  # `_read` raises the error
+        with suppress(BrokenPipeError):  # `_read` then raises UserError
             os.write(self._commands, command.tobytes())
         self._start = False
         self._q, self._dq = self._read()
@@ -140,7 +141,8 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 def gzserver() -> list[str]:
     """Return the command that starts `gzserver`.
 
-    If R2S_GAZEBO_ROOT is set, the dynamic loader of this root starts `gzserver`, because chroot needs root rights.
+    If R2S_GAZEBO_ROOT is set, the dynamic loader in this directory starts `gzserver`: chroot would need administrator
+    rights.
 
     Raises:
         UserError: `gzserver` or the plugin is missing.

@@ -22,7 +22,8 @@ from r2s.physics.robot import SIM_DT, Robot
 SEGMENT_S = 60.0  # s, longest segment: two minutes of a series need 1 GB
 LONGEST_S = 600.0
 PEAKS = 1.875, 5.7735  # peak velocity and acceleration of a minimum-jerk motion of 1 rad in 1 s
-SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor on the duration while torque is too high; most trials
+# s, shortest leg; factor on its duration if torque is too high; most trials
+SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8
 EVERY = round(1 / (COARSE_HZ * SIM_DT))  # ms between two samples that a design evaluates
 
 

@@ -41,7 +41,7 @@ LEAST_S = 5 * BLEND_S
 TOP_HZ = 1.0  # frequency of the highest harmonic at full speed
 DECAY = 1.5  # harmonic k has an amplitude proportional to k^-DECAY: the acceleration limit bounds high harmonics
 SHORTEST_S = 4.0  # s, minimum fundamental period
-RANGE = 0.8  # share of the distance from the center to the nearer position limit, or of pi rad if pi is less
+RANGE = 0.8  # share of min(distance from the center to the nearer position limit, pi rad)
 SPEED = 0.65  # share of dq_max
 ACCELERATION = 0.7  # share of ddq_max
 STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then the joint catches up at a higher speed
@@ -52,7 +52,7 @@ TRIES = 5  # candidates per step of the local search
 MIN_AMPLITUDE = 0.3  # share of a joint's largest amplitude; a series that is safe only below this share is dropped
 MARGIN = 0.3  # least `_safety`: 0.3 of a clearance and 0.03 of tau_max, a reserve for motion between two samples
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
-FINE = 10  # ratio of the sample rate for limits to the sample rate for information and safety
+FINE = 10  # sample rate for limits / sample rate for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
 Samples = tuple[np.ndarray, ...]  # offset from the center, velocity, acceleration
 # Scores (B,) of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)

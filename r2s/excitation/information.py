@@ -15,7 +15,7 @@ MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, for each coordinate of it
 SCALE_PRIOR = 0.3  # share of a link's tensor, or of its trace
 DELAY_PRIOR = 3e-3  # s
 SLOPE = 0.05  # share of dq_max, width of the sign change of friction
-RESTING = 1e-3  # share of dq_max; a slower joint may stick, so that the joint's torque carries no information
+RESTING = 1e-3  # share of dq_max; a slower joint may stick, so that the joint's torque contains no information
 
 
 def information(

@@ -178,9 +178,9 @@ class Space:
     an arm stops beyond its `DeviationLimits`, which depend on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, smallest required distances. The first element, of the end effector above z_min, is only a
-            scale for fourier.py, because `gaps` requires 0 m. Distances of geoms above the table follow, then
-            distances between the two geoms of each pair.
+        clearance: (K,) m, smallest required distances. Element 0 is for the end effector above z_min: fourier.py uses
+            it as a scale, while `gaps` requires 0 m. Distances of geoms above the table follow, then distances
+            between the two geoms of each pair.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -220,7 +220,7 @@ class Space:
             )
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # so that an arm can return to a low home posture
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
-        # required distances are at most `clearance` or half of those at home, so that an arm may return home
+        # upper limit of required distances, for a return home: half the distance at home or, if larger, `clearance`
         self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
@@ -258,7 +258,7 @@ class Space:
         far = np.linalg.norm(moved, axis=2) + radius[:, None]
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         between = (joint >= link[a, None]) & (joint < link[b, None])
-        # a joint between two links changes their distance equally, whichever link moves: use the smaller bound
+        # either link may be regarded as moved by a joint between them: both bounds hold, use the smaller one
         return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:

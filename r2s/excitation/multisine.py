@@ -1,4 +1,4 @@
-"""Plan the motions that show elastic gears: each joint in turn slides slowly under an added multisine torque.
+"""Plan motions that reveal the gears' elasticity: each joint in turn slides slowly under an added multisine torque.
 
 While a joint slides in one direction, its friction is nearly constant, so the response of the motor's angle to the
 multisine is linear. The multisine repeats every PERIOD_S, so its spectrum has lines only at LINES_HZ (Pintelon and
@@ -16,14 +16,15 @@ from r2s.physics.robot import SIM_DT, Robot
 
 PERIOD_S = 2.0  # s, of the multisine; also the time of steady sliding in each leg
 LEGS = 4  # slides per joint, to and fro; an even number
-RAMP_S, SETTLE_S = 0.5, 0.25  # s, to the sliding speed; until the tracking loop has settled (5 of its time constants)
+# s, time to reach the sliding speed; time for the tracking loop to settle (5 time constants)
+RAMP_S, SETTLE_S = 0.5, 0.25
 LEG_S = 2 * RAMP_S + SETTLE_S + PERIOD_S
 # Sliding speed / dq_max: 0.15 rad/s for a Panda's strong joints, above usual Stribeck velocities (0.01 to 0.1 rad/s)
 SPEED = 0.07
 SLOW_SHARE = 0.3  # largest sliding speed as a share of a reduced speed limit
 # Lines spread over the resonances of arms, 10 to 80 Hz
 LINES_HZ = np.unique(np.round(np.geomspace(6.0, 120.0, 24) * PERIOD_S)) / PERIOD_S
-RIPPLE = 0.05  # velocity of each line / sliding speed; 24 lines then rarely reach the sliding speed
+RIPPLE = 0.05  # velocity of each line / sliding speed; the sum of 24 lines then rarely reaches the sliding speed
 RATE_SHARE, TORQUE_SHARE = 0.4, 0.05  # largest torque rate / dtau_max and torque / tau_max of the multisine
 DRAWS = 200  # random phases tried; those with the lowest peak torque rate are used
 MARGIN = 0.15  # rad, distance kept to the position limits
@@ -65,7 +66,7 @@ def slides() -> list[slice]:
 def multisine(robot: Robot, joint: int, motion: Excitation) -> np.ndarray:
     """Return the multisine torque (T,) Nm for all rows of a `gear_motion`; it fades in and out with the speed.
 
-    Light joints get a multisine of constant velocity amplitude, heavy joints one of constant torque rate.
+    All lines have the same velocity amplitude in light joints, and the same torque rate in heavy joints.
     """
     inertia = 1 / np.linalg.inv(mass_matrix(robot, robot.q_home[None])[0])[joint, joint]  # other joints free
     omega = 2 * np.pi * LINES_HZ

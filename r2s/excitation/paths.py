@@ -19,8 +19,8 @@ SAME = 1e-3  # rad, a joint this close to its target need not move
 def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, space: Space) -> np.ndarray:
     """Return the first candidate path (k, n) rad from q_from to q_to without `path_violation`.
 
-    The candidates are the straight line, one path of two lines through q_home, two paths that move one joint at a
-    time (from the last or from the first joint on), and two paths through q_home that move one joint at a time.
+    The candidates are, in this order: the straight line; two lines through q_home; two paths that move one joint at a
+    time, starting with the last or the first joint; two such paths through q_home.
 
     Args:
         robot: limits and links.
@@ -62,7 +62,7 @@ def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
 def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
     """Return a description of the first violation of limits or clearances on a path (k, n) rad, or "".
 
-    A distance that is already too small at the first posture, where the arm is, may decrease by at most CLOSER_M.
+    If a distance is already too small at the first posture, the present one, it may decrease by at most CLOSER_M.
     """
     if path.ndim != 2 or len(path) < 2 or path.shape[1] != robot.n:
         return f"expected postures of shape (2 or more, {robot.n}), got {path.shape}"
@@ -79,7 +79,7 @@ def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
     here = space.gaps(path[:1])[0]
     least = np.where(here < 0, here - CLOSER_M, 0.0)
     for k in range(len(path) - 1):
-        # between two samples no point of the arm moves more than twice the clearance
+        # dense samples: between two of them, no point of the arm moves more than twice the clearance
         count = 1 + int(np.ceil(np.abs(path[k + 1] - path[k]).sum() * space.reach / (2 * CLEARANCE_M)))
         share = np.linspace(0, 1, count + 1)[1:]
         postures = path[k] + share[:, None] * (path[k + 1] - path[k])

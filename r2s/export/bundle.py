@@ -42,7 +42,7 @@ IDENTIFIED = ("parameters.yaml", "posterior.npz")
 # modules that r2s_runtime.py of a bundle contains in addition to runtime.py, in this order
 HERE, PARTS = "r2s.export.", ("law", "arm", "push", "control", "inverse_dynamics", "plan", "surface", "fences")
 EXAMPLES = 4  # number of example plans in a bundle
-PLAN = "plan.npy"  # the first example plan if plans are on a surface; the C++ loop reads it
+PLAN = "plan.npy"  # first example plan, which the C++ control loop reads; only for plans on a surface
 SAME = 1e-4  # allowed difference between the actions of policy.onnx and policy.pt, as a share of action_scale
 
 
@@ -62,7 +62,7 @@ def write_bundle(
         to: the new folder. source: run folder of the training.
         robot, task, policy, config: robot, task, policy and config of the training.
         dynamics: dynamics of one arm, at the center of the training's domain randomization.
-        places: names of all simulators and arms; the model card lists where the policy has not run.
+        places: names of all simulators and arms; the model card lists those on which the policy has not run.
 
     Raises:
         UserError: `to` exists, the run has no policy.onnx, or policy.onnx and policy.pt compute different actions.
@@ -127,7 +127,7 @@ def check_with_own_runtime(folder: Path) -> None:
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
-    """Copy policy.onnx, and check that its actions equal those of policy.pt and its metadata equal the contract."""
+    """Copy policy.onnx; check that its actions agree with policy.pt, and its metadata with the contract."""
     import onnx
     from onnx.reference import ReferenceEvaluator
 

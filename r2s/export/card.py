@@ -76,7 +76,7 @@ def card(
 
 
 def contacts(contract: Mapping[str, Any]) -> str:
-    """Return a phrase for the model card: which contacts did not occur in the training."""
+    """Return a phrase for the model card that names the contacts that did not occur in the training."""
     return "no contact but of the tip" if contract["goal"]["kind"] == "surface" else "no contact"
 
 
@@ -150,7 +150,10 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"simulator or arm (run)": measures} for a policy's done or stopped transfers with finite `measure`."""
+    """Return {"simulator or arm (run)": measures} of the policy's transfers that are done or stopped.
+
+    Leave out rows in which `measure` is missing or not finite.
+    """
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:

@@ -185,7 +185,7 @@ def controller(control: Controller, task: Task) -> dict[str, Any]:
 
 
 def links_of(robot: Robot, dynamics: Dynamics) -> list[dict[str, Any]]:
-    """Return each link's joint pose and axis at angle zero, and mass, center of mass and tensor in the link frame."""
+    """Return for each link: pose and axis of its joint at angle 0; mass, center and tensor in the link frame."""
     out = []
     for k in chain(robot, dynamics, friction=False)[0]:
         row: dict[str, Any] = {"place": k.origin[:3, 3], "frame": k.origin[:3, :3], "axis": k.axis}
@@ -312,7 +312,7 @@ def identified(arm: InverseDynamics, ahead_s: float, kind: str) -> dict[str, Any
 
 
 def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[Any]]:
-    """Return {name in UNITS: n values}, the parameters of safety filter and driver that differ between joints."""
+    """Return {name in UNITS: n values}, the parameters of safety filter and driver that have a value per joint."""
     matrix = law.filter_limits(robot, task.torque_limit(robot))
     values = [matrix[:, k] for k in range(law.COLUMNS)]
     values += [friction, task.torque_limit(robot), robot.q_min + driver.Q_INSIDE, robot.q_max - driver.Q_INSIDE]

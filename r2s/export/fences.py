@@ -17,8 +17,8 @@ import numpy as np
 from r2s.export.law import BundleError, Model
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")  # Ctrl-C, kill, a closed terminal, Ctrl-\, Ctrl-Z
-POLL_S = 1e-4  # s, time after which the policy's thread looks again for an observation: a tenth of a cycle
-ROUNDING_M = 1e-6  # m, tolerance of the border of the region of goals
+POLL_S = 1e-4  # s, interval at which the policy's thread looks for a new observation: a tenth of a cycle
+ROUNDING_M = 1e-6  # m, tolerance at the border of the goal region
 AGREE_M = 1e-3  # m, allowed distance between a position in a plan and the position that the plan's joint angles reach
 
 
@@ -70,7 +70,7 @@ def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None
             raise BundleError(f"row {row} of the plan is {1e3 * off:.1f} mm from where its joint angles take the arm")
 
 
-BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # limits in the law, and what null means
+BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # limits in the law: the value for null
 
 
 class PolicyThread:
@@ -107,13 +107,13 @@ class PolicyThread:
                 continue
             try:
                 self._made.append((motion, np.concatenate([self._act(seen), setpoint])))
-            except Exception:  # without commands the driver stops the arm
+            except Exception:  # the driver stops the arm if no command arrives
                 continue
 
 
 @contextmanager
 def stopped_by_signals(runtime: Any) -> Iterator[None]:
-    """Bring the arm to rest on a signal of SIGNALS instead of ending the program; call only in the main thread."""
+    """On a signal in SIGNALS, bring the arm to rest instead of ending the program; call only in the main thread."""
 
     def stop(number: int, frame: Any) -> None:
         runtime.stop(signal.Signals(number).name)

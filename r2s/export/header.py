@@ -63,7 +63,7 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
 
 
 def _push(push: Mapping[str, Any] | None) -> list[str]:
-    """Return the C++ constants of the push limit (0 if there is none)."""
+    """Return the C++ constants of the push limit; without a push limit, all numbers are 0."""
     own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
         PUSH_VECTOR, [0.0] * 3
     )
@@ -75,7 +75,7 @@ def _push(push: Mapping[str, Any] | None) -> list[str]:
 
 
 def _reflexes(given: Mapping[str, Any] | None) -> list[str]:
-    """Return the C++ constants of a Franka arm's reflex thresholds; None: the cautious ones."""
+    """Return the C++ constants of a Franka arm's reflex thresholds; if `given` is None, use cautious thresholds."""
     own = given or {"torque_Nm": CAUTIOUS.torque, "force_N": CAUTIOUS.force}
     return [
         "// thresholds of the arm's reflexes",

@@ -18,7 +18,7 @@ class BundleError(ValueError):
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
-    """Return a contract's list as an array (n,) in which `none` replaces null, the contract's sign for infinity."""
+    """Return a list of a contract as an array (n,); null, which stands for infinity, becomes `none`."""
     return np.array([none if v is None else v for v in values], dtype=float)
 
 
@@ -231,7 +231,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the allowed torque (n,) Nm nearest to `effort` plus holding torque, and whether the two differ."""
+        """Return the allowed torque (n,) Nm nearest to effort + holding torque, and whether the two differ."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -254,8 +254,8 @@ class Driver:
     ) -> tuple[np.ndarray, bool]:
         """Return the torque (n,) Nm nearest to tau that keeps ddq in `bounds`, and whether it differs from tau.
 
-        ddq: (n,) rad/s^2, acceleration that tau causes. bounds: inverse mass matrix, lowest and highest ddq (n,). The
-        friction that light joints certainly have widens the range of ddq.
+        ddq: (n,) rad/s^2, acceleration that tau causes. bounds: inverse mass matrix, lowest and highest ddq (n,). In
+        light joints, the certain part of the friction widens the range of ddq.
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():

@@ -83,9 +83,9 @@ class PushLimit:
         return most - own
 
     def limit(self, effort: np.ndarray, last: np.ndarray, bounded: Callable[..., Any]) -> tuple[np.ndarray, bool]:
-        """Return the torque within all bounds that is nearest to `effort`, (n,) Nm each, and whether the two differ.
+        """Return the torque (n,) Nm within all bounds nearest to `effort` (n,) Nm, and whether the two differ.
 
-        bounded: function of torque and bias torque in contact, (n,) Nm each, that limits torque to the joint bounds.
+        bounded: function that limits a torque (n,) Nm to the joint bounds, given the bias torque (n,) Nm in contact.
         """
         bound, p, row = self._bound(last), self._p, self._row
         bias = self._bias + max(self._resisted, 0.0) * row

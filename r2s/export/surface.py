@@ -14,7 +14,7 @@ from r2s.export.inverse_dynamics import InverseDynamics
 from r2s.export.law import BundleError, Model
 from r2s.export.plan import NO_PLAN, finite_plan
 
-WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
+WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # number of columns, before q and setpoint
 NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and the target in the plan's first row
 # in a setpoint: velocity of the target m/s; for control=hybrid: normal, force N, measured force N, whether measured;
 # for a target that slides: feedforward force N
@@ -32,7 +32,7 @@ def columns_of(n: int, setpoints: int) -> dict[str, list[int]]:
 def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
     """Raise BundleError if a plan leaves the training's plane, area, depth or force range.
 
-    Further errors are a setpoint that contradicts the other columns, and a wrong start posture.
+    Also raise BundleError if the setpoint contradicts the other columns, or if the start posture is wrong.
     """
     goal = contract["goal"]
     at, own, trained = goal["columns"], contract["law"]["joint"], goal["trained"]
@@ -75,9 +75,9 @@ def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray)
 def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
     """Raise BundleError if the setpoint, which commands the controller, differs from target, normal or force.
 
-    The target lies between the targets of a row and of the next row, because the setpoint of a target that slides is
-    valid for the middle of the control period. Further errors are a target velocity or a feedforward force that is
-    larger than during training.
+    The setpoint's target must lie between the targets of its row and of the next row, because the setpoint of a
+    sliding target is valid for the middle of the control period. Target velocity and feedforward force must not
+    exceed those of the training.
 
     Args:
         goal: entry `goal` of the contract. plan: (rows, columns), a plan on a surface.
@@ -120,7 +120,7 @@ def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
         )
 
 
-LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # keys of the law, and what null means
+LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # limits in the law: the value for null
 
 
 class SurfaceFollower:

@@ -21,7 +21,7 @@ SPARE = 1.25  # allowed value / largest value of the examples, because other goa
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
-    """Return plans (k, steps + 1, columns), one for each row of `goals`, which contains k goals of the task."""
+    """Return the plans (k, steps + 1, columns) of `goals`, k goals of the task."""
     control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
     none, starts, out = np.zeros((len(t), 3)), np.zeros((len(t), robot.n)), []
     for goal in goals:
@@ -43,7 +43,7 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
     trained = {"point_m": point.tolist(), "normal": normal.tolist(), "spread_m": task.spread}
     trained |= {"place_m": task.place, "tilt_rad": float(np.radians(task.tilt)), "force_N": list(task.force)}
     trained |= {"depth_m": [-float(task.clearance + radius), deepest]}
-    trained |= {"contact": None if contact is None else contact.tolist()}  # normal and force N if not the plan's
+    trained |= {"contact": None if contact is None else contact.tolist()}  # normal, force N instead of the plan's
     trained |= _largest_setpoints(robot, task)
     site, axes = ee_pose(robot)
     return {
@@ -73,7 +73,7 @@ def _largest_setpoints(robot: Robot, task: SurfaceTask) -> dict[str, float]:
 
 
 def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return an example plan's start posture, rad, and the joints' allowed deviation from a plan's start posture.
+    """Return the start posture of an example plan, and the allowed deviation of a joint from a start posture, rad.
 
     If no joint deviates by more than the allowed deviation, the tip starts above the surface.
     """
@@ -100,7 +100,7 @@ def pushes(robot: Robot, limit: law.PushLimit | None) -> dict[str, Any] | None:
 def reflexes(robot: Robot, task: Task) -> dict[str, list[float]] | None:
     """Return the thresholds of a Franka arm's collision reflexes for libfranka's setCollisionBehavior.
 
-    None stands for the cautious thresholds: the arm has other than 7 joints, or the task's forces are too large.
+    If the arm does not have 7 joints or the task's forces are too large, return None: the cautious thresholds apply.
     """
     if robot.n != 7:
         return None

@@ -32,11 +32,11 @@ class Arm:
 def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
     """Return correction factors (n,) for a payload's joint torques, and the factors' standard deviations (n,).
 
-    The torque of an unloaded arm determines only the product of sensor gain and masses. If all true masses are 1 + e
-    times the masses in the robot's file, the identified gains contain the factor 1 + e, so that a payload's computed
-    torque is 1 + e times too large. Gain errors are independent between joints, with standard deviation GAIN; all
-    masses have one relative error, with standard deviation MASSES. The most likely mass error minimizes the sum of
-    squares of gain errors and mass error, each divided by its standard deviation.
+    The torque of an unloaded arm determines only the product of sensor gain and masses. If every true mass is 1 + e
+    times the mass in the robot's file, the identified gains contain the factor 1 + e. A payload's computed torque is
+    then 1 + e times too large. Each joint's gain has an independent error with standard deviation GAIN; all masses
+    share one relative error with standard deviation MASSES. The most likely mass error minimizes the sum of squares
+    of gain errors and mass error, each divided by its standard deviation.
     """
     space, n = arm.space, arm.robot.n
     if "gain" not in space.blocks or LINK[0] in space.blocks:
@@ -60,7 +60,7 @@ def sliding_sign(torque: TorqueResidual) -> np.ndarray:
 def arm_directions(
     torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
 ) -> np.ndarray:
-    """Return the residual's change (T, n, r) Nm for each of r independent model errors of one standard deviation.
+    """Return the residual's changes (T, n, r) Nm due to r independent model errors of one standard deviation each.
 
     Args:
         torque: residual of the joint torque. x: (P,) parameters of the arm.

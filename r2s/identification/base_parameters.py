@@ -18,8 +18,10 @@ from r2s.physics.robot import Robot
 
 STANDARD = ("mass", "mx", "my", "mz", "xx", "yy", "zz", "xy", "xz", "yz")  # of a link, about its origin
 UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
-ORDER = (*range(4, 10), 1, 2, 3, 0)  # order of a link's parameters; the mass is last, so it is regrouped first
-DEPENDENT, NONE = 1e-9, 1e-9  # relative size below which a column is dependent, and a coefficient is set to 0
+# a link's columns; the mass is last, because QR regroups later columns into earlier ones
+ORDER = (*range(4, 10), 1, 2, 3, 0)
+# relative sizes below which a column is dependent; below which a coefficient is set to 0
+DEPENDENT, NONE = 1e-9, 1e-9
 
 
 class BaseParameters(NamedTuple):
@@ -38,14 +40,14 @@ class BaseParameters(NamedTuple):
         """Return the values (..., K) of the base parameters for the dynamics of one or many arms."""
         links = LinkInertia(d.mass, d.com, d.inertia).standard()
         links = links.reshape(*links.shape[:-2], -1)
-        count = links.shape[-1]  # `d` may contain the rotors of many arms but the links of one arm
+        count = links.shape[-1]  # `d` may have many sets of rotors but one set of links, so add the two products
         return links @ self.matrix[:, :count].T + d.armature @ self.matrix[:, count:].T
 
 
 def base_parameters(robot: Robot, rotors: bool) -> BaseParameters:
     """Return the base parameters of an arm.
 
-    rotors: whether the measured torque includes the torque that accelerates the rotors; link-side torque does not.
+    rotors: true if the measured torque includes the torque that accelerates the rotors; false for link-side torque.
     """
     n, rng = robot.n, np.random.default_rng(0)
     q = rng.uniform(*robot.q_range, (40 * n, n))

@@ -1,19 +1,19 @@
 """Divide a recording into blocks whose errors are independent, for the posterior's cluster-robust covariance.
 
 Unlike noise, model error is correlated in time: torque ripple at low speed lasts seconds. Each block lasts several
-correlation times of the residual. Model error also recurs if the motion is repeated. If the residual recurs with the
-motion, a block contains the same interval of all repetitions of the motion.
+correlation times of the residual. A repeated motion also repeats the model error. If the residual of a periodic
+motion repeats, a block contains the same interval of all repetitions.
 """
 
 import numpy as np
 
 BLOCK_S = 0.5  # s, shortest block
 BLOCKS = 20, 400  # fewest and most blocks; few blocks make the scatter uncertain, many blocks cost time
-LENGTH = 5.0  # correlation times per block; var(sum) / length of a block is then 90 % of the limit for long blocks
-WINDOW = 5.0  # correlation times; beyond this lag, autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
+LENGTH = 5.0  # correlation times per block: the variance of a block's sum, per length, is then 90 % of its limit
+WINDOW = 5.0  # lag in correlation times beyond which autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
 LONGEST_S = 60.0  # s, longest lag of the autocorrelation
-REPEATED = 0.3  # relative growth of variance due to repetition above which blocks join repetitions
-SAME = 0.1  # largest distance of a repetition's mean angle from the median, in standard deviations of the motion
+REPEATED = 0.3  # blocks join repetitions if repetition raises the variance by more than this share
+SAME = 0.1  # largest deviation of a repetition's mean angle from the median, in standard deviations of the motion
 
 
 def blocks_of(
@@ -28,10 +28,11 @@ def blocks_of(
     Args:
         t: (T,) s, times, increasing within a trajectory. q: (T, n) rad, joint angles. period: s, period of the
             motion, or None.
-        residual: (T, n), residual of a fit. If None, blocks last at least `shortest_s` s, and repetitions of the
-            motion are not joined.
+        residual: (T, n), residual of a fit. Without a residual, blocks last at least `shortest_s` s and do not join
+            repetitions of the motion.
     """
-    run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # number of the trajectory; the clock restarts in each
+    # number of the trajectory; each trajectory restarts the clock
+    run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])
     steps = np.diff(t)[np.diff(run) == 0]
     step = float(np.median(steps)) if len(steps) else shortest_s
     seconds, visit, at = step * len(t), run, run
@@ -49,7 +50,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return block numbers (T,) common to all repetitions (numbers `visit` (T,)) with similar angles q (T, n) rad."""
+    """Join blocks (T,) of repetitions `visit` (T,) with similar angles q (T, n) rad; return block numbers (T,)."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -78,17 +79,17 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether a joint's residual (T, n) recurs at equal phases `at` (T,) of the repetitions `visit` (T,)."""
+    """Return whether some joint's residual (T, n) repeats. at, visit: (T,) numbers of phase and repetition."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]
-    more = np.bincount(phase)  # repetitions of each phase
+    more = np.bincount(phase)  # number of repetitions of each phase
     if (often := more.max()) < 2:
         return False
     for x in (residual - residual.mean(0)).T:
         mean = np.bincount(cell, x) / count
         square = np.bincount(phase, mean**2)[more > 1]
-        between = np.bincount(phase, mean)[more > 1] ** 2 - square  # twice the sum over pairs of repetitions
+        between = np.bincount(phase, mean)[more > 1] ** 2 - square  # twice the sum of the products of two repetitions
         growth = between.sum() / max(square.sum(), 1e-300)  # (often - 1) times the correlation of two repetitions
         if growth > max(REPEATED, 2.0 / np.sqrt(len(square) / often)):
             return True

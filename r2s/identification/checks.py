@@ -10,8 +10,8 @@ from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 SPIKE = 5.0  # times the limits of speed and torque: beyond any sensor noise
-NONSENSE = 1e9  # times the limits of speed and torque: no wrong unit reaches this; larger values may overflow
-JUMP = 0.05  # rad, an allowed jump of an encoder
+NONSENSE = 1e9  # times the limits of speed and torque: beyond any wrong unit; larger values may overflow
+JUMP = 0.05  # rad, accepted jump of an encoder
 MARGIN = 0.05  # rad by which a log may exceed the position limits, as can happen when an arm is at a limit
 LEAST_S = 1.0  # s, least duration of a recording
 

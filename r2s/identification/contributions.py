@@ -1,9 +1,8 @@
 """Assess what each of several recordings adds to an identification, and whether one contradicts the others.
 
 Two further fits assess each recording: a fit without the recording, and a fit to the recording alone. Every further
-fit starts from the fit to all recordings, so that few least-squares steps on torque suffice. The residual of a fit to
-one recording alone sets the recording's weights, because contradicting recordings increase the residual of a common
-fit.
+fit starts from the fit to all recordings, so that few least-squares steps on torque suffice. A recording's weights
+come from the fit to this recording alone, because a contradiction would increase the residual of a common fit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,10 +19,10 @@ from r2s.identification.search.levenberg_marquardt import minimize, normal_equat
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CONTRADICTS = 2.0  # ratio of sums of squares: fit to all recordings, over fit without one plus fit to this one alone
-WORSE = 4.0  # RMSEs of fits to single recordings: ratio of one recording's to the median of the others'
-CARRIED = 0.5  # a body on the last link is reported if it explains this share of the squared left-out error
-LEAST_MASS = 0.01  # least mass of such a body, relative to the arm's mass
+CONTRADICTS = 2.0  # least ratio of sums of squares: fit to all / (fit without one recording + fit to it alone + P)
+WORSE = 4.0  # least ratio of the RMSE of one recording's own fit to the median RMSE of the others' own fits
+CARRIED = 0.5  # a body on the last link is reported if it explains this share of the squares of `left_out`
+LEAST_MASS = 0.01  # least reported mass of a body on the last link, relative to the arm's mass
 ROUNDS = 3  # reweighted fits of each recording alone
 STEPS, FTOL = 10, 1e-3  # most Jacobians in a fit; a fit ends when a step reduces the cost by less than this share
 USED_S, RATE_HZ = 120.0, 50.0  # s, longest part of a recording that is compared; rows per second
@@ -40,8 +39,8 @@ class Contribution:
         narrower: (P,), width of the 95 % intervals without this recording / width with it; None for a validation
             recording.
         alone: (n,) Nm, error of a fit to this recording alone. contradiction: ratio of sums of squares, see
-            CONTRADICTS; 1 if there is only one recording. body_kg: mass on the last link that explains the
-            contradiction; nan if no such mass explains it.
+            CONTRADICTS; 1 for a single recording. body_kg: additional mass on the last link that explains the error
+            `left_out`; nan if no mass explains it.
     """
 
     label: str
@@ -70,7 +69,8 @@ def contributions(
     for _ in range(ROUNDS):
         alone = [_fitted([p], u, prior) for p in parts]
         parts = [p.reweighted(space.from_unit(v), fitted=True) for p, v in zip(parts, alone, strict=True)]
-    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # assume that unused parts inform equally
+    # assume that unused parts of a recording contain as much information as used parts
+    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]
     information = [k * normal_equations(p.linearize(u))[1] for k, p in zip(more, parts, strict=True)]
     total = sum(information) + prior[1].T @ prior[1]
     width, square = np.sqrt(np.diag(np.linalg.inv(total))), _square(parts, _fitted(parts, u, prior))
@@ -145,7 +145,7 @@ def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
 
 
 def contradictions(parts: Sequence[Contribution]) -> list[str]:
-    """Return [message] if a recording contradicts the others or has a far larger torque error, else []."""
+    """Return [message] if a recording contradicts the others or has far larger torque errors, else []."""
     trained = [p for p in parts if p.left_out is not None and p.alone is not None]
     if len(trained) < 2:
         return []

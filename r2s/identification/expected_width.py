@@ -24,7 +24,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-STEPS, FTOL = 6, 1e-2  # most Jacobians per weighting; a fit ends when a step lowers the cost by a smaller share
+STEPS, FTOL = 6, 1e-2  # most Jacobians per weighting; relative decrease of cost per step below which a fit ends
 USED_S = 120.0  # s, longest part of a recording that is used
 
 

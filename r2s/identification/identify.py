@@ -140,7 +140,7 @@ class State:
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Predict ramps' motion after breakaway; None without ramps, with bristles, or without Stribeck effect."""
+        """Predict motion after breakaway in ramps; None without ramps or Stribeck effect, or for bristle friction."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)
@@ -233,8 +233,8 @@ def draw_full_model(s: State) -> dict[str, np.ndarray]:
     """Return unit-cube draws (S, P) of the selected model's values, from a posterior with all terms and wide priors.
 
     Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
-    compensates for a removed one, such as a payload for the error of a link's mass. Where the main fit's priors,
-    chosen for prediction, are narrower than the scatter among arms, they narrow intervals further. For the result's
+    compensates for a removed one, for example a payload for the error of a link's mass. The main fit's priors serve
+    prediction; if they are narrower than the scatter among arms, they narrow intervals further. For the result's
     intervals, draws of the full and the selected model have equal weight (Hoeting et al., Stat. Sci. 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
@@ -248,13 +248,13 @@ def formulate(s: State) -> State:
     how, memory = s.settings, s.nominal.family.has_memory
     settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # DELAY stays 0, see `settle_lateness`
     space = search_space(s.robot, s.nominal, how.bounds, [*s.terms, *settled], s.recording, how.stated)
-    s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # so that blocks join repetitions
+    s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # blocks need the period
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
     edges = estimate_breakaway(s.ramps) if s.commanded and s.ramps is not None else None
     # for a family with memory, replays start from unknown bristle deflections and would worsen a good torque fit
     if s.commanded and not all(map(fits_torque, s.searches)) and not (memory and fits_torque(s.searches[0])):
-        slowest = 0.0 if memory else CLEAR * s.nominal.dq_min  # bristles have no dead zone
+        slowest = 0.0 if memory else CLEAR * s.nominal.dq_min  # bristle friction has no dead zone
         released = None
         if edges is not None:
             scattered = edges.command + SCATTER * s.robot.tau_max.max() * np.array([-1.0, 1.0])
@@ -274,7 +274,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return the user's prior and, for all other values, an earlier identification's; None if both are missing."""
+    """Return the user's prior, completed by the prior from an earlier identification; None if both are missing."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated

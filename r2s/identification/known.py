@@ -16,10 +16,11 @@ from r2s.identification.link_inertia import PAYLOAD
 from r2s.identification.parameters import OF_LINKS, ParameterSpace, logarithmic, units
 from r2s.identification.posterior import Z_95
 
-BODY = (*OF_LINKS, *PAYLOAD)  # shared by all kinds of torque; friction, offsets and gains differ between kinds
+BODY = (*OF_LINKS, *PAYLOAD)  # the same for all kinds of torque; friction, offsets and gains differ between kinds
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # parameters that drift besides those of the friction law
 FLOOR = 1e-4  # least standard deviation, relative to `ParameterSpace.usual`, in case all draws lie at a bound
-FAR = 5.0  # standard deviations in the worst of about thirty directions, above which prior and data disagree
+# prior and data disagree if they differ by more standard deviations in the worst of about thirty directions
+FAR = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +41,8 @@ class Known:
     def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
         """Convert the values x (P,) and posterior draws (S, P) of an earlier identification into a prior.
 
-        drift: standard deviation of the change of friction, offsets and drag since the earlier identification,
-            relative to the value or, if larger, to its standard deviation among arms (`ParameterSpace.usual`).
+        drift: standard deviation of the change of friction, offsets and drag since the earlier identification. It is
+        relative to the value or, if larger, to the standard deviation among arms (`ParameterSpace.usual`).
         """
         names, usual = space.names, space.usual
         mean, least = coordinates(names, x), np.where(np.isfinite(usual), usual, 0.0)
@@ -60,7 +61,7 @@ class Known:
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return the joint distribution with the independent prior `other`; common values follow only `other`."""
+        """Return the joint distribution with the independent prior `other`, which alone determines common values."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)

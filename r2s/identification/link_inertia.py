@@ -19,7 +19,7 @@ def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np
 
     Sigma, h and m are second moment, first moment and mass (Wensing, Kim and Slotine, RA-L 3(1), 2018). The second
     moment about the center of mass is positive definite if principal moments are positive and satisfy the triangle
-    inequality; otherwise the function raises eigenvalues that are too small.
+    inequality; otherwise the function increases eigenvalues that are too small.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)

@@ -65,10 +65,10 @@ def save_parameters(
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in FIXED}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
-    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for users; not loaded
+    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; r2s does not load them
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
-    with atomic_write(path.with_name("posterior.npz")) as part:  # first, so parameters.yaml never exists alone
+    with atomic_write(path.with_name("posterior.npz")) as part:  # before parameters.yaml, which needs it
         np.savez_compressed(part, names=np.array(space.names), samples=found.samples)
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))

@@ -1,9 +1,9 @@
 """The parameter vector of an identification: blocks, bounds, map to the unit cube, and conversion to dynamics.
 
-A block contains the values of one parameter: one per joint or link (friction coefficient, offset, inertia), or one
-for the whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span decades are
-mapped by their logarithm. Link inertia has two parametrizations: `inertia_scale` is one factor per link (paper, Table
-III), and `link_...` are the ten log-Cholesky parameters of a link (link_inertia.py).
+A block contains the values of one parameter: a value per joint or link (friction coefficient, offset, inertia), or a
+single value for the whole arm (delay, lag, payload). Searches work on the unit cube; positive parameters that span
+decades are mapped by their logarithm. Link inertia has two parametrizations: `inertia_scale` is one factor per link
+(paper, Table III), and `link_...` are the ten log-Cholesky parameters of a link (link_inertia.py).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s", "signal_delay": "s"}
 OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
 TIMING = ("delay", "lag", "signal_delay")
-# standard deviation of a parameter among arms, by unit; torque-like parameters: per Nm of tau_max; logarithms: 1
+# standard deviation of a parameter among arms, by unit; of torque-like ones, per Nm of tau_max; of logarithms, 1
 USUAL = {"Nm": 0.02, "Nm s/rad": 0.02, "kg m^2": 0.002, "kg": 0.02, "1": 0.1, "rad/s": 0.03, "m": 0.1, "s": 2e-3}
 WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
@@ -153,7 +153,7 @@ class ParameterSpace:
 
         columns = [d.phi[..., k] for k in range(d.phi.shape[-1])]
         count = max([0, *(k + 1 for k, name in enumerate(d.family.names) if name in blocks)])
-        columns += [np.zeros(self.n)] * (count - len(columns))  # optional friction starts at 0
+        columns += [np.zeros(self.n)] * (count - len(columns))  # optional friction parameters start at 0
         phi = [value(name, column) for name, column in zip(d.family.names, columns, strict=False)]
         drag = [value(name, d.drag[:, i]) for i, name in enumerate(("drag_sin", "drag_cos"))]
         own: dict[str, Any] = {name: value(name, getattr(d, name)) for name in PER_JOINT}
@@ -238,8 +238,8 @@ class ParameterEstimate:
 
     Attributes:
         x: estimated values. identifiable: whether the data determine each value.
-        low, high: ends of 95 % intervals of the values; for measured and motor torque, the intervals also use draws
-            from a second model (`draw_full_model`), which `samples` does not contain.
+        low, high: ends of 95 % intervals of the values. For measured and motor torque, the intervals also use draws
+            from a second model (`draw_full_model`); `samples` excludes these draws.
         samples: (S, P) random draws from the posterior.
     """
 

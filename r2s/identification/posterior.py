@@ -10,7 +10,7 @@ from scipy.stats import t as student
 DRAWS = 512  # number of samples from the joint distribution
 Z_95 = 1.96  # half the width of a 95 % interval, in standard deviations
 FLAT = 12.0  # information of a flat prior on the unit cube, whose uniform distribution has a variance of 1/12
-LEAST_LEFT = 0.1  # lower limit of 1 minus a block's share of the information in a direction
+LEAST_LEFT = 0.1  # least value of 1 - (a block's share of the information in a direction)
 
 
 class Linearized(Protocol):
@@ -40,12 +40,12 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     Because errors within a block are correlated, the covariance is H^-1 (sum of s s^T + prior) H^-1, with the total
     information H and a score s per block. A block's score is the block's contribution to the gradient (White,
     Econometrica 48(4), 1980; clusters: Liang and Zeger, Biometrika 73(1), 1986) minus the mean contribution of all
-    blocks, which is not 0 at a bound. If there are few blocks, the fit makes each block's residual too small; a
-    factor from the block's share of the information corrects the score (CR2 of Bell and McCaffrey, Survey Methodology
-    28(2), 2002). For few blocks, Student's t widens the draws. If one block alone determines a direction, the scatter
-    of the scores underestimates the variance in this direction, so the covariance is at least that for independent
-    rows. A bootstrap over blocks would yield unrealistic tails if few blocks determine a value, because many
-    bootstrap samples would lack these blocks.
+    blocks. The mean is not 0 if the fit is at a bound. If there are few blocks, the fit makes each block's residual
+    too small; a factor from the block's share of the information corrects the score (CR2 of Bell and McCaffrey,
+    Survey Methodology 28(2), 2002). For few blocks, Student's t widens the draws. If one block alone determines a
+    direction, the scatter of the scores underestimates the variance in this direction, so the covariance is at least
+    that for independent rows. A bootstrap over blocks would yield unrealistic tails if few blocks determine a value,
+    because many bootstrap samples would lack these blocks.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -58,7 +58,7 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     least, robust = (covariance @ _root(m + prior) for m in (factor**2 * information, score.T @ score))
     normal = np.random.default_rng(seed).standard_normal((DRAWS, len(u)))
     normal -= normal.mean(0)
-    normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / DRAWS), normal.T).T  # of covariance 1, exactly
+    normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / DRAWS), normal.T).T  # sample covariance exactly 1
     steps = normal @ _at_least(least, robust).T
     return Posterior(u, inside_cube(u, steps, information + prior), information)
 
@@ -66,7 +66,8 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
 def _root(matrix: np.ndarray) -> np.ndarray:
     """Return a square root (P, P) of a positive matrix, also if rounding made it indefinite.
 
-    The information of a noise-free recording exceeds that of a wide prior by more than floats resolve.
+    Rounding matters for noise-free recordings: their information exceeds that of a wide prior by more than floats
+    resolve.
     """
     try:
         return np.linalg.cholesky(matrix)
@@ -89,7 +90,7 @@ def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _resolved(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scale a matrix to unit diagonal; return scale (P,), eigenvalues (P,), axes (P, P) of matrix / (scale scale^T).
 
-    Eigenvalues below the rounding error of the largest one are replaced by this error.
+    Eigenvalues smaller than the rounding error of the largest eigenvalue are set to this error.
     """
     scale = np.sqrt(np.diag(matrix))
     values, axes = np.linalg.eigh(matrix / np.outer(scale, scale))
@@ -115,12 +116,12 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
             score[block] += j[some].T @ r[some]
         counts = j.any(1)  # without padding rows, whose residual and slope are 0
         square, seen = square + float((r[counts] ** 2).sum()), seen + int(counts.sum())
-    prior += np.diag(np.where(prior.any(0), 0.0, FLAT))  # a flat prior has no row of its own
+    prior += np.diag(np.where(prior.any(0), 0.0, FLAT))  # flat priors have no rows
     return gram, score, prior, float(np.sqrt(max(1.0, square / max(seen, 1))))
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return a square root (P, P) of the covariance that is the larger of root root^T and least least^T by direction.
+    """Return a square root (P, P) of the larger of root root^T and least least^T in every direction.
 
     Comparing single values would fail, because data can determine the sum of two values far better than each value.
     """
@@ -132,9 +133,9 @@ def inside_cube(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return `steps` (S, P) with values changed so that u + steps lies in the unit cube.
 
     Values outside the cube are clipped. Values inside the cube are adapted to minimize the sum of squares with
-    Hessian 2 h (P, P). Without the adaptation of values inside the cube, sums of correlated values would be biased,
-    such as an offset plus an asymmetry at its bound. The value farthest outside is clipped first, because the
-    adaptation often moves correlated values into the cube.
+    Hessian 2 h (P, P). Without this adaptation, sums of correlated values would be biased, for example an offset plus
+    an asymmetry at its bound. The value farthest outside is clipped first, because the adaptation often moves
+    correlated values into the cube.
     """
     steps = steps.copy()
     for step in steps:

@@ -12,7 +12,7 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 HORIZONS = (0.1, 0.5, 2.0)  # s, horizons of open-loop prediction
-SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording used to compare torque, in total and per part
+SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording used to compare torque: in total; in each part
 REPLAYED_S = 240.0  # s of a longer recording that are replayed
 MAX_WINDOWS = 100  # per horizon
 

@@ -17,16 +17,16 @@ from r2s.physics.robot import SIM_DT
 
 UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its width
 FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
-# Least ratio of a joint's RMS errors that counts as a wrong minimum. In trials with the 2- and 3-joint arms of
-# benchmarks/scaling.py, with values drawn from the priors, wrong minima had ratios of 1.9 to 36; on a
-# physical Panda, where the fit from narrow priors predicts better, the ratio is 1.0 to 1.2.
+# r2s concludes that a minimum is wrong if another minimum lowers a joint's RMS error by more than this factor. In
+# trials with the 2- and 3-joint arms of benchmarks/scaling.py, with values drawn from the priors, this factor was 1.9
+# to 36 in wrong minima. On a physical Panda, where the fit from narrow priors predicts better, it is 1.0 to 1.2.
 CLEARLY = 2.0
-TAIL = 25.0  # degrees of freedom plus 1 of Student's t, which is the prior for link-side torque
+TAIL = 25.0  # Student's t, the prior for link-side torque, has TAIL - 1 degrees of freedom
 # implicit friction: least significance of its effect in standard deviations; range of actual over expected size
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
 ALIKE = 0.2  # relative uncertainty of the number of independent rows, and therefore of a sum of squares
 ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more: nominal friction may be off by tens of Nm
-FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; a fit ends when a step lowers the cost by a smaller share
+FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; relative decrease of cost per step below which a fit ends
 Report = Callable[[dict], None]
 
 
@@ -113,7 +113,7 @@ class Problem:
 
     @property
     def is_fixed(self) -> np.ndarray:
-        """(P,) whether a value's prior equals that of the method `fixed`; priors of users may be even narrower."""
+        """(P,) whether `fixed` set a value's prior, tested by equality, because users' priors may be narrower."""
         return self.sigma == FIXED * self.space.width
 
     def fixed(self, at: np.ndarray) -> "Problem":
@@ -259,8 +259,8 @@ def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray
     """Return whether u (P,) has a larger posterior density than v (P,), and a clearly smaller error in some joint.
 
     The two solutions u and v have different torque noise sigma. A joint's log likelihood is -N log sigma, with N
-    independent rows and torque noise sigma. A wrong model lengthens the correlation of errors, so the number of
-    independent rows follows from the shorter of the two solutions' correlation lengths.
+    independent rows and torque noise sigma. A wrong model lengthens the correlation of errors. The shorter
+    correlation length of the two solutions therefore determines the number of independent rows.
     """
     (length, sigma), (longer, larger) = (
         p.torque_data.noise_at(p.space.from_unit(x)) for p, x in ((one, u), (other, v))
@@ -307,8 +307,8 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
 
     If friction rises with speed, implicit integration evaluates friction at the velocity half a step ahead; a
     physical arm does not. The effect of implicit friction must exceed `significant` standard deviations and have
-    about the expected size: a rotor inertia missing in the model would have a similar, but a hundred times larger
-    effect.
+    about the expected size, because a rotor inertia missing in the model has a similar effect that is a hundred times
+    larger.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]

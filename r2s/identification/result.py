@@ -31,8 +31,8 @@ class IdentificationResult:
         history: one row for each step or generation of a search.
         families: {friction family: error of held-out torque relative to the best family's}; {} if the user chose the
             family.
-        null_directions: pairs (ratio, {name: component}) of parameter combinations whose ratio of posterior to prior
-            sigma exceeds NULL_SHARE, largest ratio first.
+        null_directions: parameter combinations that the prior determines, as pairs (ratio of posterior to prior
+            sigma, {name: component}); ratios exceed NULL_SHARE, largest first.
         unseen: names of the parameters that r2s left at nominal values, because the data hardly determine them.
         edges: breakaway commands estimated from ramps; None if no ramps were recorded.
         refused: whether r2s discarded the replay fit, which explained torque clearly worse than the torque fit.
@@ -101,7 +101,7 @@ class IdentificationResult:
         sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
         got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
         edges = self.space.dynamics(f.samples).breakaway
-        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # half-width from the offset alone
+        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # half-width due to the offset
         most = student.ppf(0.975, freedom)
         # policies train on these draws; for few degrees of freedom, the far tails of Student's t are unrealistic
         drawn = np.clip(np.random.default_rng(0).standard_t(freedom, edges.shape), -2 * most, 2 * most)
@@ -113,7 +113,7 @@ class IdentificationResult:
         limit = np.maximum(self.space.robot.tau_max, np.abs([x, low, high]).max((0, 2)))
         low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -limit), np.minimum(high[:, 0], 0.0)
         high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], limit), np.maximum(low[:, 1], 0.0)
-        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone replaces the prior's sigma
+        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # breakaway has no prior; half the dead zone replaces its sigma
         columns = [[a[..., 0], a[..., 1]] for a in (x, low, high, got & (half < zone / SHARPER), edges)]
         own = f.x, f.low, f.high, f.identifiable, f.samples
         space = replace(
@@ -173,9 +173,9 @@ def conclude(
 def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reset poorly determined values of u (P,) to `start`; return the new u, and a mask (P,) of the reset values.
 
-    Data may determine only a combination of values, such as the summed mass of two consecutive links. A value is
-    therefore reset only if this reset and all earlier ones together raise the sum of squares by at most 1, after a
-    refit of the remaining values.
+    Data may determine only a combination of values, such as the summed mass of two consecutive links. r2s therefore
+    resets a value only if, after a refit of the remaining values, all resets together raise the sum of squares by at
+    most 1.
 
     Args:
         u, start: (P,) fitted and nominal values on the unit cube. h: (P, P), half the Hessian of the sum of squares.

@@ -19,8 +19,8 @@ TERMS = (
     *("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "signal_delay", "load", "gain"),
     *("drag", "drag_sin", "drag_cos"),
 )
-# terms that do not affect a kind of torque: delay and lag lie between command and motion, gain and signal delay in
-# the measurement, and a link-side sensor does not measure rotors
+# Terms that do not affect a kind of torque. Delay and lag act between command and motion; gain and signal delay act
+# in the measurement. A link-side sensor does not measure the torque on the rotors.
 NO_EFFECT = {
     "commanded": ("gain", "signal_delay"),
     "measured": ("delay", "lag", "armature"),

@@ -12,14 +12,15 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia, nominal_torque, regressor
 from r2s.physics.robot import Robot
 
-MASS, MASS_LEFT = 3.0, 0.1  # least factor of a reported mass error; largest share of the misfit left by a correction
+# least factor of a reported mass error; largest share of the misfit that a correction leaves
+MASS, MASS_LEFT = 3.0, 0.1
 CARRIED = 3  # number of last links whose mass is not judged, because a payload may be undeclared
 TILTED = np.radians(20)  # least reported angle of a mounting; uncertain masses can cause smaller fitted angles
 INERTIA = 0.3, 4.0  # allowed factor of the nominal torque: errors of tensors, payloads, sensor gains
 FRICTION, OFFSET = 0.5, 0.1  # largest fitted friction and offset, relative to tau_max
 MAX_LEFT = 2.0  # upper limit of a joint's unexplained share
-# gravity is judged in joints where it changes: least RMS change, relative to tau_max; factor by which correlated rows
-# raise the standard error of gravity's share; largest standard error
+# Only joints in which gravity changes are judged. CHANGES: least RMS change, relative to tau_max. CORRELATED: factor
+# by which correlated rows raise the standard error of gravity's share. MAX_SIGMA: largest standard error.
 CHANGES, CORRELATED, MAX_SIGMA = 0.01, 3.0, 0.15
 
 
@@ -68,7 +69,7 @@ class Unexplained:
         return np.array(factors), left / whole
 
     def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return, for each judged joint, K torques / tau_max (T, K) minus their fitted friction and offset."""
+        """Return K torques / tau_max (T, K) of each judged joint, minus fitted friction and offset."""
         out = []
         for j in self.seen.tolist():
             own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
@@ -77,7 +78,7 @@ class Unexplained:
         return out
 
     def gravity_shares(self) -> np.ndarray | None:
-        """Return ratios of tau's to nominal gravity torque, for joints whose motion determines them, else None."""
+        """Return gravity in tau / nominal gravity for joints whose motion determines this ratio; None without any."""
         inertial = self.inverse_dynamics(False)
         weight, shares = self.inverse_dynamics(True) - inertial, []
         for j in self.seen:
@@ -113,7 +114,7 @@ class Unexplained:
 
 
 def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) for joint orders of tau or of all signals: by name, rotated, reversed, swapped."""
+    """Return (misfit, message) of tau or all signals in other joint orders: by name, rotated, reversed, swapped."""
     robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}

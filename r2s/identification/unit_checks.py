@@ -19,17 +19,20 @@ from r2s.recordings.clock import check_clock
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # low-pass cutoff, rate and number of compared rows
+# low-pass cutoff; rate, most and fewest of the compared rows
+CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15
 EDGE = 100  # ms, removed from both ends of a trajectory, where the filter has transients
-JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s examined in a long recording: units; clock; clock, per part
+# s examined in a long recording: for units; for the clock, total and per part
+JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0
 SLOWEST_HZ = 5.0  # sampling rate below which only the clock is judged
 MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
 STILL = 0.02  # rad, range of a joint up to which the joint is treated as at rest
-REFUSED, CORRECTED = 0.5, 0.25  # largest accepted unexplained share; largest fraction left by a valid correction
+# largest accepted unexplained share; largest fraction of this share that a valid correction leaves
+REFUSED, CORRECTED = 0.5, 0.25
 SUSPECT = 0.3  # misfit above which other joint orders are tested; correct recordings had 0.006 to 0.21
 TURNED = 0.05  # misfit above which other mountings are tested; a valid mounting leaves at most MASS_LEFT of it
 HELD = 0.05  # a joint whose RMS nominal torque exceeds this share of tau_max is judged even at rest
-HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity in tau: range with gravity; most without
+HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity in tau: range if tau has gravity; limit if not
 CURRENT = 0.005  # A/Nm, least ratio of a current to torque: no arm's joint has 200 Nm/A
 OVER_LIMIT = 3.0  # largest allowed torque over tau_max
 RATIO = 4.0  # dq is refused if its ratio to the slope of q is above RATIO or below 1 / RATIO
@@ -117,7 +120,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
     s, v = slope[:, seen], dq[:, seen]
     cross = s.T @ v / len(s)  # mean product of joint j's slope and column k of dq
     square = np.maximum((v**2).mean(0), 1e-12)
-    left = 1.0 - cross**2 / (size[seen, None] ** 2 * square)  # share that no factor explains
+    left = 1.0 - cross**2 / (size[seen, None] ** 2 * square)  # share of dq's square that no factor explains
     own = np.diag(left)
     if (swap := _swapped(left, own)) is not None:
         fits = _fits(seen, swap, "dq", "the slope of q of ")
@@ -147,7 +150,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints that other joints' columns fit far better, and the columns; else None. pairs: misfit [j, k]."""
+    """Return joints that other columns fit far better, and the columns; else None. pairs: misfit [joint, column]."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():

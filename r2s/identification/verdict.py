@@ -26,14 +26,16 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 PASS, WARN, FAIL, OPEN = "pass", "warn", "fail", "-"  # OPEN: not judged
-UNEVEN, UNEVEN_SHARE = 0.5, 0.05  # least deviation of an uneven step, relative to the median; allowed share of them
+# least deviation of an uneven step, relative to the median; allowed share of uneven steps
+UNEVEN, UNEVEN_SHARE = 0.5, 0.05
 OFF_CLOCK = 0.03  # largest error of dq's scale; filters and elastic gears cause 1 to 2 % (recordings/clock.py)
-LATE_S = 1e-3  # s, lateness below which there is no warning, or half a row period if longer
+LATE_S = 1e-3  # s; lateness below this or, if longer, half a row period causes no warning
 SURE = 2.0  # standard deviations, half-width of the shown interval of lateness
 LOADED = 0.7, 1.4  # range of gravity's share without an undeclared load: masses in files are accurate to a third
 SPEEDS_S = 600.0  # s, length of the part of a longer recording whose speeds are examined
 FAST, SLOW = 0.2, 0.05  # relative to dq_max; a friction curve needs speeds from below SLOW to above FAST
-LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # least share of a joint's moving rows: slower than SLOW; in each direction
+# least shares of a joint's moving rows: rows slower than SLOW; rows in each direction
+LEAST_SLOW, LEAST_WAY = 0.01, 0.1
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,19 @@ RANGES = "mass", "table", "friction", "damping", "bristle"
 class BoxRandomization(UniformRandomization):
     """Draw random arms from `UniformRandomization` and a random box for each arm.
 
-    Mass and stiffness of the box are log-uniform; all other draws are uniform. The initial pose of the box deviates
-    from the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's normal.
+    Mass and stiffness of the box are log-uniform; its other parameters are uniform. The initial pose of the box
+    deviates from the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's
+    normal.
 
     Attributes:
-        table, friction: ranges [least, most] of the friction coefficient at the work table and at the tip. mass (kg),
-            stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`. size: (3,) m, edges of
-            the box.
+        table, friction: ranges [least, most] of the friction coefficient between box and table, and between box and
+            tip. mass (kg), stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`. size:
+            (3,) m, edges of the box.
         spread, yaw: m and degrees, largest deviation of the box from its nominal pose.
         point, normal: point (3,) m and normal (3,) of the table; if None, see `table_frame`.
 
     Raises:
-        UserError: a range is malformed, the box would tilt, or the robot has no tool.
+        UserError: a range is malformed, a push would tilt the box, or the robot has no tool.
     """
 
     size: Sequence[float]

@@ -1,10 +1,9 @@
 """Checkpoints of a training: the state in one file, and the transitions of the replay buffer in files called chunks.
 
 Each checkpoint writes one chunk: the transitions added since the previous checkpoint. The state file lists the chunks
-of the checkpoint, so an interrupted write does not damage the previous checkpoint. A chunk is deleted after the
-replay buffer has overwritten all transitions of the chunk. The oldest chunk can contain transitions that the buffer
-has already overwritten. All files contain only tensors, numbers and names, so torch.load(weights_only=True) can read
-the files.
+of the checkpoint, so an interrupted write does not damage the previous checkpoint. r2s deletes a chunk once the
+replay buffer has overwritten all its transitions, so the oldest chunk can contain some overwritten transitions. All
+files contain only tensors, numbers and names, so torch.load(weights_only=True) can read the files.
 """
 
 import errno
@@ -68,7 +67,7 @@ class Checkpoint:
         return state
 
     def _path(self, end: int) -> Path:
-        """Return the path of the chunk that ends with transition number `end` - 1."""
+        """Return the path of the chunk whose last transition has the number `end` - 1."""
         return self.folder / f"replay_{end:012d}.pt"
 
     def clear(self) -> None:
@@ -76,7 +75,7 @@ class Checkpoint:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-# words in torch's RuntimeErrors for a full disk; the error depends on where the write fails
+# torch raises one of several RuntimeErrors on a full disk; each contains one of these words
 DISK_FULL = ("PytorchStreamWriter", "iostream error", "inline_container.cc")
 
 
@@ -98,7 +97,7 @@ def load_tensors(path: Path, option: str) -> dict[str, Any]:
         UserError: the file is missing or damaged; the message begins with `option`.
     """
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)  # perhaps written on a GPU
+        content = torch.load(path, map_location="cpu", weights_only=True)  # the tensors may come from a GPU
     except Exception as error:  # a damaged file may raise anything
         reason = " ".join(str(error).split())[:100]
         raise UserError(f"{option}: {path} cannot be read, it is missing or damaged ({reason})") from None

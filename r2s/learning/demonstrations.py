@@ -16,15 +16,16 @@ from r2s.physics.robot import Robot
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-NOISE = 0.3  # standard deviation of the last arm's noise; first value tested, on development seeds 0 to 2 of reach
-KEPT = 0.9  # correlation of the noise between steps; white noise hardly moves an arm
+NOISE = 0.3  # standard deviation of the last arm's noise; the first value tried, on development seeds 0 to 2 of reach
+KEPT = 0.9  # correlation of the noise between successive steps; white noise hardly moves an arm
 
 
 class Demonstrator:
-    """A model-based controller plus noise with a standard deviation from 0 (first arm) to NOISE (last arm).
+    """A model-based controller with action noise of standard deviation 0 (first arm) to NOISE (last arm).
 
     Attributes:
-        at_zero: whether the controller's actions are zero; a policy with zero actions then equals the controller.
+        at_zero: whether all actions of `reference` are zero, so that a policy with zero actions acts like
+            `reference`.
 
     Args:
         reference: the controller, with the interface of `r2s.learning.networks.Policy`.

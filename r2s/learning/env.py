@@ -21,7 +21,7 @@ from r2s.physics.robot import Robot
 from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State, Task, observation_scale, observe
 
-GROUPS = 8  # groups of arms that reset together; a reset of four arms takes hardly longer than a reset of one
+GROUPS = 8  # number of groups of arms that reset together; a reset of four arms hardly takes longer than of one
 
 
 class TaskEnv(EnvBase):
@@ -35,7 +35,7 @@ class TaskEnv(EnvBase):
         draw: domain randomization, called at every reset; a `Pushes` object also applies joint torques at every step.
         nsim: number of arms. nthread: number of threads; 0: all cores.
         seed: seed of goals, start postures and dynamics.
-        stagger: whether the first episodes of the GROUPS groups of arms end at different times.
+        stagger: whether the first episodes end at a different time in each of GROUPS groups of arms.
         reward: reward terms and weights; None selects the terms and `paper_weights` of the task.
     """
 
@@ -63,10 +63,10 @@ class TaskEnv(EnvBase):
         self.reward, self.control = reward or Reward(), task.control(robot)
         self.reward.terms(task)  # raises if the reward does not fit the task
         self.weights = self.reward.weights(task, 0.0)
-        self._factor = self.reward.factor  # `set_progress` adapts this factor to the mean terms since the last call
+        self._factor = self.reward.factor  # `set_progress` changes this factor
         self._seen, self._seen_steps = np.zeros_like(self.weights), 0
         self._torque = task.torque_limit(robot)
-        self._staggered = self._stagger = stagger  # the setting, and whether the next reset staggers
+        self._staggered = self._stagger = stagger  # the argument; whether the next reset staggers episodes
         self._pool = task.goals(robot, np.random.default_rng(of_goals), task.pool)
         self.goal = np.zeros((nsim, *self._pool.shape[1:]))
         self._dq, self._count = np.zeros((nsim, robot.n)), np.zeros(nsim, dtype=np.int64)
@@ -84,9 +84,9 @@ class TaskEnv(EnvBase):
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights for `progress`, the share (0 to 1) of its budget that an external loop has used.
+        """Set the reward weights for `progress`: the used share (0 to 1) of the budget of an external training loop.
 
-        As in `train`, `Reward.adapt` adapts the weights to the mean reward terms since the last call.
+        As in r2s's `train`, `Reward.adapt` adapts the weights to the mean reward terms since the last call.
         """
         if self._seen_steps:
             mean = self._seen / self._seen_steps
@@ -122,7 +122,7 @@ class TaskEnv(EnvBase):
         return state
 
     def _drawn(self, m: int) -> Dynamics:
-        """Draw the dynamics of m arms, and raise each arm's speed noise to at least U(0, task.speed_noise)."""
+        """Draw the dynamics of m arms; each arm's speed noise is at least a draw from U(0, task.speed_noise)."""
         drawn = self.draw(self.rng, m)
         if not self.task.speed_noise:
             return drawn

@@ -16,7 +16,7 @@ from r2s.physics.robot import Robot
 from r2s.tasks.rollout import Episodes, PolicyLike, rollout
 from r2s.tasks.task import Task
 
-SELECTION, REPORT = 7_000_000, 2_026_1122  # seeds, larger than those of trainings
+SELECTION, REPORT = 7_000_000, 2_026_1122  # seeds; trainings use smaller seeds
 
 
 def generators(seed: int) -> list[np.random.Generator]:

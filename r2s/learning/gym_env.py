@@ -22,7 +22,7 @@ from r2s.physics.robot import Robot
 from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State, Task, observation_scale
 
-SEEDS = 2**63  # number of seeds for an arm's episodes
+SEEDS = 2**63  # all episode seeds are below this number
 
 
 class SeparateArms(VectorArms):
@@ -75,7 +75,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
-        UserError: autoreset_mode is neither NextStep nor SameStep nor Disabled.
+        UserError: autoreset_mode is not NextStep, SameStep or Disabled.
     """
 
     def __init__(
@@ -117,7 +117,8 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes of all arms, or of the arms that `options["reset_mask"]` (num_envs,) bool selects.
 
-        seed: a number, so that arm i has `seed` + i, or one seed per arm. If None, the random generators continue.
+        seed: one number (arm i then has the seed `seed` + i), or one seed per arm. If None, the random generators
+        continue.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
@@ -137,7 +138,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
             UserError: the actions have a wrong shape, or an episode has ended and automatic resets are disabled.
             FloatingPointError: an action is not finite.
         """
-        waiting = self.ended.copy()  # arms that the mode NextStep resets in this step; their result is dropped
+        waiting = self.ended.copy()  # arms that NextStep resets in this step; r2s drops the results of their actions
         if waiting.any() and self.mode == AutoresetMode.DISABLED:
             raise UserError(f"step: the episode of arm {waiting.argmax()} has ended; reset it first")
         action = np.asarray(actions, dtype=np.float32)
@@ -190,7 +191,7 @@ class ArmEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; `seed` determines the random numbers of this episode and of all later episodes."""
+        """Start a new episode; a `seed` determines the random numbers of this episode and of all later episodes."""
         super().reset(seed=seed)
         self.batch.env.rngs = [self.np_random]
         observation, info = self.batch.reset()

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from r2s.errors import UserError, check_number
 from r2s.learning.networks import Actor, Critics, Normalizer, Policy
 
-KERNELS = 4  # largest number of C++ files of a compiled update
+KERNELS = 4  # largest number of C++ files in a compiled update
 
 
 class Learner(nn.Module, ABC):
@@ -32,16 +32,16 @@ class Learner(nn.Module, ABC):
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
             critics hardly distinguish actions, `action_l2` favors small actions over full torque of alternating sign.
         explore_correlation: correlation of an arm's exploration noise between successive steps; 0 means white noise.
-            Exploration noise is a first-order process of constant variance. Correlated noise moves an arm as far as
-            white noise does, but with less acceleration (Lillicrap et al. 2016; Eberhard et al. 2023, Pink Noise Is
-            All You Need).
+            Exploration noise is a first-order autoregressive process of constant variance. Correlated noise moves an
+            arm as far as white noise does, but with less acceleration (Lillicrap et al. 2016; Eberhard et al. 2023,
+            Pink Noise Is All You Need).
 
     Raises:
         UserError: a setting has the wrong type or is out of range.
     """
 
     action_scale: Tensor
-    compiled: tuple[str, ...] = ("gradients",)  # methods to compile: those with most of the computation
+    compiled: tuple[str, ...] = ("gradients",)  # methods to compile: those that compute the most
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class Learner(nn.Module, ABC):
         check_number("gamma", gamma, "[0, 1)")
         check_number("tau", tau, "(0, 1]")
         check_number("lr", lr, "(0, 1]")
-        check_number("lr", lr, "[1e-12, 1]")  # smaller steps vanish in float32
+        check_number("lr", lr, "[1e-12, 1]")  # smaller steps vanish in float32 rounding
         check_number("action_l2", action_l2, "[0, inf)")
         check_number("explore_correlation", explore_correlation, "[0, 1)")
         obs_dim, act_dim = len(scale[0]), len(action_scale)
@@ -73,7 +73,7 @@ class Learner(nn.Module, ABC):
         self.register_buffer("action_scale", action_scale.float())
         self.gamma, self.tau, self.lr, self.action_l2 = gamma, tau, lr, action_l2
         self.explore_correlation, self.explore_share = explore_correlation, 1.0
-        self._noise: Tensor | None = None  # noise of the last exploration
+        self._noise: Tensor | None = None  # last exploration noise
         self.updates = 0
         # One optimizer suffices: Adam skips parameters without a gradient, such as the actor's in a delayed update.
         self.optimizer = torch.optim.Adam([*self.actor.parameters(), *self.critics.parameters()], lr=lr, fused=True)
@@ -168,13 +168,13 @@ class Learner(nn.Module, ABC):
         batch = {k: torch.zeros(batch_size, size, device=self.action_scale.device) for k, size in sizes.items()}
         batch |= {k: torch.zeros(batch_size, device=self.action_scale.device) for k in ("reward", "terminated")}
         devices = [self.action_scale.device] if self.action_scale.is_cuda else []
-        # by default torch starts a compiling process per core, and a sweep runs many jobs at once
+        # by default torch starts one compiling process per core: too many for the parallel jobs of a sweep
         workers = {} if devices else {"compile_threads": min(torch.get_num_threads(), KERNELS)}
         try:
             for name, method in eager.items():
                 setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
-            traced = dynamo.patch(trace_autograd_ops=True)  # torch.autograd.grad within the graph
-            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # the update draws noise
+            traced = dynamo.patch(trace_autograd_ops=True)  # the graph contains torch.autograd.grad
+            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # this update draws noise
                 self.update(batch)
         except RuntimeError as error:
             why = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -208,7 +208,8 @@ class Learner(nn.Module, ABC):
 
     def set_extra_state(self, state: dict) -> None:
         """Restore a state that `get_extra_state` returned."""
-        # torch stores references to the loaded moments: without a copy, two learners would share and overwrite them
+        # torch stores references to the loaded Adam moments: without a copy, two learners would overwrite shared
+        # moments
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         noise = state.get("noise")  # older checkpoints contain no noise
         self.updates, self._noise = state["updates"], None if noise is None else noise.to(self.action_scale.device)
@@ -276,7 +277,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Add n log(share) to the target entropy: the entropy change of a Gaussian in R^n scaled by `share`."""
+        """Change the target entropy by n log(share), as scaling a Gaussian in R^n by `share` changes its entropy."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -303,7 +304,7 @@ class EntropyLearner(Learner):
         return out | {"alpha": self.log_alpha.detach().exp()}
 
     def entropy_losses(self, alpha: Tensor, value: Tensor, action: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        """Return actor loss, alpha loss and entropy; value, log_prob: (B,), values and log-densities of `action`."""
+        """Return actor loss, alpha loss and entropy; value, log_prob: (B,), Q-values and log-densities of actions."""
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.entropy_goal)).mean()
         return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}
@@ -312,7 +313,7 @@ class EntropyLearner(Learner):
 def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
     """Return the action tanh(loc + scale * noise) (B, a) and the log-density (B,) of the action; noise ~ N(0, 1).
 
-    The identity log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) keeps the density finite where tanh saturates.
+    With the identity log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), the density is finite where tanh saturates.
     """
     loc, scale = gaussian
     x = loc + scale * noise
@@ -340,7 +341,7 @@ def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
 
 
 def check_hidden(hidden: object) -> None:
-    """Raise UserError unless `hidden`, the units per hidden layer, is a non-empty list of positive integers."""
+    """Raise UserError unless `hidden` (units of each hidden layer) is a non-empty list of positive integers."""
     if not isinstance(hidden, Sequence) or isinstance(hidden, str) or not hidden:
         raise UserError(f"hidden: expected units per layer such as [128, 128], got {hidden!r}")
     for units in hidden:

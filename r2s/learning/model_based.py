@@ -18,10 +18,10 @@ from r2s.physics.safety_filter import ALLOWED
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-STIFF = 12.0  # rad/s, bandwidth of the critically damped feedback; the highest for 50 Hz and an arm's latency
+STIFF = 12.0  # rad/s, bandwidth of critically damped feedback; the highest that 50 Hz and an arm's latency allow
 POSTURE = 1e-3  # m^2, weight of the start posture in the inverse kinematics
-FAST = 0.9 * ALLOWED  # largest planned share of a joint's speed limit; the safety filter allows the share ALLOWED
-PEAK = 1.875  # peak over mean speed of a minimum-jerk motion (15 / 8)
+FAST = 0.9 * ALLOWED  # largest planned speed / speed limit of a joint; the safety filter allows ALLOWED
+PEAK = 1.875  # peak speed / mean speed of a minimum-jerk motion (15 / 8)
 
 
 class Oracle:
@@ -29,7 +29,8 @@ class Oracle:
 
     Args:
         robot, task: the arm and its task with control=torque. dynamics: dynamics of one arm, for computed torque.
-        move_s: s, duration of a motion; r2s prolongs a motion in which a joint would exceed FAST x its speed limit.
+        move_s: s, shortest duration of a motion; a motion lasts longer if a joint would exceed FAST x its speed
+            limit.
     """
 
     def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
@@ -47,7 +48,7 @@ class Oracle:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d); an arm with zero effort starts a new motion."""
+        """Return actions (B, n) in [-1, 1] for observations (B, d); an arm with zero effort begins a new motion."""
         rows, n = observation.numpy().astype(np.float64), self.robot.n
         out = np.empty((len(rows), n))
         for i, row in enumerate(rows):
@@ -127,8 +128,8 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     """Return the baseline `algo=hybrid_force`: zero actions under control=hybrid.
 
-    With zero actions, the controller exerts the requested force f on the surface in open loop, by the torque J^T f
-    plus the modeled friction torque.
+    With zero actions, the controller exerts the requested force f on the surface in open loop. Its torque for this
+    force is J^T f plus the modeled friction torque.
 
     Raises:
         UserError: the controller is not control=hybrid, or the task has no contact.

@@ -28,10 +28,10 @@ class Normalizer(nn.Module):
 
 
 class Actor(nn.Module):
-    """Map observations (B, d) to loc and scale (B, a) of a Gaussian whose tanh is the action.
+    """Map observations (B, d) to loc and scale (B, a) of a Gaussian; tanh of a sample is the action.
 
     Deterministic algorithms use only `mode` and do not train the scale. The network still has outputs for the scale,
-    so that the policies of all algorithms have the same file format and network size.
+    so that all algorithms write policies of equal size and file format.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, hidden: tuple[int, ...]):
@@ -43,12 +43,12 @@ class Actor(nn.Module):
         self.body = nn.Sequential(*layers, nn.Linear(sizes[-1], 2 * act_dim))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return loc and scale (B, a) of the Gaussian whose tanh is the action."""
+        """Return loc and scale (B, a) of the Gaussian; tanh of a sample is the action."""
         loc, log_std = self.body(observation).chunk(2, -1)
         return loc, log_std.clamp(*LOG_STD).exp()
 
     def mode(self, observation: Tensor) -> Tensor:
-        """Return the deterministic action (B, a), tanh of loc."""
+        """Return the deterministic action (B, a), tanh(loc)."""
         return torch.tanh(self.body(observation).chunk(2, -1)[0])
 
 

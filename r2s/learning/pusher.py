@@ -1,8 +1,8 @@
 """Push a box without learning: the model-based baseline `algo=pusher` for `task=push`.
 
-The pusher's model is quasi-static and independent of the box's mass and friction. In this model, a frictionless push
-at a face point p along the inward normal n by a length s moves the box by s n / (1 + h^2) and turns it by
-s h / (r (1 + h^2)), where h = (p x n) / r, and r is the ratio of friction moment to force (limit surface of
+The pusher's model is quasi-static and independent of the box's mass and friction. Let a frictionless push of length s
+act at a face point p along the inward normal n. In the model, the push moves the box by s n / (1 + h^2) and turns it
+by s h / (r (1 + h^2)), with h = (p x n) / r. Here r is the ratio of friction moment to friction force (limit surface,
 r2s/physics/sliding.py). The pusher divides the errors of position and yaw by their tolerances. In every control
 period, the pusher selects the face point whose best push reduces the error fastest. The time of a push includes the
 tip's travel to the face point.
@@ -24,13 +24,13 @@ from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
 from r2s.tasks.push_measures import GOOD_M, GOOD_RAD
 from r2s.tasks.task import Task
 
-POINTS, EDGE = 9, 0.75  # number of points per face; share of a half edge that the points span
+POINTS, EDGE = 9, 0.75  # number of points per face; the points span this share of an edge
 CLEAR = 0.02  # m, clearance between tip and box while the tip moves around the box
-NEAR = 0.012  # m, lateral error of the tip in front of a face, below which the tip pushes
-TOLERANCE = np.array([GOOD_M, GOOD_M, GOOD_RAD])  # m, m, rad: the unit of the error
-DONE = 0.3  # tolerances, error below which the pusher stops: 9 mm or 3 degrees; a noisy pose alone has 0.06
-SPEED, TRAVEL, SLOW_M = 0.15, 0.2, 0.02  # m/s, tip speed in a push, between pushes; m, a shorter push is slower
-GAIN = 0.25  # gain of the tip speed feedback / damping of the impedance law; 25 Hz and the latency allow little more
+NEAR = 0.012  # m, the tip pushes if its lateral distance from the face point is smaller
+TOLERANCE = np.array([GOOD_M, GOOD_M, GOOD_RAD])  # m, m, rad: unit in which the pusher measures pose errors
+DONE = 0.3  # error, in tolerances, at which the pusher stops: 9 mm or 3 degrees; pose noise alone causes 0.06
+SPEED, TRAVEL, SLOW_M = 0.15, 0.2, 0.02  # m/s, tip speed in and between pushes; m, a push shorter than this is slower
+GAIN = 0.25  # tip speed feedback gain / damping of the impedance law; 25 Hz and the latency allow little more
 
 
 class Pusher:
@@ -93,7 +93,7 @@ class Pusher:
         return np.einsum("bnk,bn->bk", inverse, torque)
 
     def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip velocity (3,) m/s along the table, and the unit vector (2,) of a push, 0 without a push."""
+        """Return the tip velocity (3,) m/s along the table, and the push direction (2,), 0 without a push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
         at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), error[2]]) / TOLERANCE
@@ -103,7 +103,7 @@ class Pusher:
         point, normal, radius = self._points[k], self._normals[k], self._task.tip_radius
         across, push = np.array([-normal[1], normal[0]]), np.zeros(2)
         aside, gap = (at - point) @ across, (point - at) @ normal - radius
-        if abs(aside) < NEAR and -radius < gap < 2 * CLEAR:  # not beyond the face: from there a push leads away
+        if abs(aside) < NEAR and -radius < gap < 2 * CLEAR:  # a tip beyond the face would move away from it
             push = rotation.T @ normal
             velocity = SPEED * min(1.0, (length + max(gap, 0.0)) / SLOW_M) * normal - 3.0 * aside * across
         else:
@@ -113,11 +113,12 @@ class Pusher:
         return np.array([*(rotation.T @ velocity), 0.0]), push
 
     def _best_push(self, at: np.ndarray, e: np.ndarray) -> tuple[int, float]:
-        """Return the face point and the length, m, of the push that reduces the error e (3,) fastest.
+        """Return the index of the face point and the length, m, of the push that reduces the error e (3,) fastest.
 
         The error e, in tolerances, and the tip's position `at` (2,) m are in the box's frame. A push of length s
-        changes the error to e - s w with the twist w of the face point; the best s >= 0 minimizes |e - s w|. The time
-        of a push includes the tip's travel from `at` around the box, but neglects acceleration.
+        changes the error to e - s w, where w is the box's twist per meter of push at the face point. The best s >= 0
+        minimizes |e - s w|. The predicted time includes the tip's travel from `at` around the box, and neglects the
+        tip's acceleration.
         """
         lengths = (self._twists @ e / self._squares).clip(0.0)
         remaining = np.linalg.norm(e - lengths[:, None] * self._twists, axis=1)
@@ -145,7 +146,7 @@ class Pusher:
         if not _crosses(at, to, edge + 0.2 * CLEAR):
             return to
         inside = edge + 0.2 * CLEAR - np.abs(at)
-        if (inside > 0).all():  # the tip touches a face: move away along the normal first
+        if (inside > 0).all():  # the tip is at a face: first move away along the normal
             k = int(np.argmin(inside))
             out = at.copy()
             out[k] = np.sign(at[k]) * clear[k]

@@ -21,7 +21,7 @@ from r2s.physics.tip import nominal_plane, tilted
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or one for all arms
 
 DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # random fields of a `Surface`
-TRIES = 64  # largest number of draws per tensor; a link whose draws are all rejected has the center's tensor
+TRIES = 64  # largest number of draws per tensor; if all are rejected, the link gets the tensor of the center
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class UniformRandomization:
     Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws are
     independent, so some tensors, mainly of slender links, are physically impossible (see `physical`). r2s draws
     impossible tensors again. With inertia_relative = 0.05, the share of valid draws is 100 % for the Panda's links 4
-    and 7, 47 to 63 % for links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). The redraws correlate
-    I_xx and I_yy of link 1 by 0.97, and elements of links 2 to 7 by at most 0.6. Even with redraws, each element
-    varies over its full range of +-5 %.
+    and 7, 47 to 63 % for links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). Because of the
+    redraws, I_xx and I_yy of link 1 have the correlation 0.97; tensor elements of links 2 to 7 have correlations up
+    to 0.6. Even with redraws, each element varies over its full range of +-5 %.
 
     Attributes:
         robot: the arm.
@@ -78,10 +78,10 @@ class UniformRandomization:
 
 @dataclass(frozen=True)
 class PosteriorRandomization:
-    """Draw the dynamics of each arm from a posterior: a random row of its `samples` (S, P) in `space`.
+    """Draw each arm's dynamics from a posterior: a random row of `samples` (S, P), parameters in `space`.
 
-    Drawing whole rows preserves correlations. Every row is physically valid: tensor scales are positive, and the full
-    inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
+    Whole rows preserve the correlations between parameters. Every row is physically valid: tensor scales are
+    positive, and the full inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
     """
 
     space: ParameterSpace
@@ -151,7 +151,7 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
 class ContactRandomization(UniformRandomization):
     """Draw arms as `UniformRandomization` does, and for each arm a random surface near a nominal plane.
 
-    The exponent is at random the lower or the upper end of its range. Stiffness is log-uniform; damping, friction and
+    The exponent is either end of its range, with equal probability. Stiffness is log-uniform; damping, friction and
     bristle are uniform. The plane is shifted along its normal by U(-place, place), and tilted about a random axis by
     U(0, tilt).
 
@@ -179,7 +179,7 @@ class ContactRandomization(UniformRandomization):
 
     @cached_property
     def _identified(self) -> Surface | None:
-        """All posterior draws of the identified surface, as a batch of surfaces; None without `surface`."""
+        """All posterior samples of the identified surface, as a batch of surfaces; None without `surface`."""
         if not self.surface:
             return None
         draws = load_contact(self.surface, "dr.surface").simulated.draws
@@ -263,6 +263,6 @@ def with_payloads(
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:
-    """Return whether each tensor (..., 3, 3) is positive definite and obeys the triangle inequality, (...) bool."""
+    """Return (...) bool: whether tensors (..., 3, 3) are positive definite and obey the triangle inequality."""
     moments = np.linalg.eigvalsh(tensor)
     return (moments[..., 0] > 0) & (moments[..., 0] + moments[..., 1] >= moments[..., 2])

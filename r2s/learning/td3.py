@@ -63,7 +63,7 @@ class TD3(DeterministicLearner):
         due = self.updates % self.policy_delay == 0  # true in the first update, so every logged row has an actor loss
         if due:
             if self.action_scale.is_cuda and "_actor_gradients" in vars(self):
-                # compiled for a GPU, each method is a CUDA graph; the second graph overwrites outputs of the first
+                # on a GPU, each compiled method is a CUDA graph; the second graph overwrites outputs of the first
                 out, gradients = {k: v.clone() for k, v in out.items()}, [g.clone() for g in gradients]
             more, of_actor = self._actor_gradients(batch)
             self.last_actor_loss = more["loss_actor"].clone()  # a CUDA graph overwrites its outputs

@@ -1,7 +1,7 @@
 """Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
 
-The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (tolerance 1e-5). For
-speed, one batched network represents all critics, instead of a vmap over networks.
+The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (tolerance 1e-5). One
+batched network represents all critics, which is faster than TorchRL's vmap over networks.
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ class TQC(EntropyLearner):
 
 
 def quantile_huber(quantiles: Tensor, target: Tensor) -> Tensor:
-    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): the sum of the critics' mean losses.
+    """Return the sum of all critics' mean quantile Huber losses (Dabney et al. 2018, arXiv:1710.10044).
 
     The loss of a quantile and a target atom is |tau - [delta < 0]| huber(delta), where delta = atom - quantile, and
     tau is the quantile's probability. huber(delta) is delta^2 / 2 for |delta| <= 1, otherwise |delta| - 1/2.

@@ -1,13 +1,14 @@
 """Train any algorithm: act, step all arms, store transitions, update, and evaluate at intervals.
 
-The budget limits wall-clock minutes, env steps, or both; the share of the budget used so far sets the curriculum. If
-only env_steps is limited, runs with equal seeds and equal numbers of threads agree bit for bit, even after a stop and
-resumption. If minutes are limited, the curriculum depends on the clock.
+The budget limits wall-clock minutes, env steps, or both; the used share of the budget sets the curriculum. If only
+env_steps is limited, runs with equal seeds and equal numbers of threads agree bit for bit, even after a stop and
+resumption. If minutes are limited, the curriculum depends on the clock, so runs differ.
 
 The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
 one core, steps and updates alternate, with the same result as in parallel. Physics and updates have
 separate OpenMP threads. After an update, shared threads would spin for milliseconds on cores that the physics needs.
-On a busy machine, every barrier would also wait for threads that the operating system has suspended.
+On a busy machine, each synchronization of shared threads would also wait for threads that the operating system has
+suspended.
 """
 
 import copy
@@ -119,7 +120,7 @@ class Callbacks:
 
     Attributes:
         log: called with each row of metrics.csv. evaluated: called with each row of evaluations.csv.
-        progress: called after every step with an update; receives the used share of the budget and numbers to show.
+        progress: called after every step with an update, with the used share of the budget and numbers to show.
     """
 
     log: Callable[[dict], None] = lambda row: None
@@ -202,7 +203,7 @@ class Training:
         self._demonstrator = demonstrator
         self.env_steps, self.updates, self.next_eval = 0, 0, loop.eval_env_steps
         if demonstrator and demonstrator.at_zero:
-            self.next_eval = 0  # the first policy nearly equals the demonstrator; evaluate it for the selection
+            self.next_eval = 0  # the first policy nearly equals the demonstrator and may be the best: evaluate it
         self.factor = env.reward.factor
         self.evaluation: dict[str, Any] = {}
         self._terms: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics
@@ -337,8 +338,8 @@ def keep_memory() -> None:
 def fastest_matmul(device: torch.device) -> str:
     """Return the fastest matrix precision: "medium" (bfloat16) if the device has bfloat16 units, else "highest".
 
-    On a CPU with AVX-512 but without bfloat16 units, "medium" saves no time with networks of 128 to 256 units:
-    rounding the factors takes as much time as the faster products save (benchmarks/results/speed.md).
+    On a CPU with AVX-512 but without bfloat16 units, "medium" saves no time for hidden layers of 128 to 256 units:
+    rounding the factors takes as long as the faster products save (benchmarks/results/speed.md).
     """
     units = device.type == "cuda" or torch.cpu.get_capabilities().get("amx_bf16", False)
     return "medium" if units else "highest"

@@ -18,9 +18,9 @@ NOISES = "_sigma", "_noise", "_pose_noise"
 class VectorArms:
     """Simulate `width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
-    Each ms of a control period has these stages: control law, soft start, low-pass, clip, rate limit, safety filter,
-    delay and lag, physics. The simulator computes kinematics once per control period. `State` stores true speeds and
-    sensor noise separately.
+    Every millisecond runs these stages: control law, soft start, low-pass, clip, rate limit, safety filter, delay and
+    lag, physics. The simulator computes kinematics once per control period. `State` stores true speeds and sensor
+    noise separately.
 
     Attributes:
         speeds: None, because simulated speeds are exact and need no smoothing.
@@ -29,7 +29,7 @@ class VectorArms:
         robot, task: the arm, and the task with its controller.
         dynamics: dynamics of `width` arms, or of one arm for all arms.
         nthread: number of threads; 0: all cores.
-        soft_start_s: s, time for which the torque fades in from 0 at the start of an episode.
+        soft_start_s: s, time in which the torque fades in from 0 at the start of an episode.
         seed: seed of the sensor noise; the noise restarts when `place` resets all arms.
         speed_share: factor on the speed limits of the safety filter.
     """
@@ -57,7 +57,7 @@ class VectorArms:
         self.sim.drive(limits, torque, task.cutoff_hz, soft_start_s, task.push_limit)
         self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
         self.speeds = None
-        self._limited = np.zeros(width)  # cycles changed by the safety filter before the last step
+        self._limited = np.zeros(width)  # cycles that the safety filter changed before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
         self.seed(seed)
         self._sigma, self._noise = np.zeros((2, width, robot.n))
@@ -143,7 +143,7 @@ class VectorArms:
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:
-    """Raise FloatingPointError with an arm and its step in `steps` (m,) unless all `rows` (m, k) are finite."""
+    """Raise FloatingPointError unless all `rows` (m, k) are finite; name the arm and its step from `steps` (m,)."""
     finite = np.isfinite(rows)
     if not finite.all():
         arm = int((~finite.all(-1)).argmax())

@@ -11,9 +11,9 @@ from r2s.physics.surface import Surface
 from r2s.physics.tip import default_plane, nominal_plane
 
 SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; low enough for the hand to stay above the box
-PUSHED_AT = 0.4  # height at which the tip pushes, as a share of the box's height
+PUSHED_AT = 0.4  # ratio of the height at which the tip pushes to the box's height
 SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal pose, to either side
-FORWARD = 0.25  # (distance from the tip at home ahead to the nominal box) / (distance from base to table below tip)
+FORWARD = 0.25  # distance from tip at home ahead to nominal box / distance from base to table point below tip
 # Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
 # from a carton on a smooth table to a block of wood on a dry table
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)
@@ -63,7 +63,8 @@ class TableFrame:
 def table_frame(robot: Robot, point: Any = None, normal: Any = None) -> TableFrame:
     """Return the frame of a table at `point` (3,) m with `normal` (3,).
 
-    If `point` is None, the frame is below and ahead of the tip at home. If `normal` is None, the table is horizontal.
+    If `point` is None, the origin is below and ahead of the tip at home. If `normal` is None, the table is
+    horizontal.
     """
     place, up = nominal_plane(robot, point, normal)
     across = place - (place @ up) * up

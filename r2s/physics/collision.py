@@ -7,8 +7,8 @@ distance fields. The check omits some pairs:
 - The check omits the table for a geom of constant height: either no joint moves the geom, or only joints with
   vertical axes do.
 - The check omits two geoms of neighboring links, because neighboring links touch at their joint.
-- The check omits two geoms closer than HOUSING_M at q_home, because one joint's housing can contain geoms of two
-  links that are two joints apart, as in the Panda's shoulder.
+- The check omits two geoms closer than HOUSING_M at q_home, because both can be parts of one joint's housing. In the
+  Panda's shoulder, for example, a housing contains geoms of links that are two joints apart.
 """
 
 from collections.abc import Collection
@@ -109,8 +109,8 @@ class CollisionCheck:
 
     Args:
         robot: the arm, whose file contains the geoms.
-        table: m, height of the table in the base frame; -inf: no table. If None, the height is TABLE_M, but an arm
-            that reaches below TABLE_M at q_home, as a hanging arm does, has no table.
+        table: m, height of the table in the base frame; -inf: no table; None: TABLE_M, or no table for an arm that
+            reaches below TABLE_M at q_home, such as a hanging arm.
         may_touch: pairs that the check omits; a pair contains two body names, or a body name and "table".
 
     Raises:
@@ -236,7 +236,7 @@ def body_poses(links, bodies, q, frames, poses):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
-    """Return the distance, m, of pair k, or a lower bound of it above `enough` m; work: (10, 3), scratch array."""
+    """Return pair k's distance, m; above `enough` m, a lower bound > `enough` suffices. work: (10, 3), scratch."""
     bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]

@@ -1,11 +1,11 @@
 """Solve a 1 ms step of a tip's contact with a surface, by a method implicit in stiffness, damping and friction.
 
-The normal force is the mean of Hunt and Crossley's force (surface.py) over the step. The mean of the elastic force, K
-d^e, from depth d0 to depth d1 is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of the force's potential V
+The normal force is the mean of Hunt and Crossley's force (surface.py) over the step. Between the depths d0 and d1,
+the mean of the elastic force K d^e is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of the force's potential V
 (Gonzalez, J. Nonlinear Science 6, 1996). A discrete gradient conserves the energy of a bounce at any stiffness, even
 if contact begins or ends within the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older
-than positions. At the depth d, and with the penetration rates `rate` before and `rate1` after the step, d0 is
-therefore d - h rate / 2, and d1 is d0 + h (rate + rate1) / 2.
+than positions. Therefore, d0 = d - h rate / 2 and d1 = d0 + h (rate + rate1) / 2, with the depth d and the
+penetration rates `rate` before and `rate1` after the step.
 
 The stiffness of tangential bristles is proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
 1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with the sliding velocity v and z_s
@@ -13,10 +13,10 @@ The stiffness of tangential bristles is proportional to the normal force F (Canu
 point. While the tip slides steadily, the magnitude of friction is mu F.
 
 The unknowns of a contact step are the joint velocities at the step's end. `add_contact` linearizes normal force and
-friction about a guess of the unknowns, and adds the constant term to the driving torque and the linear term to the
-mass matrix. stick_slip.py solves stiction together with contact, so contact can move a resting joint. `start_guess`
-writes the first guess. `contact_velocity` repeats `add_contact`, `coming_velocity` and `next_guess` until the guess
-is accurate, usually once. `finish_contact` ends the step.
+friction about a guess of the unknowns. `add_contact` then adds the constant term to the driving torque, and the
+linear term to the mass matrix. Stiction is solved together with contact (stick_slip.py), so contact can move a
+resting joint. `start_guess` writes the first guess. `contact_velocity` repeats `add_contact`, `coming_velocity` and
+`next_guess` until the guess is accurate; one repetition is usually enough. `finish_contact` ends the step.
 """
 
 import numpy as np
@@ -63,11 +63,11 @@ from r2s.physics.surface import normal_force
 
 RIGID = 1e-6  # m, smallest `bristle`, for a rigid surface: a fiftieth of the tip's motion per encoder step
 SLIP = 0.02  # m/s, speed above which bristle damping fades out; without fading, each reversal causes a force pulse
-MARGIN = 1e-3  # m, reserve in the prediction of a touch: a tip would need 2000 m/s^2 to cross it within a step
+MARGIN = 1e-3  # m, margin in the prediction of a touch: a tip would need 2000 m/s^2 to cross the margin in a step
 FAR = 0.02  # m, a tip farther away would need 20 m/s to touch within a step
 ROUNDS = 12  # largest number of guesses in a step
 TOLERANCE = 1e-4  # allowed relative error of the normal force after the last guess
-LATE = 1e-2  # allowed error of the tangential force, due to the guess, as a share of the normal force
+LATE = 1e-2  # allowed ratio of the tangential force's error, due to the guess, to the normal force
 BOX_LATE = 1e-3  # allowed relative error of table friction, due to the guessed speed of the box
 NEGLIGIBLE = 1e-6  # N, force that is treated as 0
 SHORT = 1e-6  # ratio |d1 - d0| / depth below which V(d1) - V(d0) is round-off; mean_force then uses the mean depth
@@ -219,7 +219,7 @@ def _velocity(jacobian, dq, slide):
 
 @njit(cache=True, error_model="numpy")
 def _relative(contact, rate, slide, point):
-    """Return penetration rate and sliding speed, m/s, on a box with velocity `point` (3,) m/s; update `slide`."""
+    """Return penetration rate and sliding speed, m/s, relative to a box with velocity `point` m/s; update `slide`."""
     n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
     for k in range(3):
         along += n[k] * point[k]

@@ -9,12 +9,12 @@ from r2s.physics.surface import Surface
 
 # Columns of `contact`: the surface (see `Surface`), the tool, and the results of a step
 K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
-# HALF: half edges of a box, 0: plane. AXES: matrix with box axes as columns, row by row. NORMAL: at the tip for a box
+# HALF: half edges of a box; 0: plane. AXES: matrix with box axes as columns, row by row. NORMAL: at the tip for a box
 HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
 # Columns for a box that slides on a table (sliding.py). MASS: 0 for a fixed surface. WEIGHT: N. TABLE: friction
-# coefficient. REACH: m, moment over force of table friction. UP: table normal. VELOCITY (3): m/s, of center. SPIN:
-# rad/s, about UP. STRAIN (4): m, elastic deflection on the table; the fourth value is REACH times an angle. ARM (3):
-# m, vector from the center to the contact. LOAD: N, table friction while the box slides.
+# coefficient. REACH: m, ratio of the moment to the force of table friction. UP: table normal. VELOCITY (3): m/s, of
+# center. SPIN: rad/s, about UP. STRAIN (4): m, elastic deflection on the table; the fourth value is REACH times an
+# angle. ARM (3): m, vector from the center to the contact. LOAD: N, table friction while the box slides.
 MASS, INERTIA, WEIGHT, TABLE, REACH, UP = range(DEPTH + 1, DEPTH + 7)
 VELOCITY, SPIN, STRAIN, ARM, LOAD = UP + 3, UP + 6, UP + 7, UP + 11, UP + 14
 COLUMNS = LOAD + 1

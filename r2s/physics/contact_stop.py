@@ -1,18 +1,18 @@
 """Stop an arm whose tip presses on a surface: hold the contact force, release the tip, or retreat.
 
-If a stop only removed the command, the contact force F would push the tip off a surface of stiffness k by up to F /
-k, with the elastic energy F^2 / 2k, or joint friction would sustain a contact force of up to `hidden`
-(push_limit.py). The driver therefore has three kinds of stop:
+If a stop only removed the command, the arm could recoil or keep pressing. A contact force F on a surface of stiffness
+k can push the tip back by F / k, with the elastic energy F^2 / 2k. Joint friction can sustain a contact force of up
+to `hidden` (push_limit.py). The driver therefore has three kinds of stop:
 
 - hold: the arm rests with the target torque J^T R; J is the tip's Jacobian, and R is the push limit's estimate of the
   contact force at the stop's start.
 - release: the tip moves outward at the speed LEAVE until the contact force F vanishes. A velocity loop tracks the
   joint velocity of least kinetic energy, -LEAVE m M^-1 J^T, with the mass matrix M and the tip's effective mass m.
-  The feedforward contains the present estimate R and the modeled joint friction, which is a force h at the tip. For
-  an arm with more friction, an integral adds at most h. On a tip that moves outward, joint friction exerts the inward
-  force h, so the estimate R is F - h. The release ends when R falls to RELEASED - SLIDES h. The remaining contact
-  force is at most RELEASED if the true friction is at most SLIDES h, and at most RELEASED + (1 - SLIDES) h if the
-  true friction is at most h.
+  The feedforward contains the present estimate R and the modeled joint friction, which corresponds to a force h at
+  the tip. For an arm with more friction, an integral term adds a force of at most h. On a tip that moves outward,
+  joint friction exerts the inward force h, so the estimate R is F - h. The release ends when R falls to RELEASED -
+  SLIDES h. If the true friction is at most SLIDES h, the remaining contact force is at most RELEASED. If the true
+  friction is at most h, the remaining force is at most RELEASED + (1 - SLIDES) h.
 - retreat: the arm releases the tip, then moves the tip RETREAT_M farther outward.
 
 Every stop obeys the limits of push, speed and acceleration, and every outward motion ends after LEAVES_S.
@@ -26,9 +26,9 @@ from r2s.physics.push_limit import FELT, HEIGHT, HOLD, LEAVE, PHASE, PULL, RESIS
 from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
-RELEASED = 0.5  # N, contact force below which a tip counts as released
+RELEASED = 0.5  # N, largest contact force of a released tip
 SLIDES = 0.25  # ratio of friction in slow sliding to breakaway friction; 0.35 with conf/friction/paper
-RETREAT_M = 0.01  # m; free of obstacles, as the tip came from `task.clearance` = 15 mm above the plane
+RETREAT_M = 0.01  # m; a free path, because the tip came from `task.clearance` = 15 mm above the plane
 LEAVES_S = 0.4  # s; 0.1 s remains for braking. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml
 MOST = 0.25  # largest share of a joint's allowed speed that the outward motion uses
 GAIN = 0.5 * RATE  # 1/s, gain of the velocity loop: half of the latency budget remains for the estimate R
@@ -55,7 +55,7 @@ def stop_torque(limit, arm, kinematics, friction, limits, held, target):
         mobility += row[j] * lever[j]
         kept += lever[j] * held[j]
     felt = limit[RESISTED] - kept / mobility
-    if limit[PHASE] == BEGINS:  # a tip above the highest place of the true plane touches nothing
+    if limit[PHASE] == BEGINS:  # a tip above the highest possible true plane touches nothing
         limit[FELT] = max(felt, 0.0) if height < 0.0 else 0.0
         limit[PHASE] = OVER if limit[STOP] == HOLD or height >= 0.0 else PRESSES
     target[:] = 0.0

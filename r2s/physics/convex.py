@@ -54,7 +54,7 @@ def support_point(body, vertices, pose, dx, dy, dz):
 
 @njit(cache=True, error_model="numpy")
 def separation(enough, a, pose_a, b, pose_b, vertices, work):
-    """Return the distance, m, of two bodies, 0 or less if they overlap, or a lower bound of it above `enough` m."""
+    """Return two bodies' distance, m (0 or less: overlap); above `enough` m, a lower bound > `enough` suffices."""
     around = a[RADIUS] + b[RADIUS]
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return np.sqrt(_segments(a, pose_a, b, pose_b)) - around
@@ -100,15 +100,15 @@ def _segments(a, p, b, r):
 def _nearest(s, count, t):
     """Return the simplex point x, y, z nearest to the origin, and the number of corners that span this point.
 
-    The number of corners is 4 if the origin is inside the simplex. s: (4, 3) m, contains the simplex corners in
-    `count` rows; `_nearest` moves the spanning corners to the front. t: scratch.
+    The number of corners is 4 if the origin is inside the simplex. s: (4, 3) m, whose first `count` rows are the
+    simplex corners; `_nearest` moves the spanning corners to the front. t: scratch.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1
     if count == 2:
         return _on_edge(s)
     best, x, y, z, kept = np.inf, 0.0, 0.0, 0.0, 4
-    for face in range(4 if count == 4 else 1):  # one call of _on_triangle, to halve the compile time
+    for face in range(4 if count == 4 else 1):  # a loop with one call of _on_triangle halves the compile time
         i, j, k = (face, face + 1, face + 2) if face < 2 else (0, face, 3 if face == 2 else 1)
         if count == 4:
             nx, ny, nz = _normal(s[i], s[j], s[k])

@@ -15,8 +15,8 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import SIGMOID
 from r2s.physics.robot import Robot
 
-SPEEDS, SLOWEST = 100, 0.01  # number of fitted speeds per direction, from SLOWEST dq_max to dq_max
-STEEPEST = 100.0  # s/rad, largest fp2: a controller that filters dq chatters with a steeper step
+SPEEDS, SLOWEST = 100, 0.01  # number of fitted speeds per direction, from SLOWEST * dq_max to dq_max
+STEEPEST = 100.0  # s/rad, largest fp2: with a steeper law, a controller that filters dq chatters
 
 
 def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
@@ -30,7 +30,7 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
     share = np.geomspace(SLOWEST, 1.0, SPEEDS)
     dq = np.concatenate([-share[::-1], share])[:, None] * robot.dq_max
     true = dynamics.friction(dq, np.sign(dq))
-    if dynamics.family is SIGMOID and not dynamics.phi[:, 3:].any():  # without viscous friction: the same law
+    if dynamics.family is SIGMOID and not dynamics.phi[:, 3:].any():  # the same law: viscous friction is 0
         return dynamics.phi[:, :3], np.zeros(robot.n)
     out = np.empty((robot.n, 3))
     for j in range(robot.n):
@@ -40,7 +40,7 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
         def error(x: np.ndarray, j: int = j) -> np.ndarray:
             return sigmoid_law(dq[:, j], x) - true[:, j]
 
-        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # similar to viscous and to Coulomb friction
+        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # one like viscous, one like Coulomb friction
         fits = [least_squares(error, start, bounds=bounds, x_scale="jac") for start in starts]
         out[j] = min(fits, key=lambda fit: fit.cost).x
     return out, np.sqrt(np.mean((sigmoid_law(dq, out) - true) ** 2, axis=0))

@@ -18,8 +18,8 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.urdf import GEAR, ROTOR
 from r2s.physics.welds import Bodies, about, make_pose, rotation
 
-ENDLESS = 1e16  # rad, SDF's value for no limit
-HAND = 1e-12, 1e-13  # kg, kg m^2 of the URDF link `ee`: without an inertia, DART assumes 1 kg and 1 kg m^2
+ENDLESS = 1e16  # rad, SDF represents a joint without limits by this value
+HAND = 1e-12, 1e-13  # kg, kg m^2 of the URDF link `ee`: for a link without inertia, DART assumes 1 kg and 1 kg m^2
 
 
 @dataclass(frozen=True)
@@ -314,7 +314,7 @@ def _roll_pitch_yaw(r: np.ndarray) -> np.ndarray:
     """Return roll, pitch, yaw (3,) rad with Rz(yaw) Ry(pitch) Rx(roll) = r; at gimbal lock yaw is arbitrary."""
     yaw = np.arctan2(r[1, 0], r[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
-    # from Rz(-yaw) r, whose elements are well conditioned for any yaw
+    # roll and pitch from Rz(-yaw) r, whose elements are well conditioned for any yaw
     roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
     return np.array([roll, np.arctan2(-r[2, 0], c * r[0, 0] + s * r[1, 0]), yaw])
 

@@ -14,7 +14,7 @@ from r2s.physics.surface import Surface
 
 STICTION_MODELS = ("command", "net")
 CREEP = 2e-3  # rad/s, dq_min of "net": above the residual speed 1 ms after a stop, below the speed of any motion
-PHI1 = 0.02  # share of tau_max: `phi1` (twice the Coulomb torque) of a joint without declared friction
+PHI1 = 0.02  # ratio of `phi1` (twice the Coulomb torque) to tau_max for a joint without friction in the file
 MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: largest allowed friction parameter, above that of any arm
 
 
@@ -23,7 +23,7 @@ class Dynamics:
     """Parameters that identification estimates and domain randomization samples; arrays may have batch axes.
 
     Attributes:
-        phi: (..., n, K), parameters of the friction law `family`; for eq. (5) of the paper in Nm, s/rad, rad/s.
+        phi: (..., n, K), parameters of the friction law `family`; Nm, s/rad and rad/s for the sigmoid law.
         offset: (..., n) Nm, constant torque added to every command.
         breakaway: (..., n, 2) Nm, negative and positive breakaway torque.
         dq_min: rad/s, speed below which a joint can stick.
@@ -35,13 +35,14 @@ class Dynamics:
         gain: (..., n), relative error of the link-side torque sensor or of the motor's torque constant; this error
             changes the recorded torque, but not the arm's motion.
         signal_delay: (...) s, delay of a recording's torque (measured or motor torque) behind its joint angles.
-        late_alike: whether identification treats a recording's measured torque and dq as equally late, and therefore
-            uses dq as logged.
+        late_alike: whether a recording's measured torque and dq have the same delay; identification then uses dq as
+            logged.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: the friction law.
-        stiction_model: "command" (eq. (6) of the paper): on a joint at rest, command and offset have no effect while
-            their sum is between the breakaway torques. "net": a joint sticks while the sum of all torques except its
-            friction, with the coupling to other joints, is between the breakaway torques (r2s/physics/stick_slip.py).
+        stiction_model: "command" (the paper's equation (6)): on a joint at rest, command and offset have no effect
+            while their sum is between the breakaway torques. "net": a joint sticks while the sum of all torques
+            except friction, including the coupling to other joints, is between the breakaway torques
+            (r2s/physics/stick_slip.py).
         delay, lag: (...) s, pure delay and first-order lag of the actuation. After `Simulator.drive`, the simulator
             applies delay and lag; otherwise, `Motors` (r2s/physics/actuation.py) applies them.
         declared_payload: (..., 4), the payload that is declared to gravity compensation (r2s/physics/payload.py):
@@ -98,7 +99,7 @@ class Dynamics:
     def holding_contact(self) -> "Dynamics":
         """Return the dynamics, with stiction_model="net" if the friction law is discontinuous at rest.
 
-        With the stiction model of the paper's eq. (6), any contact force would move a joint at rest.
+        With stiction_model="command", any contact force would move a joint at rest.
         """
         if self.family.sharp is None:
             return self
@@ -143,11 +144,11 @@ def nominal_dynamics(
 ) -> Dynamics:
     """Return the dynamics that `conf/friction` and `conf/inertia` describe; a scalar value applies to all joints.
 
-    phi1, phi2 and phi3 are the parameters of the sigmoid law, eq. (5). If phi1 is None, Coulomb and viscous friction
-    are frictionloss and damping in the robot's file; for a joint without frictionloss and damping, phi1 is PHI1 times
-    tau_max. family="auto" selects the sigmoid law or, if the friction comes from the file, the Coulomb law; any other
-    family receives parameters with the same friction at 1 rad/s. If a breakaway torque is None, its magnitude is the
-    file's frictionloss.
+    phi1, phi2 and phi3 are the parameters of the sigmoid law. If phi1 is None, frictionloss and damping in the
+    robot's file define Coulomb and viscous friction. For a joint without frictionloss and damping, phi1 is then PHI1
+    times tau_max. family="auto" selects the sigmoid law or, if the friction comes from the file, the Coulomb law. Any
+    other family receives parameters with the same friction at 1 rad/s. If a breakaway torque is None, its magnitude
+    is the file's frictionloss.
 
     Raises:
         UserError: a list has the wrong length, or a value is out of its physical range.
@@ -163,7 +164,7 @@ def nominal_dynamics(
 
     declared = phi1 is None and bool(robot.damping.any() or robot.frictionloss.any())
     slow, fast = robot.frictionloss, robot.damping
-    guess = np.where(slow + fast > 0, 2.0 * (slow + fast), PHI1 * robot.tau_max)  # phi1 with this friction at 1 rad/s
+    guess = np.where(slow + fast > 0, 2.0 * (slow + fast), PHI1 * robot.tau_max)  # phi1 from the file's friction
     phi = np.stack([joints("friction.phi1", guess if phi1 is None else phi1), joints("friction.phi2", phi2)], -1)
     scale = joints("inertia.scale", inertia_scale)
     for name, values in (("friction.phi1", phi[:, 0]), ("friction.phi2", phi[:, 1])):

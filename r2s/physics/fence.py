@@ -1,15 +1,15 @@
-"""Stop an arm in the driver before it touches itself or the table; the compiled check takes microseconds.
+"""Stop an arm before it touches itself or the table, by a compiled check in the driver that takes microseconds.
 
 The fence predicts the posture in which the arm would rest if it braked now. In the predicted posture, the bodies of
 each pair of `CollisionCheck` must be at least FENCE_M apart. The required distance grows with speed, to FENCE_M (1 +
 SPREAD) at full speed, because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within
-BRAKE_S, and joints lag the ramp by LAG_S. The joint with the largest ratio of speed to allowed speed brakes first;
-every other joint begins to brake when the ramp has fallen to the joint's ratio. During a motion, the predicted
-posture changes continuously, so it cannot jump over a body.
+BRAKE_S, and joints follow the ramp with a lag of LAG_S. The joint with the largest ratio of speed to allowed speed
+brakes first; every other joint begins to brake when the ramp has fallen to that joint's ratio. During a motion, the
+predicted posture changes continuously, so it cannot jump over a body.
 
-If two bodies start a motion closer than FENCE_M, the arm may move them apart: the required distance is half of their
-largest distance in the motion so far, but at most FENCE_M. The fence ignores initially overlapping bodies until they
-separate.
+If two bodies are closer than FENCE_M at a motion's start, the arm may move them apart. Their required distance is
+then half of their largest distance in the motion so far, but at most FENCE_M. The fence ignores initially overlapping
+bodies until they separate.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from r2s.physics.kinematics import POSE
 from r2s.physics.safety_filter import BRAKE_S, DQ_ALLOWED, LATENCY_S, RATE
 
 FENCE_M = 0.01  # m, required distance
-SPREAD = 3.0  # in simulation, stops from full speed end up to 0.02 m from the predicted posture
+SPREAD = 3.0  # in simulation, an arm that brakes from full speed rests up to 0.02 m from the predicted posture
 LAG_S = 1 / RATE + LATENCY_S  # s, lag of a joint's speed behind the ramp
 
 

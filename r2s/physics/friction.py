@@ -15,7 +15,7 @@ from r2s.errors import UserError, choices, nearest
 
 WIDTH_DQ = 0.01  # rad/s, width of the sign change of Coulomb friction; equal to the default dq_min of stiction
 PRESLIDING = 1e-3  # rad, presliding distance if it is not identified; typical of a Panda's joints
-MICRO_DAMPING = 5e-3  # s, bristle damping over bristle stiffness; bristle oscillations decay within a few periods
+MICRO_DAMPING = 5e-3  # s, ratio of bristle damping to bristle stiffness; bristle oscillations decay in a few periods
 FALLEN = 40.0  # (speed / Stribeck velocity)^2 above which the Stribeck term is below the rounding error of 1
 PHI = 8  # maximum number of parameters of a family
 VISCOUS = "viscous"  # name of the viscous parameter in every family that has one, Nm s/rad
@@ -36,11 +36,11 @@ class Family:
             `sign` is tanh(dq / 0.01) or, for a law with a memory, the bristle deflection, in [-1, 1].
         native: law of a joint in one step of h s, compiled by numba.njit: (p (PHI,), v, h, memory (1,)) ->
             torque and its derivative at v. `memory` is the state of the joint's friction, 0 after a reset.
-        sharp: version of `native` whose torque is discontinuous at v = 0, for stiction_model="net". If None, the law
-            is continuous at rest.
-        start: function that maps friction (..., n) Nm at 1 rad/s to a list of the required parameters' start values.
-        held: function that maps phi (..., n, K) to negative and positive breakaway torques (..., n, 2) Nm of a law
-            with memory. If None, the law has no stiction, and eq. (6) of the paper or stick_slip.py adds stiction.
+        sharp: version of `native` whose torque is discontinuous at v = 0, for stiction_model="net"; None: the law is
+            continuous at rest.
+        start: function from friction (..., n) Nm at 1 rad/s to a list of start values, one per required parameter.
+        held: for a law with memory, function from phi (..., n, K) to negative and positive breakaway torques (..., n,
+            2) Nm; None: the law itself has no stiction, so `Dynamics.stiction_model` adds stiction.
 
     Raises:
         UserError: the attributes are inconsistent.
@@ -128,7 +128,7 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def _sigmoid_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    """Return the friction of the paper's eq. (5) plus a viscous term, Nm."""
+    """Return the friction of the paper's equation (5) plus viscous friction, Nm."""
     return p[0] * (sigmoid(p[1] * (dq + p[2])) - sigmoid(p[1] * p[2])) + p[3] * dq
 
 
@@ -265,7 +265,7 @@ def _bristle_native(p, v, h, memory):
     level = p[0] * (1.0 + side * p[1]) * (1.0 + p[3] * (1.0 + side * p[6]) * np.exp(-((v / p[4]) ** 2)))
     stiff = level / p[5]
     rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
-    # the second term: change of the deflection in the coming step at the present velocity, and bristle damping
+    # second term: force of the deflection's change in the coming step at the present velocity, and bristle damping
     viscous = p[2] * (1.0 + s * p[7])
     return level * z + stiff * rate * (v - abs(v) * z) + viscous * v, stiff * rate * (1.0 - s * z) + viscous
 

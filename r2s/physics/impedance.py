@@ -6,12 +6,13 @@ The Cartesian law has the task error e, the Jacobian J, the task stiffness K, an
 damping D = 2 zeta (M # K_q) gives every mode the damping ratio zeta. The mass matrix M and the joint stiffness K_q =
 J^T K J + N^T K_n N have the geometric mean M # K_q = M (M^-1 K_q)^(1/2). The double diagonalization of Albu-Schaeffer
 et al. (ICRA 2003) yields the same damping D from eigenvectors. The null-space projector N is dynamically consistent
-(Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a potential. When
-stiffness rises, an energy tank (Ferraguti et al., ICRA 2013) must supply the energy for the springs; damping refills
-the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al., RA-L 2016). The
-feedforward cancels gravity-compensation errors and friction: bristle friction at the measured angle, other friction
-at the reference speed dq_r. A feedforward above the true friction would drive the arm. A feedforward that cancels a
-bristle stiffness k after a delay d adds damping k sin(w d) / w > 0 at frequencies w < pi / d.
+(Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a potential. An energy
+tank (Ferraguti et al., ICRA 2013) must supply the energy that a rise of stiffness adds to the springs; damping
+refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al., RA-L
+2016). The feedforward cancels errors of gravity compensation and friction: bristle friction at the measured angle,
+other friction at the reference speed dq_r. A feedforward above the true friction would accelerate the arm. A
+feedforward that cancels a bristle stiffness k after a delay d adds damping k sin(w d) / w > 0 at frequencies w < pi /
+d.
 """
 
 import numpy as np
@@ -28,10 +29,10 @@ from r2s.physics.newton_euler import (
 )
 
 # Parameters: cycles between two updates of D and N, 2 zeta, spring energies J at which force and moment saturate,
-# first level and size of the tank J, cycle s; indices in the command (-1: none), size of the target, number of task
-# axes (3 or 6); whether the law is hybrid, rate of its integrals 1/s, largest force and integral N. APPROACH: above 0
-# if the spring to the target bounds a hybrid force; 1: dq_r affects only the friction feedforward; SLIDES:
-# the target moves on the surface, which may be tilted
+# first level and size of the tank J, cycle s. Then indices in the command (-1: none), size of the target, number of
+# task axes (3 or 6), whether the law is hybrid, rate of its integrals 1/s, largest force and integral N. APPROACH:
+# above 0 if the spring to the target bounds a hybrid force; 1 if dq_r affects only the friction feedforward; SLIDES
+# if the target moves on a surface whose slope the law estimates.
 HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
 DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
 K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
@@ -43,26 +44,28 @@ SLIDES = 2  # a value of APPROACH
 # saturates, home, presliding distance rad (0: no bristles), breakaway Nm (-, +), load-dependent friction Nm/Nm
 ROTOR, MASS_ERROR, MOMENT_ERROR, OFFSET, DRAG, FRICTION = 28, 29, 30, 33, 34, 36
 K_JOINT, JOINT_LIMIT, HOME, PRESLIDING, EDGES, LOAD, ROW = 44, 47, 48, 49, 50, 52, 53
-# Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; for a sliding tip, the
-# integrals N along the path and sideways (2), and the slope of the surface (3). Then the stiffnesses, ROWS rows (n,):
-# dq_r, last damping torque, last q, low-pass filtered q, its value at the last update of the bristles, bristle
-# deflection in [-1, 1]. Then the matrices D and N^T
+# Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; for a sliding tip,
+# integrals N along the path and sideways (2), and slope of the surface (3); stiffnesses. Then ROWS rows (n,): dq_r,
+# last damping torque, last q, low-pass filtered q, filtered q at the last update of the bristles, bristle deflection
+# in [-1, 1]. Then the matrices D and N^T.
 SINCE, BEGUN, LEVEL, INTEGRAL, ACROSS, SLOPE, STIFFNESS = 0, 1, 2, 3, 4, 6, 9
 DAMPED, BEFORE, MEAN, ANCHOR, DEFLECTION, ROWS = 1, 2, 3, 4, 5, 6
-SPRINGS = 4  # stiffnesses in the task's axes
-ROUNDS = 14  # iterations of the geometric mean: enough for squared frequencies with a ratio of 1e4
+SPRINGS = 4  # number of stiffnesses in the task's axes
+ROUNDS = 14  # iterations of the geometric mean: enough if squared frequencies differ by a factor of 1e4
 FREE = 1.0  # rad/s, frequency that sets the damping of modes without a spring
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice REST_DQ
 # SETTLE_S: s, lag of the low-passed angles for friction; cuts a Panda's encoder noise, 1.4e-5 rad, to a third. STEP:
-# bristles deflect in steps of this share of the presliding distance, at least ENCODER rad, 10 times the reduced noise
+# the bristles are updated after a motion of STEP times the presliding distance, at least ENCODER rad, 10 times the
+# reduced noise
 SETTLE_S, STEP, ENCODER = 5e-3, 0.1, 5e-5
 # rad/s. REST_DQ: speed below which a joint may rest, 3.5 times the noise of (q - MEAN) / SETTLE_S. DIRECTION_DQ:
-# width of friction's sign change over reference speed; press.py on twins 0 and 1: 0.003 to 0.01 perform alike
+# width of friction's sign change over reference speed; in press.py on twins 0 and 1, values from 0.003 to 0.01
+# perform equally
 REST_DQ, DIRECTION_DQ = 0.01, 0.003
 # SLOPE_RATE: 1/s; the slope estimate settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING: m/s, speed below
 # which the estimate adapts slower: 5 times the tip's speed noise, 3e-3 rad/s (Panda) at levers of 0.5 m in 7 joints
 SLOPE_RATE, SLIDING = 10.0, 0.02
-SMALLEST = 0.01  # share of a requested rise of stiffness; a smaller share is not halved again but becomes 0
+SMALLEST = 0.01  # smallest share of a requested rise of stiffness; the next smaller share is 0
 MOBILITY = 1e-3  # 1/kg, 1/(kg m^2): directions with less mobility, near a singularity, are treated as blocked
 
 
@@ -172,10 +175,10 @@ def geometric_mean(K, mobility, out):
 
 @njit(cache=True, error_model="numpy")
 def spring(s, limit):
-    """Return a saturating spring's energy U, J, and the factor on its force K e; s: J, linear energy e^T K e / 2.
+    """Return a saturating spring's energy U, J, and the factor on the linear force K e; s: J, energy e^T K e / 2.
 
-    The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. As U depends on s alone, U is a potential of the
-    force for every K, and U rises with K. The force is at most sqrt(2 K limit). If limit is clip^2 / (2 K_high), the
+    The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. U depends on s alone, so U is a potential of the
+    force for every K. U rises with K. The force is at most sqrt(2 K limit). If limit is clip^2 / (2 K_high), the
     force is at most `clip` for every K up to K_high.
     """
     if s <= limit:
@@ -225,11 +228,11 @@ def friction_at(v, row, load):
 def friction_ahead(v, q, j, load, parameters, memory, at):
     """Return the friction feedforward, Nm, of joint j at q rad; v: reference speed of the joint, rad/s.
 
-    With bristles, the feedforward is the bristle deflection z times the friction at reference or measured speed,
-    whichever is smaller. The measured joint motion drives the deflection: dz/dt = (dq - |dq| z) / presliding (Dahl
-    1968). Without bristles and with APPROACH = 1, the feedforward is the friction at v. Without bristles and with
-    another APPROACH, the feedforward has the sign of v, and a joint at rest receives at least the breakaway torque if
-    |v| >> DIRECTION_DQ. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
+    With bristles, the feedforward is the bristle deflection z times the smaller of the friction magnitudes at
+    reference speed and measured speed. The measured joint motion drives the deflection: dz/dt = (dq - |dq| z) /
+    presliding (Dahl 1968). Without bristles and with APPROACH = 1, the feedforward is the friction at v. Without
+    bristles and with another APPROACH, the feedforward has the sign of v; for |v| >> DIRECTION_DQ, it is at least the
+    breakaway torque on a joint at rest. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
@@ -253,7 +256,7 @@ def friction_ahead(v, q, j, load, parameters, memory, at):
 
 @njit(cache=True, error_model="numpy")
 def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
-    """Return gravity's torque, Nm, about joint j on a body with mass `mass`, kg, and first moment x, y, z, kg m."""
+    """Return the gravity torque, Nm, about joint j, of a body with mass `mass` kg and first moment x, y, z kg m."""
     x, y, z = x - mass * frames[j, 0], y - mass * frames[j, 1], z - mass * frames[j, 2]
     a, b, c = parameters[GRAVITY], parameters[GRAVITY + 1], parameters[GRAVITY + 2]
     a, b, c = y * c - z * b, z * a - x * c, x * b - y * a

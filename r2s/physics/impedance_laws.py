@@ -81,7 +81,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
             asked[j] = min(max(command[stiff + j], row[K_JOINT + 1]), row[K_JOINT + 2])
         K[j] = asked[j] if begins else K[j]
     share, pays = 1.0, False
-    while not pays:  # halve a rise of stiffness until the tank can supply the energy; a fall needs none
+    while not pays:  # halve a rise of stiffness until the tank can supply the energy; a decrease needs no energy
         raised = 0.0
         for j in range(n):
             out[j] = asked[j] if asked[j] <= K[j] else K[j] + share * (asked[j] - K[j])
@@ -122,7 +122,7 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
             asked[k] = min(max(command[at + k], parameters[K_LOW + k]), parameters[K_HIGH + k])
         K[k] = asked[k] if begins else K[k]
     before, share, pays = task_energy(K, error, tilt, parameters), 1.0, False
-    while not pays:  # halve a rise of stiffness until the tank can supply the energy; a fall needs none
+    while not pays:  # halve a rise of stiffness until the tank can supply the energy; a decrease needs no energy
         for k in range(SPRINGS):
             new[k] = asked[k] if asked[k] <= K[k] else K[k] + share * (asked[k] - K[k])
         raised = task_energy(new, error, tilt, parameters) - before
@@ -214,7 +214,8 @@ def normal_force(command, shift, parameters, memory):
     """Return the desired tip force, N, against the normal: the reference plus an integral of the force error.
 
     The command contains the normal (3,), reference and measured force, N, and a flag, above 0 if force is measured.
-    Stiffness times the action's displacement against the normal adds to the reference. Saturation stops the integral.
+    The reference includes the stiffness times the action's displacement against the normal. Saturation stops the
+    integral.
     """
     at = int(parameters[TARGET_AT]) + int(parameters[TARGET_SIZE])
     asked = command[at + 3]
@@ -236,10 +237,10 @@ def normal_force(command, shift, parameters, memory):
 def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
     """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's motion.
 
-    The gradient method (Widrow and Hoff, 1960) fits the slope g in the equation: tip speed along the normal = g .
-    target velocity. `slide` adds this speed, along the normal, to `velocity` (3,) m/s. The correcting force is the
-    sum of two clamped integrals of the position error, one along the motion, where friction acts, and one across the
-    motion.
+    The gradient method (Widrow and Hoff, 1960) fits a slope g so that g . target velocity is the tip's speed along
+    the normal. `slide` adds this speed, in the direction of the normal, to `velocity` (3,) m/s. The correcting force
+    is the sum of two clamped integrals of the position error, one along the motion, where friction acts, and one
+    across the motion.
     """
     up, rises, fast = 0.0, 0.0, SLIDING * SLIDING
     for k in range(3):
@@ -275,8 +276,8 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     The command begins with the optional action: target displacement (3) m and, for six axes, (3) rad; stiffness (3)
     N/m and, for six axes, (1) Nm/rad. The task's target follows the action: position (3) m, optionally velocity (3)
     m/s and rotation vector from home (3) rad. For hybrid control, the entries that `normal_force` describes follow
-    the target. If APPROACH > 0, stiffness times the depth of the target below the tip bounds the normal force. If
-    APPROACH is SLIDES, the target is valid for the middle of the control period, and the command ends with a
+    the target. If APPROACH > 0, the normal force is at most the stiffness times the depth of the target below the
+    tip. If APPROACH is SLIDES, the target is valid for the middle of the control period, and the command ends with a
     feedforward force (3) N.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS

@@ -15,7 +15,7 @@ SLIDES = 0.01  # rad/s, width of the sign change of load-dependent friction, as 
 
 @dataclass(frozen=True)
 class InverseDynamics:
-    """Inverse dynamics of one arm that compensates gravity.
+    """Inverse dynamics of one arm with gravity compensation.
 
     Attributes:
         robot: the arm, which compensates the gravity torque of its nominal links.
@@ -48,7 +48,7 @@ class InverseDynamics:
         return out
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
-        """Return the command (m, n) Nm, without gravity, for q, dq, ddq and friction at `sliding` (m, n) rad/s."""
+        """Return the command (m, n) Nm, without gravity, for q, dq, ddq, with friction at `sliding` (m, n) rad/s."""
         d = self.dynamics
         out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
         if d.drag.any():

@@ -9,11 +9,11 @@ from r2s.physics.newton_euler import joint_frame, links_of, rotate
 from r2s.physics.robot import Robot
 
 POSE = 12  # columns of a pose: position (3,), rotation matrix (3, 3) row by row
-DAMPING = 1e-4  # m^2, damped least squares: (10 mm)^2 bounds the steps near a singularity
+DAMPING = 1e-4  # m^2, damping of the least squares, (10 mm)^2; bounds the steps near a singularity
 HOMEWARD = 0.02  # share of the distance to the home posture that a null-space motion covers per point
 ITERATIONS = 8  # largest number of Newton steps per point
-CLOSE = 1e-5  # m, position error at which the steps end
-MAX_STEP = 0.3  # rad per joint and Newton step
+CLOSE = 1e-5  # m, position error at which the iteration ends
+MAX_STEP = 0.3  # rad, largest motion of a joint in a Newton step
 
 
 class HandKinematics:

@@ -31,7 +31,7 @@ def unpack(packed, scale, diagonal, out):
 def factor(matrix, root, active=None):
     """Write the root of a matrix (n, n) from the lower triangle of `matrix`; `root` may be `matrix` itself.
 
-    active: (n,), 0 for rows and columns that the factorization omits. If None, the factorization omits no row.
+    active: (n,), 0 for rows and columns that the factorization omits; None: omit no row.
     """
     for i in range(len(root)):
         if active is not None and active[i] == 0.0:

@@ -1,15 +1,15 @@
 """Add friction, control law, safety filter and motors to MuJoCo's physics step, by a compiled callback.
 
 `install()` registers a native control callback. The callback reads each arm's parameters from `jnt_user`, so a batch
-of different arms runs at full speed. In each physics step, the callback computes friction (friction.py) and, after a
-call of `Simulator.drive`, control law (control_laws.py), safety filter (safety_filter.py) and motor delay
-(actuation.py). MuJoCo calls the control callback last before it computes accelerations, so the callback knows the sum
-of all other forces, which stiction (stick_slip.py) and contact (contact.py) need.
+of different arms runs at full speed. In each physics step, the callback computes friction (friction.py). Once
+`Simulator.drive` has been called, the callback also computes control law (control_laws.py), safety filter
+(safety_filter.py) and motor delay (actuation.py). MuJoCo computes accelerations right after the control callback, so
+the callback knows the sum of all other forces, which stiction (stick_slip.py) and contact (contact.py) need.
 
-A linearly implicit method integrates the friction torque tau_f. With D = d tau_f / dv >= 0 at the current velocity v,
-the callback adds D v - tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. The
-method is accurate to first order, and stable even for real wrist joints, with D of 3-10 Nm s/rad and inertias of
-0.004-0.012 kg m^2.
+A linearly implicit method integrates the friction torque tau_f. The callback subtracts tau_f from qfrc_passive, and
+adds the slope D = d tau_f / dv >= 0 at the current velocity v to dof_damping. Implicit integrators therefore solve
+with M + h D. The method is accurate to first order, and stable even for real wrist joints, with D of 3-10 Nm s/rad
+and inertias of 0.004-0.012 kg m^2.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ from r2s.physics.user_laws import as_doubles, call_friction, friction_address, s
 # Columns of jnt_user. MARK identifies models of r2s: the callback is global in a process and ignores other models.
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
-DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether masses are summed up
+DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether to sum up link masses
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # widths: 1, 3, 1, 3
 NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: use stick_slip.py. REST: friction when sliding begins
 GRAVITY = REST_POS + 1  # 3 wide
@@ -111,7 +111,7 @@ def _first_moment(mass, xpos, xmat, h):
 @njit(inline="always")
 def _direction(v, net, z, user):
     """Return the factor on load-dependent friction, in [-1, 1], and its slope, s/rad; z: bristle deflection."""
-    if user[FAMILY] == BRISTLES:  # in the coming step, without bristle damping
+    if user[FAMILY] == BRISTLES:  # for z in the coming step, without bristle damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
     if net:
@@ -190,7 +190,7 @@ def _friction(sizes, user, q, dq, forces, places):
     mass, memory = carray(as_doubles(forces[4]), (n * (n + 1) // 2,)), carray(as_doubles(forces[5]), (n,))
     xpos, xmat = carray(as_doubles(places[0]), (nbody, 3)), carray(as_doubles(places[1]), (nbody, 9))
     anchor, axis = carray(as_doubles(places[2]), (n, 3)), carray(as_doubles(places[3]), (n, 3))
-    net, slow = user[0, NET] != 0.0, False  # net: stick_slip.py is used, for all joints or none
+    net, slow = user[0, NET] != 0.0, False  # net: whether stick_slip.py solves stiction, for all joints
     at = int(user[0, CONTACT])
     touch = at != 0
     joint = carray(stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
@@ -216,7 +216,7 @@ def _friction(sizes, user, q, dq, forces, places):
             sign, steep = _direction(v, net, memory[j], user[j])
             friction += loaded * sign
             slope += loaded * steep
-        slope = max(slope, 0.0)  # an implicit negative slope would remove inertia
+        slope = max(slope, 0.0)  # a negative slope would reduce the inertia M + h D
         # mj_passive has already subtracted dof_damping * v; add back the part due to the previous step's slope
         force = (damping[j] - user[j, DAMPING]) * v - friction
         damping[j] = user[j, DAMPING] + slope
@@ -245,7 +245,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by the control law's torques; n is variable, which saves a minute of compiling."""
+    """Replace the applied torques by the control law's; n is no constant, which saves a minute of compiling."""
     user = carray(as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(as_doubles(fields[0]), (n,)), carray(as_doubles(fields[1]), (n,))
     applied, kept = carray(as_doubles(fields[2]), (n,)), carray(as_doubles(fields[5]), (KEPT, n))
@@ -320,7 +320,7 @@ def _hold(forces, dq, user, joint, work, touch, touches):
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]
     coming, rest, edges = joint[COMING], joint[REST : REST + 2], joint[EDGES : EDGES + 2]
-    if user[0, NET] == 0.0:  # friction is part of the force, and there is no stiction
+    if user[0, NET] == 0.0:  # FORCE already contains friction, and there is no stiction
         joint[FRICTION], joint[REST : EDGES + 2] = 0.0, 0.0
     for j in range(n if user[0, NET] != 0.0 else 0):
         joint[FORCE, j] += joint[FRICTION, j]

@@ -21,7 +21,7 @@ WORK = 22  # columns of the work array of `equations`
 
 
 def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """Return `links` (n, LINK) from masses (n,) kg, mass centers (n, 3) m and tensors (n, 3, 3) kg m^2 about them."""
+    """Return `links` (n, LINK) from masses (n,) kg, their centers (n, 3) m and central tensors (n, 3, 3) kg m^2."""
     own = replace(Dynamics.of(robot, np.zeros((robot.n, 3))), mass=mass, com=com, inertia=inertia)
     rows = [
         [*link.origin[:3, 3], *link.origin[:3, :3].flat, *link.axis, link.mass, *link.com, *link.inertia.flat]
@@ -81,7 +81,7 @@ def equations(links, gravity, q, dq, mass, bias, work):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _project(mass, bias, work):
-    """Sum forces and inertias of the links that each joint carries, and project the sums onto the joint axes."""
+    """Sum forces and inertias of all links beyond each joint, and project the sums onto the joint axes."""
     for j in range(len(bias) - 1, -1, -1):
         s = work[j]
         bias[j] = s[16] * s[3] + s[17] * s[4] + s[18] * s[5] + s[19] * s[0] + s[20] * s[1] + s[21] * s[2]
@@ -92,7 +92,7 @@ def _project(mass, bias, work):
             s[19],
             s[20],
             s[21],
-        )  # rotation, and velocity at the base's origin
+        )  # joint axis, and velocity at the base's origin for 1 rad/s
         m, hx, hy, hz = s[6], s[7], s[8], s[9]
         tx, ty, tz = _cross(zx, zy, zz, hx, hy, hz)
         lx, ly, lz = m * vx + tx, m * vy + ty, m * vz + tz

@@ -22,7 +22,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
 
 Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centers (..., n, 3) m, tensors (..., n, 3, 3)
-USUAL = 0.5  # usual payload mass and distance, as a share of the largest allowed ones
+USUAL = 0.5  # ratio of usual to largest allowed payload mass, and of usual to largest allowed distance
 WATER = 1000.0  # kg/m^3
 
 
@@ -115,7 +115,7 @@ def _of_file(name: str, path: Path) -> Any:
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
-    """Return the inertia tensor (3, 3) kg m^2 of 3 moments or 6 elements or, if value is None, of a sphere of water.
+    """Return the inertia tensor (3, 3) kg m^2 from 3 moments or 6 elements; None: of a sphere of water.
 
     A principal moment may be at most m (2 d)^2, with the largest allowed mass m and distance d in `most`.
     """
@@ -130,7 +130,7 @@ def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] <= 0:
         raise UserError(f"{name}: expected positive moments, got {moments[0]:.3g} kg m^2")
-    if moments[0] + moments[1] < moments[2] * (1 - 1e-9):  # the tolerance is for the round-off of a flat body
+    if moments[0] + moments[1] < moments[2] * (1 - 1e-9):  # tolerance for a flat body's round-off
         listed = ", ".join(f"{m:.3g}" for m in moments)
         raise UserError(f"{name}: expected no moment above the sum of the others, got {listed} kg m^2")
     if moments[2] > (largest := 4.0 * most[0] * most[1] ** 2):

@@ -14,14 +14,14 @@ P is the push of the command, F >= 0 is the contact force, and P_f is the push o
 
 The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass filtered P - m dv/dt.
 In free motion, the estimate R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, the estimate
-R is P, so the speed rule allows the push P to rise. If the tip is faster than v_max or leaves the surface, the push
-limit caps the estimate R at 0.
+R is P, so the speed rule allows the push P to rise. If the tip moves inward faster than v_max, or outward faster than
+`speed_near` / OVERSHOOT, the push limit caps the estimate R at 0.
 
 On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). When the
 contact force F exceeds force_max, the tip's speed is at most speed_near, and the net force P + P_f - F < 0 brakes the
-tip. Surface friction mu F pushes a sliding tip inward with up to mu c F, where c = m |T J M^-1 J^T n| with the full
-Jacobian J and the projection T onto the plane with the normal n. In the bound for a surface with friction, (1 - mu c)
-F therefore replaces F.
+tip. Surface friction mu F pushes a sliding tip inward with up to mu c F. The factor c is m |T J M^-1 J^T n|, with the
+full Jacobian J and the projection T onto the plane with the normal n. On a surface with friction, the bound therefore
+contains (1 - mu c) F and (1 - mu c) k instead of F and k.
 
 The force rule and the speed rule restrict the torque to two half-spaces with the same normal J M^-1. Of all torques
 in both half-spaces, Gauss' principle selects the one nearest to the effort: the effort minus J^T f. Regula falsi
@@ -103,7 +103,7 @@ class PushLimit:
         surface friction can push a sliding tip inward without limit.
         """
         jacobian = Tip(robot)(q)[1]
-        moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, by a force on the tip
+        moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, for a normal force
         mass = 1.0 / float(moved @ self.normal)
         left = 1.0 - friction * mass * float(np.linalg.norm(moved - self.normal / mass))
         return (self.force_max + self.speed_near * np.sqrt(left * stiffness * mass)) / left if left > 0.0 else np.inf
@@ -122,8 +122,8 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max, speed_near: N and m/s, see `PushLimit`; if speed_near is None, contact with 1e5 N/m at home causes
-            at most 2 force_max.
+        force_max, speed_near: N and m/s, see `PushLimit`; a speed_near of None limits the contact force at home, on a
+            surface of 1e5 N/m, to 2 force_max.
         plane: point (3,) m and normal (3,); if None, a work table below the tip at home. asked: N, a task's largest
             force.
         stop: a key of STOPS (contact_stop.py), "release" by default.
@@ -176,7 +176,7 @@ def tip_motion(limit, kinematics, dq, row):
         cx, cy, cz = uy * rz - uz * ry, uz * rx - ux * rz, ux * ry - uy * rx
         row[j] = -(nx * cx + ny * cy + nz * cz)
         vx, vy, vz = vx + s * cx, vy + s * cy, vz + s * cz
-        # angular acceleration due to the rotation of this joint's axis, and the centripetal part of its link
+        # angular acceleration due to the turning axis of the joint; below, acceleration of the next anchor
         tx, ty, tz = s * (wy * uz - wz * uy), s * (wz * ux - wx * uz), s * (wx * uy - wy * ux)
         ex, ey, ez = ex + tx, ey + ty, ez + tz
         wx, wy, wz = wx + s * ux, wy + s * uy, wz + s * uz
@@ -236,7 +236,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit the torques `out` (n,) Nm to an allowed push and, with contact force as a load, allowed accelerations.
+    """Limit push and joint accelerations of the torques `out` (n,) Nm, with the contact force as an external load.
 
     Return whether `out` changed. `filter_torque` explains `share` and `limits`; `push_bound` explains the other
     arguments.
@@ -257,7 +257,7 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     for j in range(n):
         mobility += row[j] * lever[j]
     # low, high: N, bracket of f; before, after: excess there. If no joint is at its bound, the first trial hits the
-    # middle of the tolerance CLOSE: at the edge, round-off could cause another trial
+    # middle of the tolerance CLOSE; at its edge, round-off could require another trial
     low, high, after, force = 0.0, np.inf, 0.0, (before + 0.5 * CLOSE) / mobility
     for _ in range(ROUNDS):
         for j in range(n):

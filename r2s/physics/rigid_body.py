@@ -52,7 +52,7 @@ def regressor(
     Args:
         robot: the arm, for its kinematics.
         q, dq, ddq: (T, n) rad, rad/s, rad/s^2, joint motion.
-        gravity: (3,) m/s^2, base frame. If None, the regressor excludes gravity, because the arm compensates gravity.
+        gravity: (3,) m/s^2, base frame; None: the regressor excludes gravity, because the arm compensates gravity.
     """
     place, frame, anchor, axis = joint_kinematics(robot, q)
     samples, n = q.shape
@@ -85,7 +85,7 @@ def regressor(
         rotated = np.einsum("cij,tj->tci", basis, own_alpha)
         rotated += np.cross(own_omega[:, None], np.einsum("cij,tj->tci", basis, own_omega))
         moment[:, 4:] = np.einsum("tij,tcj->tci", R, rotated)
-        for j in range(k + 1):  # joints 0 to k carry link k
+        for j in range(k + 1):  # joints 0 to k move link k
             about = moment + np.cross((place[:, k] - anchor[:, j])[:, None], force)
             out[:, j, k] = np.einsum("ti,tci->tc", axis[:, j], about)
     return out

@@ -26,7 +26,7 @@ PANDA = "r2s:models/panda.xml"
 # Share of an arm's torque rate limit that commands use. libfranka's own limiter stays 1e-3 Nm/s below the limit; an
 # FR3 reports its last torque as float32, which changes a torque step by up to 8e-6 Nm.
 RATE_SHARE = 0.99
-SIM_DT = 1e-3  # s, control cycle of the arm
+SIM_DT = 1e-3  # s, control cycle of the arm, and physics step
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of the Panda's size
 # Default payload limits, the ratios of a Panda (3 kg, 0.15 m, 87 Nm): weight of the payload * reach / largest torque
 # limit, and distance from the end effector to the payload's center / reach.
@@ -52,8 +52,8 @@ class Robot:
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
         damping, frictionloss: (n,) Nm s/rad and (n,) Nm, viscous and Coulomb friction in the file, 0 by default.
         velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3, whose velocity limit is sqrt(2
-            deceleration distance + offset^2) - offset at a distance, rad, from a position limit. If None, the
-            velocity limit does not depend on position.
+            deceleration distance + offset^2) - offset at a distance, rad, from a position limit; None: the velocity
+            limit does not depend on position.
         tool: the spherical tip that touches surfaces; None: no tool.
         lock: {joint: rad or m}, positions of the welded joints.
         payload_max: (2,) largest payload mass, kg, and largest distance, m, from end effector to payload center.
@@ -111,7 +111,7 @@ class Robot:
             obstacles: boxes around the arm, used only to compute distances.
         """
         spec, _ = read_spec(self.mjcf, self.lock)
-        spec.compile()  # assigns the joints' ids; the changes below invalidate them
+        spec.compile()  # assigns joint ids, which the changes below invalidate
         joints = sorted(spec.joints, key=lambda joint: joint.id)
         strip(spec)
         if self.ee_site not in [site.name for site in spec.sites]:
@@ -180,7 +180,7 @@ def load_robot(
         mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; if None, load the Panda.
         ee: site, body or link of the end effector; if None, use the only site, or the last link of a URDF.
         q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; if None, from the file or a default.
-        gravity: (3,) m/s^2 in the base frame; if None, use the file's or, for a URDF, gravity of an upright base.
+        gravity: (3,) m/s^2 in the base frame; None: the file's gravity or, for a URDF, gravity of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's armature.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
         lock: {joint: rad or m}, positions at which to weld joints, such as a gripper's; None: weld no joint.
@@ -263,7 +263,7 @@ def _limits(
 def _payload_max(
     model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
 ) -> tuple[float, float]:
-    """Return `Robot.payload_max`; estimate an argument of None from torque limits and the reach beyond joint 2."""
+    """Return `Robot.payload_max`; estimate `mass` or `far`, if None, from torque limits and reach beyond joint 2."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     sites = [model.site(i).name for i in range(model.nsite)]

@@ -1,7 +1,7 @@
 """Read the arm in an MJCF or URDF file, weld locked joints, and remove elements of the simulation.
 
 The reader removes loose objects of MJCF scenes: bodies with free or ball joints only. A gripper's fingers are welded
-at the positions in `robot.lock`, so the fingers become part of the link that carries the gripper.
+at the positions in `robot.lock`, so the fingers become part of the link that holds the gripper.
 """
 
 from collections.abc import Mapping
@@ -83,7 +83,7 @@ def _is_loose(body: mujoco.MjsBody) -> bool:
 
 def _remove(spec: mujoco.MjSpec, loose: list[mujoco.MjsBody]) -> None:
     """Delete the bodies `loose` and every element that refers to one of these bodies."""
-    spec.compile()  # so that keyframes lose the bodies' part of qpos, too
+    spec.compile()  # so that `delete` also removes the bodies' qpos from keyframes
     bodies = [below for body in loose for below in (body, *body.find_all("body"))]
     gone = {x.name for body in bodies for x in (body, *body.joints, *body.sites, *body.geoms) if x.name}
     _forget(spec, gone)
@@ -108,7 +108,7 @@ def _forget(spec: mujoco.MjSpec, names: set[str]) -> None:
 
 
 def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
-    """Weld the bodies of locked joints, and lump each welded body with the link that carries it."""
+    """Weld the bodies of locked joints, and lump each welded body with the link that it is attached to."""
     model, joints = spec.compile(), {joint.name: joint for joint in spec.joints}
     at = {str(name): float(value) for name, value in lock.items()}
     for name in at:
@@ -144,7 +144,7 @@ def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
 
 
 def _lump(spec: mujoco.MjSpec, welded: set[str | int]) -> None:
-    """Add the inertia of each welded body, and of bodies fixed to it, to the moving link that carries the body."""
+    """Add the inertia of welded bodies, and of bodies fixed to them, to the moving links that they are welded to."""
     model = spec.compile()
     bodies, of = Bodies(model), {body.id: body for body in spec.bodies}
     carriers = {int(model.body_weldid[body.id]) for body in of.values() if (body.name or body.id) in welded}
@@ -154,7 +154,7 @@ def _lump(spec: mujoco.MjSpec, welded: set[str | int]) -> None:
             body = of[k]
             body.explicitinertial, body.mass, body.inertia = True, 0.0, np.zeros(3)
             body.fullinertia = np.full(6, np.nan)
-            body.ipos, body.iquat = np.zeros(3), np.array([1.0, 0, 0, 0])  # else MuJoCo infers both from geoms
+            body.ipos, body.iquat = np.zeros(3), np.array([1.0, 0, 0, 0])  # else MuJoCo computes both from geoms
             for geom in body.geoms:
                 geom.mass = 0.0
         moments, axes = np.linalg.eigh(inertia)

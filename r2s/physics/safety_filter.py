@@ -5,9 +5,10 @@ the low-pass (r2s/physics/actuation.py). The safety filter consists of three lim
 
 - Fading: the policy's torque fades out as a joint approaches its velocity limit or a position limit.
 - Acceleration limit: each joint's acceleration a = M^-1 (tau - Coriolis torque) satisfies -RATE (v + dq) <= a <= RATE
-  (v - dq), with the mass matrix M and the speed v allowed at q. Of all torques within the acceleration limit, Gauss'
-  principle of least constraint selects the one nearest to the effort: the effort plus torques of fictitious joint
-  stops. Joint friction only widens the acceleration limit, so overestimated friction never accelerates a joint.
+  (v - dq), with the mass matrix M and the speed v allowed at q. By Gauss' principle of least constraint, the filter
+  selects the torque nearest to the effort within the acceleration limit, which is the effort plus torques of
+  fictitious joint stops. Joint friction only widens the acceleration limit, so overestimated friction never
+  accelerates a joint.
 - Rate limit: the filter clips each joint's torque, then multiplies the torque rates of all joints by the same factor.
   The command therefore moves straight from the last command to the new torque, within the convex set of the
   acceleration limit. With a separate factor for each joint, the command could violate the acceleration limit if two
@@ -34,17 +35,17 @@ LATENCY_S = 0.012
 # equality, s + rate exp(-s d) = 0 has a double real root.
 RATE = round(1 / (math.e * LATENCY_S))
 APPROACH = 0.25 * RATE  # 1/s, allowed speed per distance from a position limit: critical damping of the loop
-ALLOWED = 0.66  # share of dq_max that the filter allows; unmodeled friction adds to it (docs/explanation/safety.md)
-FADED = 0.82  # share of dq_max at which the policy's torque has faded out; it fades from ALLOWED on
+ALLOWED = 0.66  # share of dq_max that the filter allows; model errors add to the speed (docs/explanation/safety.md)
+FADED = 0.82  # the policy's torque fades out between the speeds ALLOWED * dq_max and FADED * dq_max
 # Q_MARGIN: rad, distance from a position limit at which the allowed speed towards the limit is 0; at most a tenth of
-# the range. Closer to the limit, the policy's torque fades out over the share Q_FADE_SHARE of the distance.
+# the range. Closer to the limit, the policy's torque fades out over Q_FADE_SHARE times this distance.
 Q_MARGIN, Q_FADE_SHARE = 0.1, 0.6
 ENVELOPE_SHARE = 0.55  # share of the position-dependent velocity limit of an FR3 that the filter uses
-# s, time in which the allowed speed ramps down while braking. With 0.1 s the torque of the base joint reached 60 Nm,
-# fell too late, at its rate limit of 1 Nm/ms, and threw a stretched elbow forward.
+# s, time in which the allowed speed ramps down while braking. With 0.1 s, the base joint's torque reached 60 Nm.
+# Limited to 1 Nm/ms, this torque fell too late, and threw a stretched elbow forward.
 BRAKE_S = 0.15
 TOLERANCE = 1e-9  # rad/s^2, tolerance of the acceleration bounds
-PIVOTS = 5  # block pivoting rounds before single pivots, which always terminate (Murty 1974)
+PIVOTS = 5  # number of rounds of block pivoting; single pivots follow, which always terminate (Murty 1974)
 ROUNDS = 100
 FRICTION_WIDTH = 0.05  # rad/s, width of the sign change of friction
 FRICTION_SHARE = 0.5  # share of the friction estimate that widens the bounds; only for joints with added inertia
@@ -69,9 +70,9 @@ class JointDynamics(NamedTuple):
 def filter_limits(robot: Robot, torque: np.ndarray, speed_share: float = 1.0) -> np.ndarray:
     """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
-    For light joints, the filter's mass matrix has just enough added inertia (column ADDED) that the largest target
-    torque of any joint is within the acceleration limit at rest. DELAY_PHASE bounds the added inertia, because added
-    inertia makes the control loop faster.
+    The filter's mass matrix adds inertia (column ADDED) to light joints, just enough that at rest the largest target
+    torque of any joint satisfies the acceleration limit. DELAY_PHASE bounds the added inertia, because added inertia
+    makes the control loop faster.
 
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
@@ -87,7 +88,7 @@ def filter_limits(robot: Robot, torque: np.ndarray, speed_share: float = 1.0) ->
     mobility = InverseInertia(robot)(robot.q_home[None])[0]
     inertia = 1 / np.diag(mobility)
     most = (DELAY_PHASE / (RATE * LATENCY_S) - 1) * inertia
-    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm, as effective as any joint's target torque
+    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm, as effective as the most effective target torque
     out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.step_max
     out[:, [DQ_ALLOWED, DQ_MAX]] *= speed_share
@@ -172,8 +173,8 @@ def joint_bounds(arm, share, limits, work):
 def bounded(arm, friction, limits, work, desk, out):
     """Limit the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether `out` exceeded a bound.
 
-    desk: (n, n), scratch array; if it is `work[:n]`, `bounded` overwrites the root, so every call needs new bounds
-    from `joint_bounds`.
+    desk: (n, n), scratch array. If `desk` is `work[:n]`, `bounded` overwrites the root, so call `joint_bounds` before
+    each call of `bounded`.
     """
     n, dq = len(out), arm.dq
     ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]
@@ -233,7 +234,7 @@ def _widen(dq, out, friction, limits, work):
     root, mobility, slack = work[:n], work[n : 2 * n], work[2 * n + _SLACK]
     for j in range(n):
         slack[j] = 0.0
-        if friction[j] > 0.0 and limits[j, ADDED] > 0.0:  # friction opposes motion, or the torque of a joint at rest
+        if friction[j] > 0.0 and limits[j, ADDED] > 0.0:  # friction opposes motion or, at rest, the torque
             slack[j] = FRICTION_SHARE * friction[j] * abs(np.tanh(dq[j] / FRICTION_WIDTH + out[j] / friction[j]))
     if work[2 * n + _INVERTED, 0] == 0.0:
         work[2 * n + _INVERTED, 0] = 1.0

@@ -82,7 +82,7 @@ class Simulator:
         self._parameters = self._memory[:, self._kept + sizes[0] + sizes[1] : self._push_at]
         self._push, self._push_limit = self._memory[:, self._push_at : self._contact_at], np.zeros(pushing)
         self._contact = self._memory[:, self._contact_at :]
-        self._surfaces = np.zeros((nsim, self._touching))  # contacts that `reset` copies into the memory
+        self._surfaces = np.zeros((nsim, self._touching))  # initial contacts, which `reset` copies into the memory
         self._xanchor, self._xaxis = self.batch.bind("xanchor"), self.batch.bind("xaxis")
         self._xpos, self._xmat = self.batch.bind("xpos"), self.batch.bind("xmat")
         self._site_xpos = self.batch.bind("site_xpos")
@@ -145,8 +145,8 @@ class Simulator:
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
         """Set the commands (nsim, c) of the arms' control laws until the next call of `command`.
 
-        speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; if None, keep the last noise,
-        0 after `reset`.
+        speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: keep the last noise;
+        `reset` sets the noise to 0.
         """
         n = self.robot.n
         self._memory[:, self._kept : self._kept + self._sizes[0]] = command
@@ -293,7 +293,7 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
     rows[..., f.OFFSET] = d.offset
     rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
-    if not d.family.has_memory:  # a law with memory has its own stiction: no dead zone
+    if not d.family.has_memory:  # a law with memory contains stiction, so no stiction model is needed
         rows[..., f.DQ_MIN], rows[..., f.NET] = d.dq_min, d.stiction_model == "net"
         rows[..., f.REST_NEG : f.REST_POS + 1] = d.family.at_rest(d.phi)
     rows[..., f.DAMPING] = model.dof_damping

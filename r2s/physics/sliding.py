@@ -11,11 +11,11 @@ The box is not a body of the MuJoCo model, so simulations without a box do not c
 share one compiled law, which solves joint friction and box motion together. The box neither tilts nor lifts off
 (`check_size` in box.py). The tip does not touch the table; the tip's vertical force only changes the box's load.
 
-In a step, the contact force on the tip is F = F0 - K d, where d is the change of the tip's velocity relative to the
-box, F0 is the force for d = 0, and K is a resistance, N s/m. The box's velocity after the step is linear in F, with
-the mobility h W at the contact. Elimination of the box's velocity yields the contact force in the joint equations, F
-= (1 + h K W)^-1 (F0 + K d_0 - K d_tip), where d_tip is the change of the tip's velocity, and d_0 is the change of the
-box's velocity if F is 0.
+In a step, the contact force on the tip is F = F0 - K d, with a resistance K, N s/m. Here, d is the change of the
+tip's velocity relative to the box, and F0 is the force for d = 0. The box's velocity after the step is linear in F,
+with the mobility h W at the contact. Elimination of the box's velocity yields the contact force F = (1 + h K W)^-1
+(F0 + K d_0 - K d_tip) for the joint equations. Here, d_tip is the change of the tip's velocity, and d_0 is the change
+of the box's velocity for F = 0.
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ from r2s.physics.contact_layout import (
 )
 
 RIGID = 1e-6  # m, largest elastic deflection of a box on its table
-STILL = 1e-6  # m/s, a slower box without contact is at rest: table friction stops a box from 4e-3 m/s within 1 ms
+STILL = 1e-6  # m/s, speed below which a box without contact is at rest; table friction stops 4e-3 m/s within 1 ms
 ROUNDS = 30  # largest number of guesses of the box's speed
 CLOSE = 1e-4  # relative error of the guessed speed at which the iteration ends
 

@@ -4,8 +4,8 @@ A joint at rest sticks while its net torque lies between its edges, the breakawa
 direction. The net torque includes the coupling to other joints, but not the joint's own friction. If the net torque
 is beyond an edge, the joint slides in the torque's direction. Torques are constant in a step, and accelerations are
 constant between events, so each event is located exactly (event-driven integration: Pfeiffer and Glocker, Multibody
-Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at a step's end to the whole step,
-and the impulse of a reversal would have an error of up to the friction times the step h.
+Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at a step's end to the whole step. At
+a reversal, the impulse error would be up to the friction times the step h.
 
 MuJoCo itself adds the forces of the joints' position limits.
 """
@@ -84,7 +84,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
             if j < 0 or events > 4 * n:  # after 4 n stops, no joint breaks away in this step
                 break
             side[j] = direction if coming[j] == 0.0 else np.sign(coming[j])
-            on = side[j] * forces.dq[j] > 0.0  # the joint keeps its direction
+            on = side[j] * forces.dq[j] > 0.0  # the joint's direction of motion does not change
             friction[j] = forces.friction[j] if on else forces.rest[int(side[j] > 0.0), j]
             took_part |= not on
         if slow:  # an impulse stops the slow sticking joints; the coupling transmits the impulse to other joints
@@ -113,7 +113,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
 
 @njit(cache=True, error_model="numpy")
 def _initial_sides(forces, dq_min, side, friction, coming):
-    """Write each joint's side, friction and velocity; return whether HELD joints move and whether all joints rest."""
+    """Write each joint's side, friction and velocity; return whether a HELD joint creeps and whether all rest."""
     dq, drive, edges, n = forces.dq, forces.drive, forces.edges, len(forces.dq)
     slow, held, inside = False, 0, True
     for j in range(n):

@@ -122,7 +122,7 @@ def normal_force(K, exponent, damping, depth, rate):
 
 
 def load_tool(path: str | Path) -> Tool:
-    """Read a tool file, JSON: `tip_in_flange_m` (3 numbers), `radius_m`, optional `mass_kg`.
+    """Read a tool file, JSON: `tip_in_flange_m` (3 numbers), `radius_m`, optional `mass_kg`; ignore `frame`.
 
     Raises:
         UserError: the file is missing or not valid JSON, a key is unknown or missing, or a value is out of range.

@@ -51,7 +51,7 @@ class Tip:
 
 
 def tilted(normal: np.ndarray, about: np.ndarray | float, tilt: np.ndarray | float) -> np.ndarray:
-    """Tilt `normal` (3,) by `tilt` rad toward the direction `about` rad; return (3,), or (m, 3) for angles (m, 1)."""
+    """Tilt `normal` (3,) by `tilt` rad toward the azimuth `about` rad; return (3,), or (m, 3) for angles (m, 1)."""
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     across /= np.linalg.norm(across)
     aside = np.cos(about) * across + np.sin(about) * np.cross(normal, across)

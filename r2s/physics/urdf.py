@@ -16,10 +16,10 @@ from r2s.physics.welds import Inertia, about, combined
 
 MOVING, FIXED = ("revolute", "continuous"), "fixed"
 ROUNDED = 1e-9  # tolerated round-off of a tensor in the file, as a share of its largest moment
-DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements; URDF itself has none
+DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements; URDF itself has no rotor elements
 ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
 ET.register_namespace("drake", DRAKE)
-NO_RANGE = "limits 0 to 0"  # value of `info` that marks a joint with these limits
+NO_RANGE = "limits 0 to 0"  # value of `info` that marks a joint with a range of 0 to 0
 COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # attribute -> how many numbers it contains; other attributes contain one
 
 
@@ -37,8 +37,8 @@ def is_urdf(path: Path) -> bool:
 def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
-    The spec has the file's body and joint names, joint damping and friction. Joints in `lock` ({name: rad or m})
-    become fixed at the given positions, and joints that mimic a locked joint at the resulting positions.
+    The spec has the file's body and joint names, joint damping and friction. `lock` ({name: rad or m}) fixes joints
+    at the given positions. Joints that mimic a locked joint are also fixed, at the positions that result.
 
     Raises:
         UserError: the file is not XML, not URDF, or not an arm of revolute (or continuous) joints.

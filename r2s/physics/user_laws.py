@@ -1,7 +1,7 @@
 """Call a user's control or friction law from the cached compiled code of r2s.
 
 Compiling the code of r2s for a new law would take half a minute in every process, so r2s compiles only the user's
-law, and calls the law by address. A built-in law has no address but an index, which is a small integer. A float64
+law, and calls the law by address. A built-in law has an index, a small integer, instead of an address. A float64
 represents every address exactly, because addresses are below 2^53.
 """
 
@@ -17,7 +17,7 @@ from numba.extending import intrinsic, is_jitted
 from r2s.compiled import cfunc, njit
 from r2s.errors import UserError
 
-LEAST_ADDRESS = 4096  # no function is in the first page of memory
+LEAST_ADDRESS = 4096  # the first page of memory contains no function
 DOUBLES, COUNT = types.CPointer(types.float64), types.int64
 CONTROL = types.void(DOUBLES, DOUBLES, COUNT, DOUBLES, COUNT, DOUBLES, COUNT, DOUBLES, COUNT, DOUBLES)
 FRICTION = types.void(DOUBLES, COUNT, types.float64, types.float64, DOUBLES, DOUBLES)
@@ -46,7 +46,7 @@ def stack(typingctx, count):
 
 @intrinsic
 def _call(typingctx, address, args):
-    """Call the C function at `address`, which returns nothing, with the values in `args`; pointers are integers."""
+    """Call the void C function at `address` with the values in `args`; pointers are passed as integers."""
 
     def codegen(context, builder, signature, values):
         given = [builder.extract_value(values[1], k) for k in range(len(args))]
@@ -61,7 +61,7 @@ def _call(typingctx, address, args):
 
 @njit(cache=True)
 def call_control(address, q, dq, command, parameters, memory, out):
-    """Call the control law at an address (control_laws.py); write torques of 0 if `address` is no address."""
+    """Call the control law at an address (control_laws.py); write torques of 0 for an invalid address."""
     if address < LEAST_ADDRESS:
         out[:] = 0.0
         return
@@ -72,7 +72,7 @@ def call_control(address, q, dq, command, parameters, memory, out):
 
 @njit(cache=True)
 def call_friction(address, p, v, h, memory):
-    """Call the friction law at an address (friction.py); return torque and slope, 0 if `address` is no address."""
+    """Call the friction law at an address (friction.py); return torque and slope, 0 for an invalid address."""
     if address < LEAST_ADDRESS:
         return 0.0, 0.0
     out = carray(stack(2), (2,))  # type: ignore[call-arg]

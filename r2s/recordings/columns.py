@@ -21,7 +21,7 @@ TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # kin
 NAMES = ("joint_names", "joints", "names", "name")  # names that an array of joint names may have in .npz or HDF5
 CURRENT = ("current", "i")  # columns of motor current, read instead of torque if the user sets a torque constant
 OPTIONAL = ("dq", "trajectory")
-WORDS = {  # field -> words that denote the field in a column name with a joint name
+WORDS = {  # field -> words for the field in a column name that also contains a joint name
     "q": ("q", "position", "positions", "pos", "angle"),
     "dq": ("dq", "qd", "velocity", "velocities", "vel", "speed"),
     "tau": ("tau", "effort", "efforts", "torque"),
@@ -104,7 +104,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
-    """Return the index of the joint in a column name, or -1 without a joint, and the remaining name in lower case."""
+    """Return the index of the joint that a column name contains (-1: none), and the remaining name in lower case."""
     lower = column.lower()
     cores = [re.sub(r"^joint_|_joint$", "", joint.lower()) for joint in robot_joints]
     for k in sorted(range(len(cores)), key=lambda k: -len(cores[k])):
@@ -167,7 +167,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return columns such as q1, q2, ... (pattern "q{}", first=1); first=None starts at q0 or, without q0, at q1."""
+    """Return the columns q1, q2, ... for pattern "q{}" and first=1; first=None begins at q0 or, if missing, q1."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)

@@ -9,7 +9,7 @@ import pandas as pd
 
 from r2s.errors import UserError
 
-HEAD = 1 << 16  # bytes; the header must be within this length from the start of the file
+HEAD = 1 << 16  # bytes at the start of the file that must contain the header
 MARKS = "#%"  # characters that begin a comment line, or the header (NumPy, rostopic echo -p)
 UNITS = {
     "rad": 1.0, "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180, "mrad": 1e-3,
@@ -65,7 +65,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbers(column: pd.Series) -> pd.Series:
-    """Convert a column to numbers if its only text is a last cell that was cut off, such as "-" or "1.2e"."""
+    """Convert a column to numbers if its only text is a truncated last cell, such as "-" or "1.2e"."""
     text = column.dtype.kind not in "iufb" and len(column) > 1
     if not text or not re.fullmatch(r"[+-]?[\d.]*(e[+-]?)?", str(column.iloc[-1])):
         return column
@@ -88,7 +88,7 @@ def bare_name(name: str) -> tuple[str, float]:
     found = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name)
     unit = found[2].strip().lower() if found else ""
     if not found or unit not in UNITS or (unit in ("a", "ma") and not found[1].lower().startswith(("i", "current"))):
-        return name, 1.0  # `tau1 [A]` is a current, no torque
+        return name, 1.0  # `tau1 [A]` keeps its unit: it is a current
     return found[1], UNITS[unit]
 
 

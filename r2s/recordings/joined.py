@@ -1,4 +1,4 @@
-"""Join recordings of one arm and one kind of torque; each recording keeps its clock and trajectories."""
+"""Join recordings of one arm and one kind of torque; their clocks and trajectories remain separate."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ from r2s.errors import UserError
 from r2s.recordings.recording import FIELDS, Recording
 
 SAME_RATE = 0.01  # largest relative difference of rates that are treated as equal
-DT = 1e-3  # s, common grid of recordings with different rates; r2s filters every recording on this grid
+DT = 1e-3  # s, step of the common grid of recordings with different rates; r2s filters every recording on this grid
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:

@@ -30,17 +30,17 @@ class Lateness:
 
     @property
     def sure(self) -> np.ndarray:
-        """Lateness (n,) s to correct: `s`, but 0 where `s` is too small or too uncertain; nan remains nan."""
+        """Lateness (n,) s to correct: `s`, but 0 where `s` is too small or too uncertain; nan stays nan."""
         seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
         return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
 
     @property
     def as_logged(self) -> "Lateness":
-        """Copy of this lateness with 0 for finite values of `s`, so that dq is not corrected; nan remains nan."""
+        """Copy of this lateness with 0 for finite values of `s`, so that dq is not corrected; nan stays nan."""
         return replace(self, s=0.0 * self.s)
 
     def corrected(self, smooth: Recording) -> np.ndarray:
-        """Return the corrected dq (T, n) rad/s; if a joint's lateness is nan, return the derivative of its q."""
+        """Return the corrected dq (T, n) rad/s; for a joint with a lateness of nan, return the derivative of q."""
         return _corrected(smooth, self.sure, self.filtered)
 
 
@@ -50,7 +50,7 @@ def from_q(joints: int) -> Lateness:
 
 
 def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
-    """Estimate the lateness of dq by least squares on motion below `cutoff_hz`, where a filter acts like a delay.
+    """Estimate the lateness of dq by least squares on motion below `cutoff_hz`, where a lag acts like a delay.
 
     Correcting dq is better than differentiating q, because the logged dq is often smoother. The correction inverts a
     first-order filter or a delay, whichever model fits the data better.

@@ -1,7 +1,7 @@
 """Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet files and meta/info.json.
 
 `write_dataset` stores commanded torque as `action`, and measured torque or motor torque as `observation.effort`.
-`lerobot_table` finds angles, velocities and torques by words in the names of features and of feature elements.
+`lerobot_table` finds angles, velocities and torques by words in the names of features and of their elements.
 """
 
 import json
@@ -63,7 +63,7 @@ def lerobot_table(folder: Path) -> Table:
     channels = _channels(features)
     found: dict[str, dict[str, tuple[str, int, float]]] = {}
     for field, joint, place in channels:
-        found.setdefault(field, {}).setdefault(joint, place)  # the first feature with this field and joint is used
+        found.setdefault(field, {}).setdefault(joint, place)  # the first feature with a field and joint is used
     torques = [field for field in ("tau", "tau_J_d", "current") if field in found]
     joints = [j for j in found.get("q", {}) if any(j in found[field] for field in torques)]
     if not joints:
@@ -112,7 +112,7 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _channels(features: Mapping[str, Any]) -> list[tuple[str, str, tuple[str, int, float]]]:
-    """Return (field, joint, (feature, element index, factor to SI units)) of each element of an arm joint."""
+    """Return (field, joint, (feature, element index, factor to SI units)) for each element of the arm's joints."""
     out = []
     for feature, spec in features.items():
         shape = spec["shape"]
@@ -188,7 +188,7 @@ def write_dataset(
         more: {feature: (T, k)}, values of further features, which cannot be resampled.
 
     Raises:
-        UserError: the folder exists, or the recording needs resampling although `more` has features.
+        UserError: the folder exists, or the recording needs resampling, but `more` cannot be resampled.
     """
     if folder.exists():
         raise UserError(f"to: {folder} exists; a LeRobotDataset needs a new folder")

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 STEP = 0.02  # s, grid of the comparison
-MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances; its range is then about 10
+MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances; the range is then about 10 tolerances
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
 MAX_COMPARED = 60  # limit on the tracks compared with one track and on the pieces in `overlap`, for speed
@@ -56,8 +56,8 @@ def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
 def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
     """Return the period of the motion, s, and time shifts (K,) s that align repeated motion in K tracks.
 
-    The shifts align the phase of a motion that occurs in several tracks. The period is None if no motion repeats. If
-    no track repeats itself, but tracks repeat each other, the period is the time span of all aligned tracks.
+    The period is None if no motion repeats. If no track repeats itself, but tracks repeat each other, the period is
+    the time span of all aligned tracks.
     """
     shift, found, period, tolerance = np.zeros(len(tracks)), False, None, _tolerance(tracks)
     for k, b in enumerate(tracks if tolerance.any() else []):
@@ -75,10 +75,10 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 
 
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
-    """Return the share (0 to 1) of the motion in `other` that all joints together also perform in `training`.
+    """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
 
-    A piece occurs in `training` if its RMS distance from a motion in `training` is below the `_tolerance` of `other`
-    in each joint.
+    A piece of `other` occurs in `training` if, in each joint, its RMS distance from some motion in `training` is
+    below the `_tolerance` of `other`.
     """
     tolerance, deviation = _tolerance(other), _deviation(other)
     pieces = [piece for track in other for piece in _pieces(track.q, PIECE_MOTION * deviation.max())]
@@ -101,8 +101,8 @@ def _deviation(tracks: Sequence[Track]) -> np.ndarray:
 def _tolerance(tracks: Sequence[Track]) -> np.ndarray:
     """Return the RMS distance (n,) rad, per joint, below which two pieces of motion in `tracks` are treated as equal.
 
-    The distance is TRACKING, clipped to the range SIMILAR x s, where s is the joint's standard deviation or, if
-    larger, STILL x the largest standard deviation of all joints.
+    The distance is TRACKING, clipped to the range SIMILAR x s. Here s is the joint's standard deviation, but at least
+    STILL x the largest standard deviation of all joints.
     """
     deviation = _deviation(tracks)
     return np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -131,7 +131,7 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     a[k + lag] - b[k] (L, n), the variance of b[k] (L, n) over the common rows, and the number of common rows (L,).
     """
     size = 1 << int(len(a) + len(b) - 1).bit_length()
-    middle = np.nanmean(a, axis=0)  # centring reduces the round-off of the differences
+    middle = np.nanmean(a, axis=0)  # centering reduces the round-off of the differences
     spectra = []
     for x in (a, b):
         seen = ~np.isnan(x[:, :1])
@@ -151,10 +151,10 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _errors(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each of L lags the largest RMS distance of a joint between a and b, divided by `tolerance` (n,) rad.
+    """Return the distance (L,) of a and b at each of L lags: the largest RMS distance of a joint, in tolerances.
 
-    Also return the number of common rows (L,). The divided distance is inf at a lag at which the common rows last
-    less than OVERLAP_S, or no joint has a standard deviation of more than MIN_MOTION tolerances.
+    Also return the number of common rows (L,). The distance is inf if the common rows last less than OVERLAP_S, or
+    if no joint moves: no standard deviation exceeds MIN_MOTION tolerances.
     """
     square, variance, count = _distances(a, b)
     counts = (count >= OVERLAP_S / STEP) & ((variance / tolerance**2).max(1) > MIN_MOTION**2)
@@ -168,7 +168,7 @@ def _own_lag(track: Track, tolerance: np.ndarray) -> int | None:
     error[:least] = np.inf
     for run in _runs(error < 1.0):
         best = run.start + int(error[run].argmin())
-        if best > least:  # a match at the smallest lag is slow motion, not a repetition
+        if best > least:  # a match at the smallest lag indicates slow motion, not a repetition
             return best
     return None
 

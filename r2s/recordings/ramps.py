@@ -26,8 +26,8 @@ class Ramps:
 
     Attributes:
         recording: motion with commanded torque; identification uses t, and the ramped joint's q and tau.
-        joint: ramped joint, from 0. sign: direction, 1 or -1. pose: posture index, from 0. Each attribute has K
-            values; one value applies to all ramps.
+        joint: ramped joint, from 0. sign: direction, 1 or -1. pose: posture index, from 0. These three have K values;
+            a single value applies to all ramps.
 
     Raises:
         UserError: the torque is not commanded, or `joint`, `sign` or `pose` has a wrong shape or value.
@@ -73,17 +73,18 @@ def read_ramps(
 ) -> Ramps:
     """Read ramps from a file that `Ramps.save` wrote, or from a log in any format of `readers.read`.
 
-    A log needs columns t (s), q (rad), tau_J_d or tau (commanded torque, Nm), optionally dq (rad/s), and columns
-    `joint` (from 1, in the robot's order) and `sign` (1 or -1) with a value per row or per ramp. A new ramp begins
-    where the value of `joint`, `sign`, `trajectory` or `segment` changes, where t restarts, and after a gap in t.
+    A log needs the columns t (s), q (rad) and tau_J_d or tau (commanded torque, Nm); dq (rad/s) is optional. The log
+    also needs `joint` (from 1, in the robot's order) and `sign` (1 or -1), with a value per row or per ramp. A new
+    ramp begins where the value of `joint`, `sign`, `trajectory` or `segment` changes, where t restarts, and after a
+    gap in t.
 
     Args:
         path: file of ramps.
         columns: {field: column name} of a log, see `readers.read`.
         n_joints: expected number of joints.
         max_gap_s: s; a longer time step separates ramps; if None, the result of `longest_step` is the limit.
-        joints, model_joints, limits: names of the log's joints, names and position limits of the robot's joints, see
-            `readers.read`.
+        joints: names of the joints in the log. model_joints, limits: names and position limits of the robot's joints.
+            See `readers.read`.
 
     Raises:
         UserError: the file is missing or contains no ramps, or a joint or sign contradicts the command.
@@ -159,7 +160,7 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError if commands change, but the ramped joint's command does not mainly change along `sign`."""
+    """Raise UserError unless the ramped joint's command changes mainly along `sign`, or no command changes."""
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY

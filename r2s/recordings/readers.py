@@ -40,7 +40,7 @@ class Options:
     restarts: bool = False  # whether a clock that goes back to its start begins a new trajectory
     robot_joints: Sequence[str] | None = None
     limits: tuple[np.ndarray, np.ndarray] | None = None
-    repair: bool = True  # whether the reader may sort rows or leave rows out
+    repair: bool = True  # whether the reader may sort or omit rows
 
 
 def read(
@@ -65,13 +65,13 @@ def read(
             LeRobotDataset.
         torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); if None, the file declares it.
         columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The default names
-            are in DEFAULT_COLUMNS; for tau, the name in TAU precedes the default names. For q, dq and tau, a name
-            stands for one array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ...
-            In a name, `{j}` (from 1) or `{i}` (from 0) stands for the joint number. A list of names has one column
-            name per joint. In HDF5 a column name is the path of a dataset, such as robot/q.
+            are in DEFAULT_COLUMNS; for tau, the name in TAU has priority. For q, dq and tau, a name stands for one
+            array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... In a name,
+            `{j}` (from 1) or `{i}` (from 0) stands for the joint number. A list of names has one column name per
+            joint. In HDF5 a column name is the path of a dataset, such as robot/q.
         n_joints: expected number of joints.
         max_gap_s: s, longest time step within a trajectory. If None, the result of `longest_step` is the limit; if
-            inf, gaps end no trajectory.
+            inf, gaps do not separate trajectories.
         period: s, period of the motion, see `Recording`.
         name: name of the recording; if None, the file name without its suffix.
         topic: ROS topic to read from a bag, see `bag_table`.
@@ -79,13 +79,13 @@ def read(
             `choose_joints` select and sort the file's joints by these names.
         torque_constant: Nm/A, (n,) or one value: joint torque, after the gear, per motor current. If set, the column
             of tau contains motor current.
-        limits: (lowest, highest) q of the robot, (n,) rad each; angles outside of the limits are shifted inside by
+        limits: (lowest, highest) q of the robot, (n,) rad each; angles outside are shifted inside by full
             revolutions, if possible.
 
     Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. Clock
     restarts also separate trajectories, except in bags and in files with a column `trajectory`. Log faults with only
     one remedy are repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file that
-    `Recording.save` wrote is restored unchanged.
+    `Recording.save` wrote is restored unchanged, but without its notes.
 
     Raises:
         UserError: the file or a column is missing or damaged, or the values do not form a valid recording.
@@ -93,7 +93,7 @@ def read(
     constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
     table = load_table(path, {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints})
-    restarts = not is_bag(path)  # a bag may interleave messages from two starts
+    restarts = not is_bag(path)  # a bag may interleave messages from before and after a restart
     how = Options(torque, columns or {}, n_joints, max_gap_s, period, name or path.stem, constant, restarts)
     how = replace(how, robot_joints=model_joints, limits=limits)
     try:
@@ -106,7 +106,7 @@ def read(
 
 def from_table(table: Table, how: Options) -> Recording:
     """Build a recording from the columns of a file; error messages do not contain the file name."""
-    notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars of `Recording.save` or of a reader
+    notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars that `Recording.save` or a reader wrote
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(how.torque, notes.get("torque"))
     constant = how.torque_constant
@@ -186,7 +186,7 @@ def _agreed_torque(declared: str | None, stored) -> str:
 
 
 def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
-    """Return the torque constants in Nm/A, () or (n,), or None if `value` is None."""
+    """Return the torque constants in Nm/A as an array () or (n,), or None if `value` is None."""
     if value is None:
         return None
     where = "data.torque_constant"
@@ -246,7 +246,7 @@ def files_of(path: str | os.PathLike) -> list[Path]:
 
 
 def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
-    """Return all columns of the file `path`, and name it in errors; `bag` contains the arguments of `bag_table`."""
+    """Return all columns of a file; errors contain its `path`. bag: arguments of `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")

@@ -16,7 +16,7 @@ from r2s.recordings.periodicity import find_period, overlap, tracks_of
 
 TORQUES = ("measured", "commanded", "motor")
 MIN_ROWS = 10
-SPLIT_GUARD_S = 0.1  # s; `split` drops training rows this close to a validation row, because they almost repeat it
+SPLIT_GUARD_S = 0.1  # s; `split` drops training rows this close to a validation row: adjacent rows are almost equal
 FIELDS = ("t", "q", "dq", "tau", "trajectory")
 SIGNALS = (  # further values that an arm may measure or estimate, with libfranka's names; see `ArmState`
     "tau_ext_hat_filtered", "O_F_ext_hat_K", "joint_contact", "cartesian_contact", "joint_collision",
@@ -248,9 +248,9 @@ class Recording:
     def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        In a repetition, which lasts at least 0.5 s, the RMS difference of each joint is below a tolerance (about 0.03
-        rad), and a joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a clock
-        restart.
+        A repetition lasts at least 0.5 s. In it, the RMS difference of each joint is below a tolerance (about 0.03
+        rad), and at least one joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a
+        clock restart.
         """
         return self._period_and_clock()[0]
 
@@ -280,17 +280,17 @@ class Recording:
     def overlap(self, training: "Recording") -> float:
         """Return the share (0 to 1) of this recording's motion that occurs in `training` (see `periodicity.overlap`).
 
-        Pieces of this recording with too little motion are ignored. The time of a motion does not affect the share.
+        Pieces with too little motion are ignored. The share does not depend on when a motion occurs.
         """
         return overlap(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
         """Return (train, validation) without common motion; validation has about `validation_fraction` of the rows.
 
-        1. If the motion has a period (argument or attribute), validation is the end of each period: the rows with the
-           largest phase, `t` modulo period. A chronological split would put repeated motion on both sides.
-        2. Otherwise, validation consists of the last trajectories, if these have about `validation_fraction` of the
-           rows: at least half of this fraction, and at most twice this fraction or half of the rows.
+        1. If the motion has a period (argument or attribute), validation is the end of each period: the rows whose
+           phase (`t` modulo period) is largest. A chronological split would put repeated motion on both sides.
+        2. Otherwise, validation consists of the last trajectories, if their share of the rows is at least half of
+           `validation_fraction` and at most twice `validation_fraction` (or 0.5, if larger).
         3. Otherwise, validation is the end of the recording.
 
         Except in case 2, training has no rows within 0.1 s of a validation row. Single-row trajectories are dropped.

@@ -1,7 +1,7 @@
-"""Repair log faults with only one remedy: swapped rows, repeats, zero stamps, wrapped or misread angles.
+"""Repair log faults that have only one remedy: swapped rows, repeats, zero stamps, wrapped or misread angles.
 
-Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired, but
-reported by `Recording` or by the checks of an identification.
+Every repair adds a line to the notes of the recording. A fault with several possible remedies is not repaired:
+`Recording` or the checks of an identification report it.
 """
 
 from itertools import pairwise
@@ -11,7 +11,7 @@ import numpy as np
 Arrays = dict[str, np.ndarray]  # t (T,), trajectory (T,), q, dq, tau (T, n)
 
 MOST_SWAPPED = 10  # rows; a row that is farther out of place indicates two interleaved logs
-JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: misread q jumps by more than each, and back
+JUMP, JUMPS, FASTEST = 0.05, 20, 10.0  # rad, median steps, rad/s: a misread q jumps by more than each limit, and back
 AWAY, MOST_FAILED = 10, 0.01  # largest number of successive rows, and share of all rows, with misread q
 FIRST_STEP = 100  # median steps; zero stamps are dropped only if the first valid stamp is larger than this
 REVOLUTION, NEAR = 2 * np.pi, 0.5  # rad; at a wrap, q jumps by a revolution, plus or minus a motion below NEAR
@@ -77,8 +77,8 @@ def _order(arrays: Arrays) -> np.ndarray | None:
 def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Arrays, list[str]]:
     """Remove jumps of q by a full revolution within a trajectory; return the arrays and a note on each repair.
 
-    limits: (low, high) joint limits, (n,) rad each; angles outside of the limits are shifted inside by revolutions,
-    if possible.
+    limits: (low, high) joint limits, (n,) rad each; angles outside are shifted inside by full revolutions, if
+    possible.
     """
     q, index = arrays["q"], arrays.get("trajectory")
     if q.ndim != 2 or q.dtype.kind not in "iuf" or len(q) != len(arrays["t"]):
@@ -105,7 +105,7 @@ def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) 
 
 
 def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Shift trajectories beyond the limits inside by revolutions; return q (T, n) and the list of shifted joints."""
+    """Move trajectories beyond the limits inside, by full revolutions; return q (T, n) and the shifted joints."""
     if (q.min(0) >= low - SLACK).all() and (q.max(0) <= high + SLACK).all():
         return q, []
     out, turned = q.copy(), set()

@@ -32,7 +32,7 @@ def libfranka_table(table: Table) -> Table:
     if not {"time", "success_rate", "state.q[0]"} <= table.keys():
         return table
     time = table["time"]
-    numeric = time.dtype.kind in "iuf"  # text is not converted: `readers` reports it with the column's name
+    numeric = time.dtype.kind in "iuf"  # text is not converted: `readers` raises an error with the column's name
     t = time * CYCLE if numeric else time
     found = {"t": t}
     for field, name in (("q", "state.q"), ("dq", "state.dq"), ("tau_J", "state.tau_J"), ("tau_J_d", "cmd.tau_J_d")):
@@ -99,7 +99,7 @@ def bag_table(
 
     t starts at 0 and comes from the header stamps, or from bag time if all stamps are 0. Messages that lack joints of
     the robot, such as a gripper's, are ignored. Messages are sorted by time, and repeated messages are dropped. The
-    entry `reader_note` counts the omitted messages: messages with stamp 0 and messages before the first complete
+    entry `reader_note` states how many messages were omitted: those with stamp 0, and those before the first complete
     message.
 
     Args:
@@ -186,7 +186,7 @@ def choose_joints(
 
 
 def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
-    """Read `topic`, or the only readable topic if it is None; return the topic's name and messages."""
+    """Read `topic`, or the only readable topic if `topic` is None; return the topic's name and messages."""
     rosbag1, rosbag2 = (optional_import(f"rosbags.rosbag{k}", "reading this file", "recordings") for k in (1, 2))
     try:
         # only this topic is decoded: other topics may have unknown message types

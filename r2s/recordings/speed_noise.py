@@ -1,4 +1,4 @@
-"""Estimate the noise of an arm's measured velocity from recordings; a training adds such noise to dq."""
+"""Estimate the noise of an arm's measured velocity from recordings; a training adds such noise to simulated dq."""
 
 from collections.abc import Iterator, Sequence
 
@@ -24,8 +24,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
 
     The noise is dq minus a reference velocity, the slope of a cubic fit to q (Savitzky and Golay, Analytical
     Chemistry 36(8), 1964). At low acceleration, the fitted slope is accurate, and a delay of dq has no effect. The
-    result is the median noise of the calmest 50 ms pieces: the 10 % in which acceleration, the second derivative of
-    q, is smallest.
+    result is the median RMS noise of the calmest 50 ms pieces. These are the 10 % with the smallest acceleration, the
+    second derivative of q.
 
     Raises:
         UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.

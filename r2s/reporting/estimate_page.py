@@ -20,7 +20,7 @@ LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and limits 
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
-    """Draw the estimates of payload and friction in `rows` over time; mark payload changes at `changes`, s."""
+    """Draw the estimates of payload and friction in `rows` over time; mark payload changes at times `changes`, s."""
     t, colour = rows["t"].to_numpy(), colours(["estimate"])["estimate"]
 
     def band(axis, name: str, title: str, label: str, scale: float = 1.0) -> None:
@@ -52,7 +52,8 @@ def write_estimate_recording(
     """Write a rerun recording: the arm, the force on the arm, and each estimate with its 95 % interval.
 
     Args:
-        rows: table with a row per estimate. wrench: table of the external force from `observe_recording`.
+        rows: table of the estimates, with a row per time `t`. wrench: table of the external force from
+            `observe_recording`.
     """
     stream = rr.RecordingStream(f"r2s {path.absolute().parent.name.replace('.', '-')}")
     shown = [n for n in rows.columns if n not in wrench.columns and not n.endswith("_half")]

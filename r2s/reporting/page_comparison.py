@@ -1,4 +1,4 @@
-"""Compare the table cells, including their intervals, in two versions of a page from benchmarks/results.
+"""Compare the tables in two versions of a page in benchmarks/results, cell by cell and with intervals.
 
 Cells are matched by section, row and column, so added rows and changed paragraphs do not affect the comparison.
 """
@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Remove all table rows of a page, so that a table that no command computes again keeps only its header."""
+    """Remove the rows of all tables in a page, so that a table shows only its header unless it is computed again."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -42,8 +42,8 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
 
     `verdict` is one of VERDICTS. The verdict "last digit" means that numbers differ by at most one unit of their last
     digits. The verdict "beyond intervals" means that an interval in the old cell and its counterpart in the new cell
-    do not overlap. `change` is the largest relative change of a number in the cell, or NaN if the cell has no numbers
-    or if the count of numbers changes.
+    do not overlap. `change` is the largest relative change of a number in the cell; NaN if the cell has no numbers,
+    or if their count differs.
     """
     old, new = table_cells(before), table_cells(now)
     rows = []

@@ -44,7 +44,7 @@ def transfer(
     stops: Sequence[Stop] = (),
     halted: str | None = None,
 ) -> None:
-    """Save the episodes of a transfer and the last second before each stop, draw four episodes, and write the report.
+    """Save a transfer's episodes and the last second before each stop; draw up to four episodes; write the report.
 
     Args:
         run, robot: the run and its arm. episodes: {simulator or arm: episodes}. rows: {simulator or arm: measures}.

@@ -1,4 +1,4 @@
-"""Report stage=results: how the cells of a page differ from the committed cells, and a summary of all pages."""
+"""Report stage=results: recomputed cells of a page that differ from committed cells, and a summary of all pages."""
 
 import json
 from pathlib import Path
@@ -38,7 +38,7 @@ def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.Da
 
 
 def all_pages(folder: Path, last: dict[str, Any]) -> None:
-    """Write report.md in `folder` with a row per page, from this run's summary `last` and other runs' summaries."""
+    """Write report.md in `folder` with a row per page, from `last`, this run's summary, and other runs' summaries."""
     done = {last["page"]: last}
     for path in sorted(folder.glob("*/summary.json")):
         other = json.loads(path.read_text())
@@ -53,7 +53,7 @@ def all_pages(folder: Path, last: dict[str, Any]) -> None:
 
 
 def _shown(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return cells as strings, by verdict (beyond intervals, without interval, others), then by decreasing change."""
+    """Return cells as strings, sorted by verdict (beyond intervals, without interval, others), then by change."""
     order = cells.assign(rank=cells["verdict"].map({"beyond intervals": 0, "without interval": 1}).fillna(2))
     order = order.sort_values(["rank", "change"], ascending=[True, False])
     change = order["change"].map(lambda x: "" if pd.isna(x) else f"{100 * x:.0f} %")

@@ -14,7 +14,7 @@ from r2s.reporting.document import Item, report_markdown
 from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
-ORDERS = 2000  # random orders of a grid's jobs: a mean over them has a standard error of 1 / 45 of the spread
+ORDERS = 2000  # number of random orders of a grid's jobs; their mean has a standard error of sigma / 45
 SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of the search's training time, summed over its trials
 
 
@@ -32,9 +32,9 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) found until the times `at` (K,) s by trials in sequence, which take `spent` s each.
+    """Return the best value (K,) found by the times `at` (K,) s; trials run in sequence and last `spent` s each.
 
-    Pruned and failed trials use compute, but their value is nan. sign: 1 if a larger value is better, else -1.
+    Pruned and failed trials take time, but have the value nan. sign: 1 if a larger value is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))

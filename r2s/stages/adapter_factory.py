@@ -11,11 +11,14 @@ from r2s.stages.run_config import checked, loaded, modules
 RECORDINGS = ("train.npz", "validation.npz")  # files that stage=identify writes when it records an arm
 PARAMETERS = "parameters.yaml"
 TORQUE = "commanded"  # adapters compare the commanded torque with the motion
-BESIDE = ("calibration",)  # keys of conf/adapt that are no arguments of the adapter's class
+BESIDE = ("calibration",)  # keys of conf/adapt that are not arguments of the adapter's class
 
 
 def calibrated(calibration, robot, trust=()):
-    """Return the dynamics, (space, posterior draws) and recordings without payload; missing files give None."""
+    """Return the identified dynamics, (parameter space, posterior draws) and (training, validation recording).
+
+    The draws are None if posterior.npz is missing. The recordings are None if one of them is missing.
+    """
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
 
@@ -29,7 +32,7 @@ def calibrated(calibration, robot, trust=()):
 
 
 def free_recordings(calibration):
-    """Return the recordings of motion without contact that identified the arm, if their files still exist.
+    """Return the contact-free recordings from which the arm was identified, if their files still exist.
 
     If the recordings do not suffice to compute a contact threshold, print the reason and return [].
     """
@@ -52,7 +55,7 @@ def free_recordings(calibration):
 
 
 def _given_recordings(folder):
-    """Return the user's recordings that a stage=identify run read, if they have commanded torque and no payload.
+    """Return the recordings with commanded torque and without payload that a stage=identify run read from files.
 
     Raises:
         UserError: a file cannot be read with the settings of the run's config.
@@ -77,8 +80,8 @@ def _given_recordings(folder):
 def with_declared_payload(cfg, robot, dynamics, calibration):
     """Return the dynamics of an arm whose gravity compensation includes arm.declared_payload.
 
-    A model that the run folder `calibration` identified with a declared payload lacks this payload, because the
-    gravity compensation carried it; so the dynamics contain the change of the declared payload since then.
+    If a payload was declared during the identification `calibration`, the gravity compensation held this payload, so
+    the identified model lacks it. The returned dynamics therefore declare only the change of payload since then.
     """
     from omegaconf import OmegaConf
 
@@ -123,10 +126,10 @@ def make_adapter(cfg, robot, source):
 
 
 def calibration_of(cfg, source):
-    """Return the run folder of the adapter's model: adapt.calibration or, by default, that of the policy's training.
+    """Return the run folder with the adapter's model: adapt.calibration, or by default the training's calibration=.
 
-    If the training folder contains a copy of an identified model, prefer the folder of the identification, because
-    only that folder contains recordings.
+    If the training's calibration= is gone or has changed, return the training's folder `source`, which contains a
+    copy of the model but no recordings.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)

@@ -57,8 +57,8 @@ def make_robot(cfg):
 def make_dynamics(cfg, robot, announce=False):
     """Return the dynamics of `base_dynamics`, prepared for contact if the task of conf/task touches a surface.
 
-    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. With
-    `announce`, print a line if contact changes the stiction model.
+    During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. If `announce`
+    and the preparation changes the stiction model, print a line.
     """
     dynamics = base_dynamics(cfg, robot)
     if not getattr(target(cfg.task, "task"), "touches", False):
@@ -85,7 +85,7 @@ def base_dynamics(cfg, robot):
 
 
 def dynamics_of(robot, friction, inertia):
-    """Return the dynamics from the contents of a file in conf/friction and a file in conf/inertia."""
+    """Return the dynamics that the contents of a file in conf/friction and of a file in conf/inertia describe."""
     from r2s.physics.dynamics import nominal_dynamics
 
     for group, settings in (("friction", friction), ("inertia", inertia)):
@@ -100,8 +100,8 @@ def dynamics_of(robot, friction, inertia):
 def make_task(cfg, robot, dynamics, safety=None):
     """Return the task of conf/task with the arm's model, the controller of conf/control and the safety limits.
 
-    safety: safety settings of a transfer, which replace safety settings in the training's config `cfg`; a setting
-    with the value None, or `safety=None`, replaces nothing.
+    safety: safety settings of a transfer, or None. Each setting that is not None replaces the setting of the
+    training's config `cfg`.
     """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
@@ -189,7 +189,7 @@ def ends_sweep(cfg):
 
 
 def is_simulated(cfg):
-    """Return whether the arm of conf/arm is simulated from a seed: a twin, or an emulated control box with a twin."""
+    """Return whether the arm of conf/arm is a twin, alone or behind an emulated control box."""
     made = {"_target_", "seed"} <= cfg.arm.keys()
     return made and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
 
@@ -218,7 +218,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
             finally:
                 arm.stop()
         return
-    _arm_target(cfg)  # raise errors here, not in the process of the arm
+    _arm_target(cfg)  # raise UserError in this process, not in the arm's
     make = partial(part, _arm_settings(cfg, robot, task), "arm", robot, beside=list(DRIVE_KEYS))
     with ExitStack() as stack:
         try:
@@ -250,19 +250,19 @@ def opened_source(cfg, robot, noise):
 
 
 def planned_speed_share(cfg):
-    """Return arm.speed_share for planning a recorded motion; 1 if no arm records."""
+    """Return arm.speed_share, which scales the speed limits of a planned motion; 1 unless data=arm."""
     share = cfg.arm.get("speed_share", 1.0) if cfg.data.kind == "arm" else 1.0
     check_number("arm.speed_share", share, "(0, 1]")
     return share
 
 
 def within_speed_share(cfg, robot):
-    """Return the robot for planning a recorded motion, with the speed limits scaled by arm.speed_share."""
+    """Return the robot with speed limits scaled by arm.speed_share, for planning a motion to record."""
     return replace(robot, dq_max=planned_speed_share(cfg) * robot.dq_max)
 
 
 def check_source(cfg, robot):
-    """Raise UserError if r2s cannot make the simulated arm for a recording; do not connect to a physical arm."""
+    """Raise UserError if the settings of a simulated arm to record are wrong; do not connect to a physical arm."""
     if cfg.data.kind == "simulated" or is_simulated(cfg):
         with opened_source(cfg, robot, 0):
             pass
@@ -308,7 +308,7 @@ def make_controller(cfg, robot, task, dynamics):
 def open_run(cfg, overrides, inputs=(), parents=()):
     """Return the open run folder of this job and start the trackers; a resumed run stays in its tracker group.
 
-    inputs, parents: files and run folders that the job reads, in addition to those that the config names.
+    inputs, parents: files and run folders that the job reads and that the config does not name.
     """
     from omegaconf import OmegaConf
 

@@ -51,7 +51,8 @@ def contact_data(cfg, robot, file):
 def stated_stiffness(cfg, robot):
     """Return the prior of gear stiffness from identify.gears; None if identify.gears.stiffness is unset.
 
-    identify.gears.stiffness contains numbers, with the accuracy identify.gears.accuracy, or a folder with gears.yaml.
+    identify.gears.stiffness is a run folder with gears.yaml, or numbers, Nm/rad, of relative standard deviation
+    identify.gears.accuracy.
 
     Raises:
         UserError: a value is invalid.
@@ -157,7 +158,7 @@ def identify_surface(cfg, run, arm, data):
 
 
 def keep_calibration(cfg, run):
-    """Copy the model of `calibration=` into the run folder, so that a later calibration= can name this folder."""
+    """Copy the model of `calibration=` into the run folder; a later job can then set calibration= to this folder."""
     folder = Path(cfg.calibration)
     folder = folder if folder.is_dir() else folder.parent
     for name in ARM:

@@ -10,7 +10,7 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
-SLOW_MS = 1.5  # ms; if recorded commands are farther apart, r2s prints how long it assumes each command is held
+SLOW_MS = 1.5  # ms, longest hold of a command that r2s assumes without printing the hold
 LEAST_PRESSES = 4
 MAX_OVERLAP = 0.2  # largest share of a validation motion that may repeat training motion, for example in the approach
 
@@ -26,7 +26,7 @@ class ArmData:
         excitation: file of the training motion; if None, r2s optimizes a training motion.
         ramp_poses: number of postures in which r2s ramps every joint in both directions; 0 means no ramps.
         presses: number of contact motions (press and slide), which replace all motions without contact; 0 means none.
-        gears: whether each joint slides slowly under a multisine torque, which replaces all other motions.
+        gears: whether to record, instead of all other motions, each joint sliding slowly under a multisine torque.
         press_point, press_normal: point (3,) m and normal (3,) of the nominal plane; if None, a work table below the
             tip in the home posture.
 
@@ -118,7 +118,10 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with the hold of data.command_hz; if unset, print an assumed hold above SLOW_MS."""
+        """Return the recording with the hold of a command, 1 / data.command_hz.
+
+        If data.command_hz is unset, each command is assumed to hold until the next row; print a hold above SLOW_MS.
+        """
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)
         if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
@@ -182,7 +185,7 @@ def of_joints(robot):
 
 
 def read_episodes(path):
-    """Return a transfer's episodes as a recording of commanded torque, and further signals as {LeRobot name: rows}.
+    """Return a transfer's episodes as a recording of commanded torque, and further signals {LeRobot feature: rows}.
 
     Raises:
         UserError: the file has no episodes of a transfer.
@@ -243,7 +246,7 @@ def check_other_motion(recording, validation):
 
 
 def check_cutoff(cutoff_hz, recordings):
-    """Raise UserError unless identify.cutoff_hz is below 500 Hz and each recording's Nyquist frequency."""
+    """Raise UserError unless identify.cutoff_hz is below 500 Hz and below the Nyquist frequency of each recording."""
     from r2s.identification.checks import check_rate
 
     check_number("identify.cutoff_hz", cutoff_hz, "(0, 500)")  # r2s works at 1 kHz
@@ -261,7 +264,7 @@ def read_user_ramps(robot, file):
         return None
     columns = dict(file.columns)
     if file.torque != "commanded":
-        columns["tau"] = None  # ramps need commanded torque, which this column of the recording does not contain
+        columns["tau"] = None  # ramps need commanded torque; this column names another torque
     how = of_joints(robot) | {"columns": columns, "max_gap_s": file.max_gap_s}
     ramps = read_ramps(file.ramps, joints=None if is_bag(Path(file.path)) else file.joints, **how)
     check_ramps(robot, ramps)
@@ -304,7 +307,7 @@ def record_motion(cfg, robot, motion, k, label, timing):
 
 
 def record_ramps(cfg, robot, timing):
-    """Record breakaway ramps in postures about home; return the ramps, or None if the settings require none.
+    """Record breakaway ramps in postures near home; return the ramps, or None if the settings ask for no ramps.
 
     timing: object that stores the durations of the control cycles.
     """

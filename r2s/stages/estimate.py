@@ -100,7 +100,7 @@ def estimate(cfg, overrides):
 
 
 def calibrated_by_commands(cfg, robot):
-    """Return `calibrated` of calibration=; raise UserError unless commanded torque identified the model."""
+    """Return `calibrated(calibration)`; raise UserError unless the model was identified from commanded torque."""
     if (torque := torque_of_calibration(cfg, None)) != TORQUE:
         raise UserError(
             f"calibration: stage=estimate expects a model identified with data.torque={TORQUE}, got {torque} "
@@ -110,7 +110,7 @@ def calibrated_by_commands(cfg, robot):
 
 
 def compensated(cfg, robot, dynamics):
-    """Return the dynamics of an arm whose gravity compensation includes the payload declared for arm or recording."""
+    """Return the dynamics with the declared payload of the arm or of the recording."""
     from r2s.physics.payload import mass_and_moment, payload_of
 
     if cfg.data.kind == "arm":
@@ -120,7 +120,7 @@ def compensated(cfg, robot, dynamics):
 
 
 def identified_surface(cfg, robot):
-    """Return the identified surface of estimate.surface=, or None; raise UserError if the robot has no tool."""
+    """Return the identified surface estimate.surface, or None if unset; raise UserError if the robot has no tool."""
     if not cfg.estimate.surface:
         return None
     from r2s.identification.contact.contact_file import load_contact
@@ -179,7 +179,9 @@ def given_recording(cfg, robot):
 
 
 def record_arm(cfg, robot):
-    """Record data.excitation, or a motion of data.seconds; return the recording, and the reason of a stop (or None).
+    """Record an arm in the motion data.excitation, or in a new motion of duration data.seconds.
+
+    Return the recording, and the reason why the arm stopped early (or None).
 
     Raises:
         Stopped: a signal stopped the arm, or the arm stopped before the recording began.

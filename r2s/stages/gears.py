@@ -14,7 +14,7 @@ OTHERS = (
 
 
 def check_alone(cfg):
-    """Raise UserError if data.gears is combined with another recording or lacks the identified arm."""
+    """Raise UserError if data.gears is combined with another recording, or if calibration= is missing."""
     from omegaconf import OmegaConf
 
     for key in OTHERS:
@@ -42,7 +42,7 @@ def slides_in_file(cfg, robot):
 
 
 def check_motions(cfg, robot):
-    """Raise UserError if the settings of data=arm are invalid, or if a joint cannot slide about home."""
+    """Raise UserError if the settings of data=arm are invalid, or if a joint's slide breaks a limit or collides."""
     from r2s.arm.gear_motions import check_gear_motions
 
     check_data(cfg)

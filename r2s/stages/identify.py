@@ -79,7 +79,7 @@ def make_parts(cfg):
             check_cutoff(cfg.identify.cutoff_hz, (*group.train.values(), *group.validation.values()))
             settings = make_settings(cfg, group.torque, [earlier] if earlier else [], group is groups[-1])
             check_known(robot, nominal, whole(group.train), settings)
-        kinds = [group.torque for group in groups]  # commanded torque is the last
+        kinds = [group.torque for group in groups]  # commanded torque, if any, is last
         contact = contact_data(cfg, robot, replace(file, torque=kinds[-1]))
         if loaded and loaded.recording.torque not in kinds:
             raise UserError(
@@ -218,7 +218,7 @@ def fit_group(cfg, run, made, group, earlier, folder):
     save_parameters(folder / "parameters.yaml", *found.saved, source, found.note)
     for line in write_description(folder / "model", robot, found.dynamics):
         print(line)
-    if train.torque != "measured":  # a link-side sensor does not measure the friction that a command has to overcome
+    if train.torque != "measured":  # a link-side sensor does not measure the friction that commands overcome
         write_crisp(folder / "model" / "crisp_friction.yaml", robot, found.dynamics)
     tables, entries = compared(made, group, found, settings, " and ".join(str(e) for e in earlier))
     arm = Arm(found.space, found.x, found.found.samples)
@@ -231,7 +231,7 @@ def fit_group(cfg, run, made, group, earlier, folder):
 def compared(made, group, found, settings, known_from):
     """Return tables and summary.json entries: contribution of each recording, and drift since the run identify.from.
 
-    known_from: names of the earlier identifications that provide `settings.known`, for messages.
+    known_from: text for messages, the names of the earlier identifications that provide `settings.known`.
     """
     from r2s.identification.contributions import contradictions, contributions, validated
     from r2s.identification.known import FAR, block_of, disagreement, drift_table

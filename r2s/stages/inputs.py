@@ -14,7 +14,8 @@ PARENTS = (
     "dr.surface",
     "identify.gears.stiffness",
 )  # config keys that name a run folder
-FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; the commit determines files of the package
+# config keys that name a file; no digest is needed inside the package, because the commit determines those files
+FILES = ("robot.mjcf", "robot.tool")
 # files of a run folder that another job may read
 READ = (
     *("config.yaml", "overrides.yaml", "policy.yaml", "summary.json", "measures.json", "evaluations.csv"),
@@ -28,14 +29,17 @@ def parents_of(cfg) -> list[str]:
     """Return the run folders and parameter files that a config names."""
     from omegaconf import OmegaConf
 
-    copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # a resumed run reads these copies
+    copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # a resumed run reads its copies
     keys = [k for k in PARENTS if not (cfg.resume and k in copies and (Path(cfg.resume) / copies[k]).is_file())]
     values = [OmegaConf.select(cfg, key) for key in keys]
     return [str(Path(value)) for value in values if isinstance(value, str) and value]
 
 
 def files_of(cfg, parents: Iterable[str]) -> list[Path]:
-    """Return the robot files that a config names, and all READ files in `parents` (run folders, parameter files)."""
+    """Return the files that a job reads: the robot files that the config names, and files of `parents`.
+
+    parents: run folders, of which a job reads the files READ, or parameter files with posterior.npz beside them.
+    """
     from omegaconf import OmegaConf
 
     named = [str(value) for key in FILES if (value := OmegaConf.select(cfg, key))]

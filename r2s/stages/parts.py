@@ -32,7 +32,7 @@ def target(node: Any, group: str) -> Callable[..., Any]:
     path = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(path, str) or not path:
         raise UserError(f"{group}: expected a yaml with _target_ (dotted path of a class or function), got none")
-    logging.getLogger("hydra.utils").disabled = True  # Hydra would print the error a second time
+    logging.getLogger("hydra.utils").disabled = True  # otherwise Hydra prints the error too
     try:
         return get_object(path)
     except Exception as error:  # the import of a user's module may raise anything
@@ -62,7 +62,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
         return make(*given, **settings)
     except UserError as error:
         first = str(error).split(":")[0].split(".")[0]
-        if first in settings and first != group:  # the target cannot name its group in the message
+        if first in settings and first != group:  # the message lacks the group, which the target does not know
             raise UserError(f"{group}.{error}") from None
         raise
 
@@ -70,7 +70,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
 def arguments(make: Callable[..., Any]) -> dict[str, Any]:
     """Return {argument: type hint} of a function or class.
 
-    For **kwargs of an __init__, add the arguments of the next class in the MRO; for **kwargs of a function, add "**".
+    If an __init__ has **kwargs, add the arguments of the next class in the MRO. If a function has **kwargs, add "**".
     """
     found: dict[str, Any] = {}
     for owner in make.__mro__[:-1] if inspect.isclass(make) else (make,):
@@ -79,7 +79,7 @@ def arguments(make: Callable[..., Any]) -> dict[str, Any]:
             continue
         try:
             hints = get_type_hints(function)
-        except (NameError, TypeError):  # annotations only for type checkers, or no plain function
+        except (NameError, TypeError):  # annotations that only type checkers resolve, or no plain function
             hints = {}
         parameters = inspect.signature(function).parameters.values()
         found = {p.name: hints.get(p.name) for p in parameters if not p.kind.name.startswith("VAR")} | found

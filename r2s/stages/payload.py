@@ -23,7 +23,7 @@ def loaded_data(cfg, robot, file, torque=None):
     """Return the `LoadedData` of data.loaded, or None without data.loaded.
 
     Args:
-        file: `FileData` of the config. torque: kind of torque that replaces data.torque; if None, data.torque counts.
+        file: `FileData` of the config. torque: kind of torque; if None, data.torque applies.
 
     Raises:
         UserError: data.declared_payload or data.contact contradicts data.loaded, or the file is invalid.
@@ -51,12 +51,12 @@ def loaded_data(cfg, robot, file, torque=None):
 
 
 def torque_of_calibration(cfg, given):
-    """Return the kind of torque of the calibration; a recording with a payload must have the same kind of torque.
+    """Return the kind of torque from which calibration= was identified; data.loaded needs the same kind of torque.
 
     given: value of data.torque, or None if unset.
 
     Raises:
-        UserError: data.torque differs from the kind of torque of the calibration.
+        UserError: data.torque is set to another kind of torque.
     """
     from r2s.stages.adapter_factory import PARAMETERS, TORQUE
     from r2s.stages.run_config import loaded
@@ -73,7 +73,7 @@ def torque_of_calibration(cfg, given):
 def identify_load(cfg, run, arm, data, label=""):
     """Identify a payload; write payload.yaml and figure, print the tables, return the entry for summary.json.
 
-    label: label of the recording if there are several; payload.yaml is then in the folder payload_LABEL.
+    label: label of the recording, given if there are several recordings; payload.yaml is then in payload_LABEL/.
     """
     from r2s.identification.payload.estimate import identify_payload
     from r2s.identification.payload.payload_file import save_payload

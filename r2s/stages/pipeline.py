@@ -27,7 +27,7 @@ STEPS = {  # {first label of the step's commands: description}
 }
 STOPPED = 3  # exit status of a command that ended because the arm stopped, see r2s/cli.py
 MODELS = ("identified", "nominal")
-# labels: with adapt=, computed torque, and the policy of "identified" plus adapter; identification of the surface
+# labels: computed torque, policy "identified" with adapter (both only with adapt=), identification of the surface
 COMPUTED, ADAPTED, SURFACE = "computed", "adapted", "surface"
 REFERENCE = "reference"  # for a task on a surface: hybrid control with the identified model, without learning
 ROWS = {
@@ -35,7 +35,7 @@ ROWS = {
     ADAPTED: "identified model + adapter",
     REFERENCE: "hybrid control, identified model",
 }
-PATHS = 6  # number of contact motions on the surface, 8 s each; the last is for validation
+PATHS = 6  # number of contact motions on the surface, 8 s each; the last motion is for validation
 CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # see `commands`
 # keys that only learners read
 UNLEARNED = ("algo", "budget", "reward", "costs", "evaluation.env_steps", "compile", "matmul", "device")
@@ -54,7 +54,7 @@ def reads(cfg):
 
 
 def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
-    """Return the user's overrides that the command with the config `step` reads."""
+    """Return those of the user's overrides that the stage of the config `step` reads."""
     own = ("stage=", "name=", "root=", "threads=", "pipeline.")
     return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
 
@@ -109,7 +109,7 @@ def run_step(words: dict[str, list[str]]) -> None:
 
 
 def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
-    """Split a step into groups of parallel commands: one group or, if an arm `moves`, one group per command."""
+    """Split a step into groups of parallel commands; if a physical arm `moves`, each group is a single command."""
     return [{label: words} for label, words in step.items()] if moves else [step]
 
 
@@ -141,7 +141,7 @@ def compose_step(words: Sequence[str], option: str) -> Any:
 
 
 def touches(cfg: Any) -> bool:
-    """Return whether the task presses a tool on a surface, so that the surface has to be identified."""
+    """Return whether the task presses a tool on a surface, which r2s then identifies."""
     return bool(getattr(target(cfg.task, "task"), "touches", False)) and not moves_box(cfg)
 
 
@@ -171,8 +171,8 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     """Return the commands {label: words} of each step: identify the arm, identify a surface, train, transfer.
 
     The trainings on the identified and the nominal model differ only in the model: settings, time and computer are
-    the same. With an adapter, the changes of a simulated arm (CHANGES) apply only to transfers, not to
-    identifications. A physical arm keeps its declared payload, because the load is set in its control box.
+    the same. With an adapter, the options CHANGES, which change a simulated arm, apply only to transfers. On a
+    physical arm, arm.declared_payload applies to every command, because the arm's control box stores the payload.
 
     Args:
         cfg: config of the pipeline. name: name of the pipeline's run folder, with which all other folder names begin.
@@ -189,7 +189,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     ) -> list[str]:
         config = cfg.copy()
         config.stage, config.calibration = stage, calibration
-        if typed is not overrides:  # only commands without adapter pass other overrides
+        if typed is not overrides:  # `typed` is given only for commands without adapter
             config.adapt = {"name": "none"}
         full = f"{name}_{label}" if label != "identify" else name
         threads = cfg.threads if stage == "identify" else max(1, both // 2)
@@ -270,7 +270,7 @@ def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
         for word in words:
             if why := unread(word.lstrip("+~").split("=")[0], step):
                 raise UserError(f"the training '{label}': {why}")
-    if COMPUTED in trained:  # refuses some controllers; the reference uses the task's own
+    if COMPUTED in trained:  # algo=computed_torque refuses some control=; REFERENCE ignores control=
         bare = [word for word in trained[COMPUTED] if not word.startswith("calibration=")]
         bare += [word for word in overrides if word.lstrip("+~").startswith(("friction", "inertia"))]
         train.make_parts(compose_step([*bare, *chosen(overrides, cfg)], f"the training '{COMPUTED}'"))

@@ -62,10 +62,10 @@ def make_settings(cfg, torque, earlier=(), last=True):
     """Return the `Settings` of an identification from torque of the kind `torque`.
 
     Args:
-        earlier: list of `Earlier`, whose links and payload enter the prior. An `Earlier` with the same kind of torque
-            also provides all other values, the friction family and the terms, so that the old and the new model have
-            equal form.
-        last: whether `torque` is the last kind that r2s fits; other fits use only stated values of links and payload.
+        earlier: list of `Earlier`, whose links and payload enter the prior. If an `Earlier` has the same kind of
+            torque, all its values enter the prior, and the new model has the same friction family and terms.
+        last: whether `torque` is the last kind that r2s fits; earlier fits use only the stated values of links and
+            payload.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings

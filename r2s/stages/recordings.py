@@ -18,7 +18,7 @@ from r2s.stages.parts import plain
 
 OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints", "payload")
 FIND = "find"  # value of `payload` for a recording whose payload is to be identified
-ORDER = ("measured", "motor", "commanded")  # order of fits; the last identifies the friction that a command overcomes
+ORDER = ("measured", "motor", "commanded")  # order of fits; the last identifies the friction that commands overcome
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def read_groups(robot, files, validation, share, cutoff_hz):
 
 
 def _read(robot, file, several, cutoff_hz):
-    """Return a checked recording without the torque of a known payload; if `several`, errors name the file."""
+    """Read and check a recording, and subtract the torque of a known payload; if `several`, errors name the file."""
     from r2s.identification.checks import check_recording
     from r2s.identification.payload.unloaded import without_payload
     from r2s.physics.payload import payload_of
@@ -166,11 +166,11 @@ def whole(recordings, label=""):
 
 
 def recorded_once(run, name, label, record):
-    """Return the recording NAME.npz of a run; record it unless the run, if resumed, already has it.
+    """Return the recording NAME.npz of a run; record it first unless a resumed run already contains this file.
 
     Args:
         label: what the arm does, for progress and messages.
-        record: called with `Progress` and `Timing`; returns the recording, of commanded torque.
+        record: function of a `Progress` and a `Timing` that returns a recording of commanded torque.
 
     Raises:
         Stopped: the arm stopped; NAME_until_stop.npz contains the motions completed before the stop, if any.

@@ -28,7 +28,7 @@ def reads(cfg):
 def commands_of(settings):
     """Return the commands, as lists of words, that produce `results.page`; {data} becomes the folder `results.data`.
 
-    A command begins with `make`, or else contains the arguments for python.
+    A command begins with `make`, or consists of arguments for python.
 
     Raises:
         UserError: the page does not exist, r2s is not a checkout, or the data for the page are missing.

@@ -12,9 +12,7 @@ from r2s.stages.parts import target
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, or in a checkout
 PROGRAM = "python run.py" if CONF.parent != PACKAGE else "r2s"  # how the user starts r2s
-TRUST = (
-    "R2S_TRUST"  # environment variable: `trust=` for trainings of a resumed search, with overrides from its folder
-)
+TRUST = "R2S_TRUST"  # environment variable: `trust=` with which the trainings of a resumed search check their configs
 # matches resolvers such as ${oc.env:HOME}, nested ${a${b}} that may become a resolver, and an escaped $
 RESOLVER = re.compile(r"\$\{\s*(\w*)[^}]*(?::|\$\{)|\\\$")
 
@@ -59,7 +57,7 @@ def run_config(folder, trust=None):
 
 
 def replayed(cfg):
-    """Return a composed config; if its overrides come from a run folder, check the config with `checked` first."""
+    """Return a composed config; in the trainings of a resumed search, check the config with `checked` first."""
     return checked(cfg, "resume", os.environ[TRUST]) if TRUST in os.environ else cfg
 
 
@@ -112,7 +110,7 @@ def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...],
 
 
 def _is_own(key, value) -> bool:
-    """Return whether a setting names no code, or names a `_target_` that conf/ also names in the same group."""
+    """Return whether a setting names no code, or a `_target_` that a file of conf/ names in the same group."""
     if key == ("friction", "family"):
         return "." not in str(value)
     if key[-1:] != ("_target_",):

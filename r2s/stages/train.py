@@ -124,7 +124,7 @@ def check_length(budget, loop, n_envs, key):
 
 
 class Selection:
-    """The best and the last evaluation of a training; of equally good evaluations, the latest counts as the best."""
+    """The best and the last evaluation of a training; of equally good evaluations, the latest is the best."""
 
     def __init__(self, task):
         self._task, self.best, self.last = task, {}, {}
@@ -178,7 +178,7 @@ def train(cfg, overrides):
 
 
 def conclude(cfg, run, parts, selection):
-    """Evaluate the best and last policy on goals not used for selection; write policy.onnx, summary.json and page."""
+    """Evaluate best and last policy on goals not used for selection; write policy.onnx, summary.json, figure."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.learning.policy import export_onnx, load_policy
     from r2s.reporting import pages
@@ -210,7 +210,7 @@ def split_algo(cfg):
     check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
     demonstrations = settings.pop("demonstrations", 0)
     check_number("algo.demonstrations", demonstrations, "[0, inf)", whole=True)
-    residual_l2 = settings.pop("residual_l2", None)  # configs of earlier versions have none
+    residual_l2 = settings.pop("residual_l2", None)  # older configs lack this key
     if residual_l2 is not None:
         check_number("algo.residual_l2", residual_l2, "[0, inf)")
     loop = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
@@ -220,7 +220,10 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config; a resumed training reads the models' copies in its folder, as the originals may be gone."""
+    """Return the config; if the training is resumed, calibration= and dr name the copies in its run folder.
+
+    The original files may no longer exist.
+    """
     if not cfg.resume:
         return cfg
     model = cfg.copy()

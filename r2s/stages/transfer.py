@@ -29,7 +29,7 @@ from r2s.stages.build import (
 from r2s.stages.parts import part
 from r2s.stages.run_config import run_config
 
-REST_GAP = 0.05  # share of episodes by which `rest` on the arm may be below the prediction without a warning
+REST_GAP = 0.05  # `rest`, a share of episodes, may be this much lower on the arm than predicted without a warning
 FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward", "costs")
 WHY = {k: "it comes from the policy's run" for k in FROM_POLICY}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
@@ -239,7 +239,7 @@ def predict(cfg, request, robot):
 def save_arm_result(run, request, name, result, predicted):
     """Write stops.txt, timing.csv and episodes_<arm>.csv with a row per episode; return the measures on the arm.
 
-    predicted: episodes that the model predicted; if None, the arm's episodes are not compared.
+    predicted: episodes that the model predicted; if None, the arm's episodes are not compared with a prediction.
     """
     import pandas as pd
 
@@ -261,7 +261,7 @@ def save_arm_result(run, request, name, result, predicted):
 def rest_warning(rows, name):
     """Return a warning if fewer episodes end at rest on the arm than predicted, else None.
 
-    A policy that shakes the joints hardly moves the end effector, so success and path gap do not reveal the shaking
+    Shaking joints hardly move the end effector, so success and path gap do not reveal the shaking
     (benchmarks/results/transfer.md).
     """
     seen, expected = (rows.get(k, {}).get("rest") for k in (name, "predicted"))

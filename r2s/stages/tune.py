@@ -23,7 +23,7 @@ from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 MOST_STARTS = 3  # attempts to start a training that the system ends, for example because memory is short
 POLL_S = 0.2
 STOP_S = 20.0  # s, time for a training to end after each signal; a step or an evaluation takes less
-EDGE = 0.05  # share of a range, at each end, that counts as its edge
+EDGE = 0.05  # width of the edge at each end of a range, as a fraction of the range
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 
@@ -38,10 +38,10 @@ class Tune:
 
     Attributes:
         trials: number of trials. workers: number of parallel trainings with one thread each; if None, `threads`.
-        startup: number of random trials before TPE and the pruner start.
+        startup: number of random trials before the TPE sampler and the pruner start.
         measure: key of the task's measure to optimize, in the last evaluation of each training.
         space: {option: list of values, or text of a range; see `parse_range`}.
-        against: glob pattern of run folders of trainings to compare with, such as a grid; if None, no comparison.
+        against: glob pattern of training folders to compare with the trials, such as a grid; None: no comparison.
 
     Raises:
         UserError: a number is outside its range, the space is invalid, or the pattern matches nothing.
@@ -201,7 +201,11 @@ class TrialRun:
                 continue
 
     def status(self) -> str:
-        """Return "started" (by this process), "left" (by an earlier process), "none", or the status in meta.json."""
+        """Return the state of the training.
+
+        "started": runs, started by this process. "left": runs, started by an earlier process. "none": no run folder.
+        Otherwise: the status in meta.json.
+        """
         from r2s.runs import is_locked, read_meta
 
         if self._process is not None and self._process.poll() is None:
@@ -322,12 +326,12 @@ def tune(cfg, overrides):
         if done.empty:
             raise UserError(f"tune: no trial of {len(trials)} is complete")
         best = done.sort_values("value", key=lambda values: measure.sign * values).iloc[-1]
-        # the best value is biased, because it was selected on these goals; `last` comes from other goals
+        # the best value is biased, because its goals selected the trial; `last` was measured on other goals
         last = read_summary(Path(cfg.root) / "train" / f"{run.folder.name}_{int(best['trial'])}", "tune")["last"]
         counts = trials["state"].value_counts().to_dict()
         run.summary({"best": best.to_dict() | {"unseen": last[how.measure]}, "trials": counts})
         tuning_page(run, trials, against, how.measure)
-    chosen = study.trials[int(best["trial"])].params  # the table has nan for None
+    chosen = study.trials[int(best["trial"])].params  # the table contains nan instead of None
     settings = " ".join(words_of({k: chosen[k] for k in how.space if k in chosen}))
     unseen = f"{last[how.measure]:.4g} on goals that chose nothing"
     line = f"best of {len(trials)} trials: {how.measure} {best['value']:.4g}, {unseen}, with {settings}"

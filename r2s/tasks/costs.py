@@ -1,11 +1,11 @@
-"""Costs that a training limits in addition to the reward, with one adaptive Lagrange multiplier per cost.
+"""Costs, whose means a training limits while it maximizes the reward; each has an adaptive Lagrange multiplier.
 
 A training maximizes the mean reward r while each mean cost c_k stays within its limit d_k (constrained Markov
-decision process, Altman 1999). The policy maximizes r - sum_k lambda_k c_k / d_k, where the rate of the multiplier
-lambda_k is proportional to c_k / d_k - 1, and lambda_k is never negative (Tessler, Mankowitz and Mannor, Reward
-Constrained Policy Optimization, ICLR 2019). The replay buffer stores unweighted costs, which each update multiplies
-by the current -lambda_k / d_k. A stored cost thus stays valid, and costs need no separate critic. Mean reward and
-mean costs are means over all training steps, including exploration.
+decision process, Altman 1999). The policy maximizes r - sum_k lambda_k c_k / d_k (Tessler, Mankowitz and Mannor,
+Reward Constrained Policy Optimization, ICLR 2019). Each multiplier lambda_k >= 0 changes at a rate proportional to
+c_k / d_k - 1. The replay buffer stores unweighted costs, which each update multiplies by the current -lambda_k / d_k.
+Stored costs therefore stay valid when multipliers change, and costs need no separate critic. Mean reward and mean
+costs are means over all training steps, including exploration.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ from r2s.tasks.task import State
 
 MARGIN_RAD = 0.1  # rad, distance from a position limit at which the safety filter starts to fade the torque
 PATIENCE = 50_000  # env steps in which a multiplier grows by 1 while its cost is twice the limit; see rewards.py
-MOST = 50.0  # largest multiplier; if unlimited, a cost limit that no policy can meet would dominate the reward
+MOST = 50.0  # largest multiplier; without this bound, a cost limit that no policy can meet would dominate the reward
 
 
 def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
@@ -69,7 +69,7 @@ class ConstrainedReward(Reward):
 
     @property
     def factor(self) -> np.ndarray:
-        """(1 + K,), the initial factor of `reward`, followed by the initial multipliers of the K costs."""
+        """(1 + K,), initial value: the initial factor of `reward`, then the initial multipliers of the K costs."""
         return np.array([self._reward.factor, *np.zeros(len(self._names))])
 
     def terms(self, task: Any) -> tuple[str, ...]:
@@ -92,13 +92,13 @@ class ConstrainedReward(Reward):
         return distance, np.column_stack([terms, *costs])
 
     def weights(self, task: Any, progress: float, factor: Any = None) -> np.ndarray:
-        """Return the weights (k,) of reward terms and costs; for `factor`, see the attribute of the same name."""
+        """Return the weights (k,) of reward terms and costs; `factor` has the form of the attribute `factor`."""
         factor = self.factor if factor is None else factor
         return np.array([*self._reward.weights(task, progress, factor[0]), *(-factor[1:] / self._limits)])
 
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> np.ndarray:
         """Return the new `factor`; seen: (k,), means of terms and costs over the last `env_steps` env steps."""
         own = len(seen) - len(self._names)
-        beyond = seen[own:] / self._limits - 1.0  # not clipped: clipping would make rare large costs irrelevant
+        beyond = seen[own:] / self._limits - 1.0  # not clipped, so that rare large costs matter
         multipliers = (factor[1:] + beyond * env_steps / PATIENCE).clip(0.0, MOST)
         return np.array([self._reward.adapt(factor[0], progress, seen[:own], env_steps), *multipliers])

@@ -1,6 +1,6 @@
 """Descriptions of a task's measures: key, unit, whether lower is better, and presentation in tables and figures.
 
-Each task class has a `measure_table`, which training and transfer write to measures.json in their run folder, so that
+Each task class has a `measure_table`. Training and transfer write this table to measures.json in their run folder, so
 tables, pages and comparisons of run folders do not need the task's class.
 """
 
@@ -25,7 +25,7 @@ class Measure:
         key: column of evaluations.csv. short: name in table headings. title: name in figures and sentences.
         unit: unit for display, "" if dimensionless. scale: displayed value divided by the stored value.
         digits: number of displayed decimals. lower_is_better: whether lower values are better.
-        root_mean_square: whether several values are averaged as the root of their mean square.
+        root_mean_square: whether the average of several values is their root mean square.
     """
 
     key: str
@@ -81,16 +81,16 @@ class MeasureTable:
 
     Attributes:
         measures: the task's own measures, to which r2s adds the measures COMMON.
-        selection: measures that compare trainings: every row must contain the first measure; the last measure ranks
-            the trainings.
-        rows: columns of the table that has a row for each simulator and arm; by default all `measures`.
+        selection: keys of the measures that compare trainings. Every row of evaluations.csv must contain the first;
+            the last ranks the trainings.
+        rows: columns of the table with one row for each simulator and arm; by default all `measures`.
         comparison: columns of the table of trainings. curves: panels of the figure of learning curves.
         scores: panels of the figure that compares the scores of trainings.
         transfer: measures that compare adapters episode by episode in transfers to an arm.
         diagnostics: columns of a transfer's second table; by default COMMON.
         corner: heading of the column of row labels. description: sentence that describes what a policy does.
-        error: name, unit and scale of `Episodes.distance`. error_levels: errors at which the
-            figure of the error over time has horizontal lines.
+        error: name, unit and scale of `Episodes.distance`. error_levels: values of the horizontal lines in the figure
+            of error over time.
         reward: name of `Episodes.reward`.
 
     By default, `comparison`, `curves`, `scores` and `transfer` contain the measures that `selection` lists.

@@ -42,11 +42,11 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
     """Return the measures of the task press, which form one row of evaluations.csv.
 
     force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the force step, and in
-    the last second. Means over episodes: overshoot_N, largest excess over the new force in the direction of the step;
-    overshoot_share, overshoot_N divided by the step; impact_N, largest force within IMPACT_S of the first touch;
-    contact, share of time in contact after the first touch. All measures above exclude stopped episodes. success:
-    share of all episodes that have no stop, RMS errors <= GOOD_N before the step and at the end, and overshoot_N <=
-    OVER_N or overshoot_share <= OVER_SHARE.
+    the last second. The next four are means over episodes. overshoot_N: largest excess over the new force in the
+    direction of the step. overshoot_share: overshoot_N divided by the step. impact_N: largest force within IMPACT_S
+    of the first touch. contact: share of time in contact after the first touch. All measures above exclude stopped
+    episodes. success: share of all episodes that have no stop, RMS errors <= GOOD_N before the step and at the end,
+    and overshoot_N <= OVER_N or overshoot_share <= OVER_SHARE.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]
@@ -72,7 +72,7 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
 
 
 def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> tuple[float, ...]:
-    """Return RMS force errors before the step and at the end, overshoot (N, share), impact N, share in contact."""
+    """Return RMS force errors before the step and at the end, overshoot (N, share), impact N, contact time share."""
     window = round(WINDOW_S * ctrl_hz)
     error, change = force - asked, asked[-1] - asked[0]
     rmse = [float(np.sqrt((error[part] ** 2).mean())) for part in (slice(step - window, step), slice(-window, None))]

@@ -16,15 +16,15 @@ from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.rollout import measures
 from r2s.tasks.task import BaseTask, Episodes, ObservationTerm, State
 
-FINE_M = 0.02  # m, tanh scale of the observed error, so that the last centimeters span a network input's range
+FINE_M = 0.02  # m, tanh scale of the observed error; the last centimeters span the range of this network input
 FINE_RAD = 0.015  # m^2/rad, tanh scale of the observed J^T error
 FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds: makes creeping joints visible
 OBSERVED = (  # terms of `observe`, for metadata
     f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
 )
 SPEED_NOISE = 0.05  # rad/s, speed noise of trainings for an identified arm; equals REST (rollout.py)
-CLOSE_M = 1e-3  # m, lower bound of the initial distance by which the reward divides
-MIDDLE = 0.05, 0.95  # quantiles of the distance from the shoulder in random postures: default goal region
+CLOSE_M = 1e-3  # m, the reward divides by the initial distance, or by CLOSE_M if larger
+MIDDLE = 0.05, 0.95  # default goal region: quantiles of the distance from the shoulder in random postures
 POSTURES = 500  # number of random postures from which r2s computes the quantiles MIDDLE
 
 REACH = MeasureTable(
@@ -65,12 +65,14 @@ class ReachTask(BaseTask):
         torque_fraction: share of tau_max that an action of 1 commands: a number for all joints, or one per joint.
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         start_spread: rad, largest random deviation of a joint from q_home in a start posture.
-        reach: (low, high) m, range of the distance of goals from the shoulder (the second joint, or the only joint);
-            if None, quantiles MIDDLE of the end effector's distance from the shoulder in random postures.
+        reach: (low, high) m, range of the distance between goal and shoulder (the second joint, or the only joint).
+            If None, low and high are the quantiles MIDDLE of the distance between end effector and shoulder in random
+            postures.
         height: lowest goal, m. azimuth: rad, largest horizontal angle between a goal's direction and straight ahead.
-        speed_noise: rad/s, see `Task`; if None, SPEED_NOISE for a model with measurement noise, as identified arms
-            have, else 0. A policy trained with noise does not react to noise, and thus does not excite oscillations
-            of elastic gears. Rigid models have no elastic oscillations (benchmarks/results/transfer.md).
+        speed_noise: rad/s, see `Task`. If None, the value is SPEED_NOISE for models with measurement noise, such as
+            identified arms, and 0 for other models. A policy trained with noise does not react to noise, and thus
+            does not excite oscillations of elastic gears, which rigid models do not show
+            (benchmarks/results/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -144,7 +146,7 @@ class ReachTask(BaseTask):
         return robot.q_home + rng.uniform(-self.start_spread, self.start_spread, (count, robot.n))
 
     def region(self, robot: Robot) -> tuple[float, float]:
-        """Return (low, high) m, the range of the distance between goals and shoulder."""
+        """Return (low, high) m, the range of the distance between goal and shoulder."""
         if self.reach is not None:
             return self.reach
         postures = zip(range(POSTURES), _postures(robot, np.random.default_rng(0)), strict=False)
@@ -259,8 +261,8 @@ def observe(
 
     Terms: q; dq; ee; goal; error; effort / torque; tanh(error / 2 cm); J^T error; tanh(J^T error / 1.5 cm);
     tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector toward the goal; without J^T error, a
-    network would have to learn the Jacobian. The observation contains the effort, because torque changes by at most 1
-    Nm per ms.
+    network would have to learn the Jacobian. The observation contains the effort, from which the torque can change by
+    at most 1 Nm per ms.
 
     Args:
         q, dq: (m, n) rad, rad/s, joint angles and speeds.

@@ -16,7 +16,7 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # m, tanh scales of the precision bonus
-STILL = (0.2, 0.05)  # rad/s, tanh scales of the largest joint speed; a joint can turn while the end effector rests
+STILL = (0.2, 0.05)  # rad/s, tanh scales of the largest joint speed; joints can turn while the end effector rests
 TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 
 
@@ -108,13 +108,13 @@ class Curriculum(Reward):
 
     Attributes:
         smoothness, precision, stillness, filter_penalty: (before, after), weight of the term before and after the
-            curriculum's change. anneal: fractions of the budget at which the change of the weights starts and ends.
-        max_filter_rate: largest filter rate in a training, exploration included; if None, no limit. Once the weights
-            have started to change, a filter rate above `max_filter_rate` raises the weight of the filter penalty. A
-            filter rate below `max_filter_rate` lowers the penalty weight, but not below the curriculum's weight. With
-            a fixed penalty, the filter rate is 1 to 6 %, depending on the seed (benchmarks/results/minutes.md).
-            Integral control adapts the logarithm of the penalty weight, as for a Lagrange multiplier (Stooke, Achiam
-            and Abbeel, ICML 2020).
+            curriculum's change. anneal: fractions of the budget at which the weights start and stop changing.
+        max_filter_rate: intended upper limit of the filter rate in training, exploration included; if None, no limit.
+            Once the weights have started to change, a filter rate above `max_filter_rate` raises the weight of the
+            filter penalty. A filter rate below `max_filter_rate` lowers the penalty weight, but not below the
+            curriculum's weight. With a fixed penalty, the filter rate is 1 to 6 %, depending on the seed
+            (benchmarks/results/minutes.md). Integral control of the filter rate adapts the logarithm of the penalty
+            weight, as for a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.

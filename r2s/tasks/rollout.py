@@ -63,9 +63,9 @@ def rollout(
 ) -> Episodes:
     """Run one episode for each goal, and return the `Episodes`.
 
-    A stop ends an episode, and so does a contact of the arm with itself or the table (r2s/physics/collision.py)
-    that `task.may_touch` does not allow. `rollout` checks contacts after every control step. An episode that ended
-    early repeats its last state, and its distance in the last step is infinite.
+    An episode ends early if the arm stops, or if it touches itself or the table (r2s/physics/collision.py) and
+    `task.may_touch` does not allow this contact. `rollout` checks contacts after every control step. The record of an
+    episode that ended early repeats the last state; the last distance is infinite.
 
     Args:
         policy: maps observations to actions. arms: simulated or real arms. task: the task with its controller.
@@ -146,11 +146,11 @@ def _run(
             )
             then = replace(state, t=t, q=q, dq=arms.speeds[:, k], ee=ee, tau=tau)
             out.reward_smooth[now, k] = task.judge(then, rate[:, k], goals, scale)[1] @ weights
-    out.distance[now, -1][stopped] = np.inf  # success requires an arm that still runs
+    out.distance[now, -1][stopped] = np.inf  # an arm that stopped cannot succeed
 
 
 def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
-    """Return the state with q, dq, ee and tau from `last` in the arms whose episode is `over` (m,) bool."""
+    """Return the state; arms whose episode has ended (`over`, (m,) bool) have q, dq, ee and tau from `last`."""
     names, here = ("q", "dq", "ee", "tau"), over[:, None]
     kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
     return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
@@ -162,11 +162,11 @@ def measures(episodes: Episodes) -> dict[str, float]:
     success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
     of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth:
     return_paper computed from speeds without noise, because noise causes false accelerations in eq. (2).
-    time_to_reach_s: median time after which the end effector stays within 2 cm, over the episodes that end within
-    2 cm. overshoot_m: mean over episodes of the largest distance beyond 2 cm after the first time within 2 cm. rest:
-    share of episodes in which every joint is slower than REST throughout the last 0.5 s; joints can move although the
-    end effector is at rest. q_left_rad: 5 % quantile over episodes of the smallest distance of a joint from its
-    position limits. limited: mean filter rate. collision: share of episodes that a contact ended.
+    time_to_reach_s: time after which the end effector stays within 2 cm, median over the episodes that end within 2
+    cm. overshoot_m: largest distance minus 2 cm after the end effector has first come within 2 cm, mean over
+    episodes. rest: share of episodes in which every joint is slower than REST throughout the last 0.5 s; joints can
+    move although the end effector is at rest. q_left_rad: smallest distance of a joint from its position limits, 5 %
+    quantile over episodes. limited: mean filter rate. collision: share of episodes that a contact ended.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)

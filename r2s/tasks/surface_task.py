@@ -1,7 +1,7 @@
 """Base class of tasks on a surface: nominal plane, approach, force estimate, and functions for reward terms.
 
-The task contains the nominal plane, not the true one: the surface's true plane, stiffness and friction are part of
-the dynamics (`dr=contact`, `arm.surface`). The policy observes a force estimate from q, dq and the commanded torque.
+The task contains only the nominal plane. The true plane, stiffness and friction of the surface are part of the
+dynamics (`dr=contact`, `arm.surface`). The policy observes a force estimate from q, dq and the commanded torque.
 Neither observation nor controller uses the true force.
 """
 
@@ -27,14 +27,14 @@ from r2s.tasks.tip_task import TipTask
 POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8, 9  # columns of a goal
 LAG_M = 0.01  # m, lag of the tip behind its target, from damping at approach_speed and a friction error of 2 N
 # Force that an action of 1 adds under the default controller, divided by the largest force: 2 N of 20 N. On the model
-# of elastic twin 0, policies wipe as well with 1 N, and worse than the controller alone with 5 N
+# of elastic twin 0, policies wipe equally well with 1 N; with 5 N, they wipe worse than the controller alone
 RESIDUAL = 0.1
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
-# 1/rad, see `cartesian_impedance`; low, because with stuck joints a null-space torque pushes the tip. On models of
-# twins 0 and 1 the reference controller's force errors are similar from 0.02 to 0.05, and up to twice that at 0.2
+# 1/rad, see `cartesian_impedance`; low, because a null-space torque pushes the tip if joints stick. On models of
+# twins 0 and 1, the reference controller has similar force errors from 0.02 to 0.05, and up to twice as large at 0.2
 NULL_STIFFNESS = 0.05
-REGULAR = 1e-3  # m^2/rad^2, regularizes the force estimate to 0 in directions in which no joint moves the tip
-EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: middle of conf/dr/contact.yaml
+REGULAR = 1e-3  # m^2/rad^2, regularization: the force estimate is 0 in directions in which no joint moves the tip
+EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: mid-range of conf/dr/contact.yaml
 POSTURES = 12  # approximate number of points per path for which r2s checks the reach
 
 
@@ -83,7 +83,7 @@ class SurfaceTask(TipTask):
     parameters: np.ndarray | None = field(default=None, repr=False)
     own: Impedance | None = field(default=None, repr=False)
     touches = True
-    approaches: ClassVar[int] = 1  # APPROACH of the control law under `control=hybrid`
+    approaches: ClassVar[int] = 1  # parameter APPROACH of the law `control=hybrid` (impedance.py)
     target_size: ClassVar[int] = 6
 
     def __post_init__(self):
@@ -140,7 +140,7 @@ class SurfaceTask(TipTask):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with limits of force and speed at the nominal plane that allow the requested forces."""
+        """Return the task with limits of force and speed at the nominal plane; they allow the requested forces."""
         limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1], self.stop)
         if limit is not None:
             limit = replace(limit, place=self.place, tilt=float(np.radians(self.tilt)))
@@ -216,7 +216,7 @@ class SurfaceTask(TipTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Compute from `path` (k, 3) m the numbers that follow the start posture in a goal; by default none."""
+        """Return the numbers after the start posture in a goal, computed from `path` (k, 3) m; by default none."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -224,13 +224,13 @@ class SurfaceTask(TipTask):
         return goals[:, POINT]
 
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, the depth of the target of the tip's center below the nominal plane at the times t (m,) s.
+        """Return (m,) m, how deep the target of the tip's center is below the nominal plane at the times t (m,) s.
 
-        The depth grows at `approach_speed` until the tip touches the lowest plane, then at `force_rate` / `spring`
-        m/s.
+        The depth grows at `approach_speed` until the tip touches even the lowest allowed surface, then at
+        `force_rate` / `spring` m/s.
         """
         height, K = goals[:, HEIGHT], self.spring
-        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` refers to the tip's center
+        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` is that of the tip's center
         slow, late = self.approach_speed * t - height, (t - self.down_s).clip(0.0)
         return np.minimum(
             slow.clip(None, touched) + self.force_rate / K * late, touched + goals[:, FORCES].max(1) / K
@@ -243,7 +243,7 @@ class SurfaceTask(TipTask):
 
     @property
     def spring(self) -> float:
-        """Stiffness, N/m, of the spring in `controller`; if `controller` has no spring, in the default controller."""
+        """Stiffness, N/m, of the spring in `controller`, or in the default controller if `controller` has none."""
         for control in (self.controller, self.own):
             if isinstance(control, Impedance) and control.parameters[K_DEFAULT] > 0:
                 return float(control.parameters[K_DEFAULT])

@@ -21,7 +21,7 @@ from r2s.tasks.rewards import TERMS
 
 # the score penalizes only filter rates above this value; lower rates do not make policies better
 MAX_FILTER_RATE = 0.04
-TORQUE_STD = 0.3  # standard deviation, divided by the torque limit, that normalizes an observed torque
+TORQUE_STD = 0.3  # scale of observed torques, as a share of the torque limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class State:
 
     @staticmethod
     def at_home(robot: Robot) -> "State":
-        """Return the state of an arm at rest in the home posture, with zero ee and Jacobian, for compilation."""
+        """Return the state of an arm at rest in the home posture, with zero ee and Jacobian, to compile functions."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
         none = np.zeros(1, dtype=bool), np.zeros(1)
         return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
@@ -102,7 +102,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class ObservationTerm:
-    """One term of an observation, described so that a program without r2s can compute it.
+    """Description of one observation term, from which a program without r2s can compute the term.
 
     Attributes:
         name: name of the term. unit: SI unit of the term, "1" if dimensionless.
@@ -131,10 +131,11 @@ class Task(Protocol):
         reward_terms: names of the reward terms. paper_weights: (k,), weights of the reward terms in
             `Episodes.reward`.
         pool: number of different goals in a training.
-        speed_noise: rad/s; in a training, each arm's speed noise has at least a random standard deviation ~ U(0,
-            speed_noise); if None or 0, there is no lower bound.
+        speed_noise: rad/s. In training, the standard deviation of each arm's speed noise is at least a random value ~
+            U(0, speed_noise). If None or 0, there is no lower bound.
         measure_table: the measures that `measures` returns, with their presentation (r2s/tasks/measures.py).
-        may_touch: pairs of bodies that may touch: two names, or a name and "table"; other contacts end an episode.
+        may_touch: pairs of bodies that may touch each other: two names, or a name and "table". Other contacts end an
+            episode.
         touches: whether the tool touches a surface; simulated arms then need `Dynamics.surface`.
         moves_box: whether the surface is a box that the tool pushes; arms must then perceive the box (`State.box`).
         push_limit: limit of the force and the speed of contacts, or None without a limit.
@@ -184,7 +185,7 @@ class Task(Protocol):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "Task":
-        """Return the task with limits of contact force N and contact speed m/s; friction: (n,) Nm, of the joints."""
+        """Return the task with limits of contact force N and contact speed m/s; friction: (n,) Nm, joint friction."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -252,7 +253,7 @@ class Task(Protocol):
 
 
 def observe(task: Task, controller: Controller, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
+    """Return the policy's observations (m, d) float32: terms of the task, then terms of the controller.
 
     Args:
         task, controller: the task and its controller. goals: (m, ...). state: state to which `observe` adds

@@ -27,13 +27,13 @@ class TipTask(BaseTask):
     own: Impedance | None
 
     def as_reach(self) -> ReachTask:
-        """Return a reach task with this task's timing, torque limit and noise; raise UserError if one is wrong."""
+        """Return a reach task with this task's timing, torque limit and noise; raise UserError for invalid values."""
         return ReachTask(
             self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
         )
 
     def noise_for(self, dynamics: Dynamics) -> float:
-        """Return `speed_noise`, rad/s, or the default for an arm with these dynamics if `speed_noise` is None."""
+        """Return `speed_noise`, rad/s; if None, return the default for an arm with these dynamics."""
         if self.speed_noise is not None:
             return self.speed_noise
         return SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0

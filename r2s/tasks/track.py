@@ -95,7 +95,7 @@ class TrackTask(BaseTask):
         if not isinstance(self.ctrl_hz, int) or not 50 <= self.ctrl_hz <= 200 or cycles % self.ctrl_hz:
             raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; 50, 100, 125 and 200 are")
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
-        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # plans are stored in full
+        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # 60 s: r2s stores whole plans
         check_number("task.boost", self.boost, "(0, inf)")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.pool", self.pool, "[1, inf)", whole=True)
@@ -169,7 +169,7 @@ class TrackTask(BaseTask):
         """Return plans (count, steps + 1 + preview, 6 + 3 n) of random paths that the arm can follow.
 
         Raises:
-            UserError: hardly any path is within the arm's reach and limits and free of collisions.
+            UserError: hardly any random path is within the arm's reach and limits and free of collisions.
         """
         paths = self._paths(robot)
         space, inside = Space(robot, table=-np.inf, z_min=self.height, deviation=0.0), _Inside(robot, self._region)
@@ -202,7 +202,7 @@ class TrackTask(BaseTask):
     def plan(self, robot: Robot, start: Sequence[float], shape: Curve, pace: float) -> np.ndarray:
         """Return the plan (steps + 1 + preview, 6 + 3 n) of a custom curve.
 
-        This method does not check for contacts, or whether the curve resembles the paths of a training.
+        This method does not check for contacts. It does not check whether the curve resembles the training paths.
 
         Args:
             robot: the arm. start: (3,) m, first end-effector position. shape: function from the path parameter u (T,)
@@ -291,10 +291,10 @@ class TrackTask(BaseTask):
         """Return the measures of task track, one row of evaluations.csv.
 
         path_rmse_mm: RMS distance between end effector and reference over the steps of the paths without a stop.
-        path_max_mm: mean over paths without a stop of the largest distance on a path. within_x: share of steps with a
-        distance below x; steps of stopped paths never qualify. return_track: mean over paths of the reward's sum.
-        torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector, from cubic fits
-        over JERK_S. stopped: share of stopped paths. q_left_rad, limited, collision: see
+        path_max_mm: largest distance on a path, mean over the paths without a stop. within_x: share of steps with a
+        distance below x; steps of stopped paths are misses. return_track: sum of the reward over a path, mean over
+        paths. torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector, from cubic
+        fits over JERK_S. stopped: share of stopped paths. q_left_rad, limited, collision: see
         `r2s.tasks.rollout.measures`.
         """
         ended = ~np.isfinite(episodes.distance).all(1)

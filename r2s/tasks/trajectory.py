@@ -23,16 +23,16 @@ KINDS = ("fourier", "eight", "circle", "waypoints")
 SPACE = np.eye(3)
 GRID_M = 0.01  # m, step of u between two postures of the inverse kinematics
 HARMONICS = 3  # harmonics of a random Fourier curve
-LEADS = 60  # points from home to the start of a path, and repetitions of the start until the posture converges
+LEADS = 60  # points from home to the start of a path; then LEADS times the start, so that the posture converges
 OFF_M = 1e-4  # m, largest position error of a posture
-INSIDE = 0.05  # rad, least distance of a path from the position limits of the safety filter
-# Shares of the largest target torque, and of the filter's speed limit and acceleration bound, that a path may use;
-# the remaining share is for friction, feedback and errors of the nominal model.
+INSIDE = 0.05  # rad, smallest allowed distance of a path from the position limits of the safety filter
+# A path may use these shares of the largest target torque, and of the safety filter's limits of speed and
+# acceleration; the remaining share is for friction, feedback and errors of the nominal model.
 TORQUE, SPEED, ACCELERATION = 0.5, 0.9, 0.8
-SLOWEST = 0.02  # share of the requested pace; a path that must be slower is rejected
+SLOWEST = 0.02  # smallest share of the requested pace; `plan` rejects a path that must be slower
 CHECK_HZ = 50  # Hz, rate at which a path is checked against limits
 TRIES = 20  # largest number of paces tried for a path
-PEAK = 1.875  # peak over mean speed of a minimum-jerk motion
+PEAK = 1.875  # peak speed / mean speed of a minimum-jerk motion
 X, V = slice(0, 3), slice(3, 6)  # columns of a plan, followed by q, dq, ddq
 
 Curve = Callable[[np.ndarray], np.ndarray]
@@ -68,10 +68,10 @@ def curve(kind: str, rng: np.random.Generator, size: float, axes: np.ndarray = S
 
 
 def _waypoints(rng: np.random.Generator, size: float, axes: np.ndarray) -> Curve:
-    """Return a curve of minimum-jerk motions between random points of a ball, or of a disc."""
+    """Return a curve of minimum-jerk motions between random points of a ball, or of a disc for two axes."""
     points = [np.zeros(3)]
     length = 0.0
-    while length < 8.0:  # m of u, more than an episode can cover
+    while length < 8.0:  # m, length in u: more than an episode can cover
         direction = rng.standard_normal(len(axes)) @ axes
         point = size * rng.uniform(0.3, 1.0) * direction / np.linalg.norm(direction)
         if len(points) == 1 or np.linalg.norm(point - points[-1]) > 0.3 * size:
@@ -154,7 +154,7 @@ class Paths:
         return q(u[:, 0]), along * rate, q(u[:, 0], 2) * rate**2 + along * slope
 
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
-        """Return the largest ratio of torque to allowed torque, or of motion to allowed motion, on a path.
+        """Return the largest ratio of torque or motion to its allowed value on a path; a feasible path has at most 1.
 
         The nominal model predicts the path's torque. The safety filter requires -RATE (v + dq) <= ddq and
         ddq <= RATE (v - dq), where v is the speed limit in the posture q.
@@ -171,7 +171,7 @@ class Paths:
         return float(max(s.max() for s in shares))
 
     def plan(self, start: np.ndarray, shape: Curve, pace: float, t: np.ndarray) -> np.ndarray | None:
-        """Return the plan (T, 6 + 3 n) at t (T,) s, or None if infeasible; reduce `pace` m/s until `strain` <= 1.
+        """Reduce `pace` m/s until `strain` <= 1, and return the plan (T, 6 + 3 n) at t (T,) s; None if infeasible.
 
         The columns are position and velocity of the end effector, m, m/s, then q, dq, ddq. t may exceed `seconds`.
         """

@@ -23,7 +23,7 @@ from r2s.tasks.wipe_measures import GOOD_M, GOOD_N, WIPE, wipe_measures
 A = slice(6, 9)  # columns of the acceleration in a path, after position and velocity
 SLOW_V = 0.01  # m/s, tip speed at which the expected friction of the surface reaches its level
 FAR_M = 0.01  # m, tanh scale of the path error
-REST_S = 0.3  # s, pause between the full force and the path, and after the path
+REST_S = 0.3  # s, pause at full force before the path, and pause after the path
 STEADY = 0.25  # integral rate as a share of its stability limit: a gain margin of 12 dB
 
 
@@ -38,7 +38,7 @@ class WipeTask(SurfaceTask):
         speed: (low, high) m/s, range of random peak speeds. size: (low, high) m, range of random path radii. kinds:
             curves from KINDS, equally probable. ramp_s: s, duration of acceleration and of deceleration on a path.
         friction: expected friction coefficient of the surface. Other attributes: see `SurfaceTask`.
-        inertia: (3, 3) kg, effective mass of the tip at the nominal plane.
+        inertia: (3, 3) kg, effective mass matrix of the tip at the nominal plane.
     """
 
     episode_s: float = 8.0
@@ -73,7 +73,7 @@ class WipeTask(SurfaceTask):
 
     @property
     def begin_s(self) -> float:
-        """Time, s, at which the path starts, when the tip presses with full force even on the lowest surface."""
+        """Start time, s, of the path: the tip then presses with full force even on the lowest allowed surface."""
         return self.down_s + self.force[1] / self.force_rate + REST_S
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
@@ -87,12 +87,12 @@ class WipeTask(SurfaceTask):
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """Stiffness K, N/m, and integral rate r, 1/s, of the default controller, from the tip's effective mass.
+        """Stiffness K, N/m, and integral rate r, 1/s, of the default controller, derived from the tip's inertia.
 
         To follow a path, the spring is as stiff as latency allows: K = m w^2, where m is the smallest effective mass
         and w the result of `fastest_spring`. With critical damping, the largest effective mass M has the
-        characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0, stable for r < r0 = 2 (K/M)^(1/2) (Routh,
-        Hurwitz). r = STEADY r0.
+        characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0. The loop is stable for r < r0 = 2
+        (K/M)^(1/2) (Routh, Hurwitz); r2s sets r = STEADY r0.
         """
         masses = np.linalg.eigvalsh(self.inertia)
         K = float(masses[0] * fastest_spring(self) ** 2)

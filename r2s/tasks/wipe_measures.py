@@ -40,11 +40,11 @@ WIPE = MeasureTable(
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
     """Return one row of evaluations.csv: measures of task wipe over the steps from `begin`, where the path starts.
 
-    within_2N, within_3mm: share of steps with a force error <= 2 N, and with a path error <= 3 mm. wiped: share of
-    steps within 2 N and 3 mm. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes never
-    qualify. success: share of episodes with `wiped` >= SUCCESS. For episodes without a stop: force_rmse_N and
-    path_rmse_mm are RMS errors; impact_N is the mean over episodes of the peak force within IMPACT_S of the first
-    touch, which may precede `begin`.
+    within_2N: share of steps with a force error <= 2 N. within_3mm: share of steps with a path error <= 3 mm. wiped:
+    share of steps within 2 N and 3 mm. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes
+    are misses. success: share of episodes with `wiped` >= SUCCESS. The following exclude stopped episodes.
+    force_rmse_N, path_rmse_mm: RMS errors. impact_N: peak force within IMPACT_S of the first touch, which may precede
+    `begin`; mean over episodes.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = ~ended[:, None]

@@ -1,4 +1,4 @@
-"""Set the external torque and force at which a Franka arm stops itself (libfranka's setCollisionBehavior)."""
+"""Compute the external torque and force at which a Franka arm stops itself (libfranka's setCollisionBehavior)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +14,8 @@ from r2s.tasks.surface_task import RESIDUAL, SurfaceTask
 from r2s.tasks.task import Task
 
 OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to this value, so that no reflex acts
-# Share of the cautious thresholds reserved for friction and model errors, which cause an external torque of up to
-# 3.7 Nm (threshold 20 Nm) in joints 1 to 4 of a Panda, and 2.2 Nm (threshold 12 Nm) in its wrist.
+# Share of the cautious thresholds reserved for the apparent external torque of friction and model errors.
+# On a Panda, it is up to 3.7 Nm in joints 1 to 4 (threshold 20 Nm), and up to 2.2 Nm in the wrist (threshold 12 Nm).
 ERROR = 0.2
 FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/contact.yaml
 
@@ -50,8 +50,8 @@ CAUTIOUS = CollisionThresholds()
 def thresholds_for(robot: Robot, task: Task | None) -> CollisionThresholds:
     """Return collision thresholds above every contact force that a task expects; without a task, CAUTIOUS.
 
-    Without safety.force_max, a task on a surface pushes with at most the requested force, the force that an action
-    adds, and twice the force that joint friction may hide, and meets the surface at its approach speed.
+    Without safety.force_max, the largest expected push is the sum of the requested force, the force that an action
+    may add, and twice the force that joint friction may hide. The tip meets the surface at the task's approach speed.
 
     Raises:
         UserError: as `thresholds_of`.
@@ -73,7 +73,7 @@ def thresholds_of(robot: Robot, limit: PushLimit | None, cause: str | None = Non
     FRICTION * F. The thresholds are the resulting torques and forces plus ERROR * CAUTIOUS for model errors, but at
     least CAUTIOUS.
 
-    cause: subject of the error message; if None, the settings of the push limit.
+    cause: setting that the error message names; if None, safety.force_max.
 
     Raises:
         UserError: the push limit needs thresholds so high that they would switch the reflexes off, or the robot does

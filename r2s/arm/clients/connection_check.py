@@ -13,13 +13,14 @@ from r2s.physics.payload import LoadTorque, Payload, ee_pose
 from r2s.physics.rigid_body import nominal_torque
 from r2s.physics.robot import Robot
 
-# At one q, the poses of arm and model differ only by single precision (1e-7 m) and rounded numbers in robot files
-PLACE_M, ANGLE_DEG = 1e-3, 0.2  # a tenth of the accuracy of a policy; 0.2 deg are 1 mm at 0.3 m
+# At equal joint angles, poses of arm and model differ only by rounding (single precision, 1e-7 m, and robot files)
+PLACE_M, ANGLE_DEG = 1e-3, 0.2  # a tenth of a policy's position error; 0.2 deg turn a point at 0.3 m by 1 mm
 LOAD_KG = 0.01  # 0.08 Nm at full reach: less than the friction of any joint, so the arm does not sink
 GRAVITY = 0.1  # m/s^2: 0.6 deg of tilt, 1 % of gravity compensation
-# Without O_ddP_O, r2s compares gravity torques. Link models differ, so only tilts above 5 to 12 deg are detected
+# Without the arm's gravity vector O_ddP_O, r2s compares gravity torques.
+# Link models differ, so the comparison detects only tilts above 5 to 12 deg.
 GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # allowed error: a share of the posture's largest gravity torque, plus 1 Nm
-BEYOND = 0.1  # rad, how far a person may guide a joint beyond its limit
+BEYOND = 0.1  # rad, accepted distance of a joint beyond its limit: a person may have guided it there
 
 
 def check_joints(robot: Robot) -> None:
@@ -83,7 +84,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Connection:
-    """Properties that an arm must have before a client moves this arm.
+    """Properties that an arm must have before a client may move it.
 
     Attributes:
         arm: type of the arm. declared: payload plus end effector that the arm's gravity compensation should assume.
@@ -182,7 +183,7 @@ def _end_effector(robot: Robot, s: Any) -> Finding:
     arm, tool = (np.array(x).reshape(4, 4).T for x in (s.O_T_EE, s.F_T_EE))  # by columns
     place, rotation = data.site_xpos[site], data.site_xmat[site].reshape(3, 3)
     apart = float(np.linalg.norm(place - arm[:3, 3]))
-    relative = rotation.T @ arm[:3, :3]  # rotates by the angle whose sine and cosine are:
+    relative = rotation.T @ arm[:3, :3]  # the next line computes sine and cosine of its angle
     sine, cosine = np.linalg.norm(relative - relative.T) / np.sqrt(8), (np.trace(relative) - 1) / 2
     turned = float(np.degrees(np.arctan2(sine, cosine)))
     found = f"{_row(arm[:3, 3], 4)} m (O_T_EE, with F_T_EE at {_row(tool[:3, 3], 4)} m)"

@@ -1,7 +1,7 @@
 """The wire format of the Franka Control Interface (FCI), limited to what torque control needs.
 
 A client connects to TCP port 1337 and sends its FCI version and its UDP port. The robot then sends one RobotState
-per millisecond by UDP and, in a motion, expects a RobotCommand for each state. r2s implements FCI version 5
+per millisecond by UDP and, in a motion, expects a RobotCommand for each state. This module contains FCI version 5
 (libfranka 0.9, Panda or FER) and version 10 (libfranka 0.18 or later, FR3). All structs are packed and little-endian.
 
 Source: the public headers of libfranka-common (service_types.h, rbk_types.h), checked with panda-python, pylibfranka.
@@ -13,7 +13,7 @@ PORT = 1337  # fixed in libfranka: several robots need several addresses
 VERSIONS = (5, 10)
 HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
 CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
-MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # allowed deviations follow, unused
+MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # without the allowed deviations
 COLLISION = np.dtype(  # our clients use equal thresholds with and without acceleration
     [
         ("torque_acceleration", "<f8", (2, 7)),
@@ -25,7 +25,7 @@ COLLISION = np.dtype(  # our clients use equal thresholds with and without accel
     ]
 )
 LOAD = np.dtype([("m_load", "<f8"), ("F_x_Cload", "<f8", 3), ("I_load", "<f8", 9)])
-SETTINGS = {  # requests that change the state, with their payload; the emulator ignores other settings
+SETTINGS = {  # requests that change the RobotState, with the type of their data; the emulator ignores others
     "SetCollisionBehavior": COLLISION,
     "SetLoad": LOAD,
     "SetEEToK": np.dtype([("EE_T_K", "<f8", 16)]),
@@ -55,7 +55,8 @@ MOVE_STATUS = {
 DONE, NOT_POSSIBLE, EMERGENCY = 0, 1, 5  # status of all other requests; NOT_POSSIBLE also means a wrong version
 
 
-# codes of torque control in a Move request and in a motion's RobotState; libfranka 0.9 has no generator "none"
+# codes of torque control in a Move request and in a motion's RobotState
+# FCI version 5 has no motion generator "none", so libfranka 0.9 requests the generator of joint velocities
 EXTERNAL_CONTROLLER = 2
 GENERATOR_REQUESTED = {5: 1, 10: 4}
 GENERATOR_RUNNING = {5: 2, 10: 5}

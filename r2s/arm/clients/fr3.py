@@ -14,7 +14,8 @@ from r2s.arm.clients.libfranka import Client
 from r2s.arm.clients.panda import Panda
 from r2s.physics.robot import Robot
 
-STOP_DISTANCE = 0.02  # rad, braking distance of a joint from 0.2 rad/s; at `margin` an FR3 allows 0.16 to 0.48 rad/s
+# rad, braking distance of a joint from 0.2 rad/s; at the limits of `within_fr3`, an FR3 allows 0.16 to 0.48 rad/s
+STOP_DISTANCE = 0.02
 
 
 def within_fr3(robot: Robot) -> Robot:
@@ -68,7 +69,7 @@ class _FR3Client(Client):
         self._control, self._last = self._robot.start_torque_control(), [0.0] * 7
         while True:
             state, _ = self._control.readOnce()
-            # the arm may ignore commands until its success rate is above 0; keep the caller's first command
+            # the arm may ignore commands until its success rate is above 0, so send zero torque until then
             if state.control_command_success_rate > 0:
                 return state
             self._control.writeOnce(self._package.Torques(self._last))
@@ -79,7 +80,7 @@ class _FR3Client(Client):
         return self._control.readOnce()[0]
 
     def _finish(self) -> None:
-        torques = self._package.Torques(self._last)  # a step to zero could trigger a reflex
+        torques = self._package.Torques(self._last)  # not zero: a step to zero could trigger a reflex
         torques.motion_finished = True
         self._control.writeOnce(torques)
 

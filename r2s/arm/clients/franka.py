@@ -1,8 +1,8 @@
 """Implement the `Arm` protocol through libfranka, as the base class of Panda and FR3.
 
-libfranka has no point-to-point motion in torque control. `move_to` follows a slow, checked joint path with the
-recorder's tracking controller, in the 1 kHz torque loop that all motions use. `move_to` needs no robot model from
-libfranka, and the same code moves the hardware and, in tests, an emulated arm.
+libfranka has no point-to-point motion in torque control. Therefore, `move_to` follows a slow, checked joint path with
+the recorder's tracking controller, in the same 1 kHz torque loop as all other motions. `move_to` needs no robot model
+from libfranka, and the same code moves the hardware and, in tests, an emulated arm.
 """
 
 import weakref
@@ -36,13 +36,13 @@ from r2s.recordings.recording import SIGNALS
 SPEED = 0.2  # share of dq_max
 ACCELERATION = 0.2  # share of ddq_max
 TORQUE_SHARE = 0.2  # share of tau_max that the driver allows
-MAX_DEVIATION = 0.1  # rad, largest deviation from the path, smaller near obstacles; beyond it, `move_to` ends
+MAX_DEVIATION = 0.1  # rad; `move_to` ends at a larger deviation from its path; smaller near obstacles
 SETTLE_S = 3.0  # s, longest time to settle at the end of the path
 INTEGRAL_GAIN = 15.0  # share of tau_max per rad s; overcomes breakaway torque at the end of the path
 INTEGRAL_SHARE = 0.15  # share of tau_max, limit of the integral's torque
-ARRIVED = 2e-3  # rad from the target: the motion ends
-ACCEPTED = 1e-2  # rad from the target after SETTLE_S: accepted, because friction may hold a real wrist there
-# share of tau_max that the driver allows in `stop`: the largest `hold` of a load, and the damping torque on top of it
+ARRIVED = 2e-3  # rad, distance from the target at which the motion ends
+ACCEPTED = 1e-2  # rad, accepted distance from the target after SETTLE_S: friction may hold a real wrist there
+# share of tau_max that the driver allows in `stop`: the largest `hold` of a load plus the damping torque
 STOP_SHARE = ADDED + REST_SHARE
 MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
 
@@ -53,9 +53,9 @@ class Franka:
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked: see `Operated`. Every stop sets `blocked`, for example a reflex, the stop button (even if a
-            person has released it), a stop by the driver, a rejected command or a `move_to` that failed in motion.
-            Only a successful call of `stop` does not set `blocked`. hold: see `Holds`.
+        operator, blocked, hold: see `Operated` and `Holds`. Every stop sets `blocked`, except a successful call of
+            `stop`. Examples: a reflex, the stop button (even after its release), a stop by the driver, a rejected
+            command, and a `move_to` that failed in motion.
         findings: results of comparing the arm with `connection`.
         realtime: whether motions run in a `realtime_section`. In real time, r2s rejects recordings and episodes in
             which less than 99 % of the commands arrive in time.
@@ -64,7 +64,8 @@ class Franka:
         robot: limits and nominal model.
         client: connection to the arm through libfranka.
         operator: function that receives a stop's reason and returns whether the arm may move again. Without an
-            operator (None), `move_to` raises NotCleared after a stop until a new connection finds the arm ready.
+            operator (None), `move_to` raises NotCleared after a stop; only a new connection to a ready arm can move
+            the arm again.
         collision: external torque and force at which the arm stops itself.
         connection: properties that the arm must have; if None, r2s does not check the arm.
         speed_share: factor on all allowed speeds in every motion.
@@ -295,8 +296,8 @@ class Franka:
                 if (reason := controller.deviation(k, s)) is not None:
                     loop.halt(reason)
                 if k >= moving:
-                    # Clegg integrator (1958): it resets when the error changes sign. Otherwise the torque that
-                    # overcame a joint's breakaway torque would carry the joint past its target
+                    # Clegg integrator (1958): the integral resets when the error changes sign.
+                    # Otherwise, the torque that broke a joint away would carry the joint past its target.
                     integral = np.clip(integral + INTEGRAL_GAIN * SIM_DT * self.robot.tau_max * error, -limit, limit)
                     integral = np.where(error * last_error < 0, 0, integral)
                     last_error = error

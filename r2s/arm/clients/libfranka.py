@@ -18,7 +18,7 @@ CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in 
 
 
 class Client:
-    """Base class of the clients that use panda-python or pylibfranka; their RobotStates have the same attributes.
+    """Base class of clients that use panda-python or pylibfranka; both libraries' RobotStates have equal attributes.
 
     If libfranka reports an error, the called method raises ArmStopped with libfranka's message.
 

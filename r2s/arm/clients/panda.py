@@ -1,8 +1,8 @@
 """Connect to a Panda (FER) through panda-python (libfranka 0.9): hardware, or the emulator in FCI version 5.
 
-libfranka calls a callback once per millisecond, but r2s calls the methods of an `Arm`. Therefore, libfranka's loop
-runs in a thread. The callback passes each state to r2s and waits for a command. r2s switches libfranka's rate limiter
-and low-pass off, so the arm receives unchanged commands.
+libfranka's control loop calls a callback once per millisecond, but r2s itself calls `Arm.command`. libfranka's loop
+therefore runs in a separate thread: its callback passes each state to r2s and waits for a command. r2s switches
+libfranka's rate limiter and low-pass off, so the arm receives unchanged commands.
 """
 
 import threading
@@ -98,7 +98,7 @@ class _Motion:
         self._states.put(end)
 
     def _callback(self, state: Any, _: Any) -> Any:
-        # the arm may ignore commands until its success rate is above 0; the caller's first command must not get lost
+        # the arm may ignore commands until its success rate is above 0, so send zero torque until then
         self._started = self._started or state.control_command_success_rate > 0
         if not self._started:
             return self._libfranka.Torques(self._last)

@@ -23,7 +23,7 @@ HOLD = 5e3, 100.0  # Nm/rad, Nm s/rad, of the fault 'hold': stiffer than a perso
 CUTOFF_HZ = 15.0  # low-pass of the external torque; our choice, Franka does not publish it
 FRAMES = ("F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE")
 DESK = ("F_T_EE", "m_ee", "F_x_Cee", "m_load", "F_x_Cload", "O_ddP_O")  # what an operator sets in Franka's Desk
-INSIDE = 0.02  # rad inside a position limit, where recovery places a joint that is beyond the limit
+INSIDE = 0.02  # rad; recovery moves a joint that is beyond a position limit this far inside the limit
 _ERRORS = (  # parts of the messages of `Reflexes`, and libfranka's index of the same error
     ("steps", fci.TORQUE_DISCONTINUITY),
     ("torque", fci.TORQUE_RANGE),
@@ -201,7 +201,7 @@ class Control:
             for name in settings.dtype.names or ():
                 self.state[name] = settings[name]
             f = {name: self.state[name].reshape(4, 4) for name in FRAMES}
-            self.state["F_T_EE"] = (f["NE_T_EE"] @ f["F_T_NE"]).ravel()  # stored by columns, hence in this order
+            self.state["F_T_EE"] = (f["NE_T_EE"] @ f["F_T_NE"]).ravel()  # column-major: factors in reverse order
         self._feel(1.0)
         self._sense()
 
@@ -275,7 +275,7 @@ class Control:
         self._external = s["tau_ext_hat_filtered"] = self._external + gain * (raw - self._external)
         force = np.zeros(6)
         if self._external.any():
-            at_k = s["EE_T_K"].reshape(4, 4) @ s["F_T_EE"].reshape(4, 4)  # stored by columns, hence this order
+            at_k = s["EE_T_K"].reshape(4, 4) @ s["F_T_EE"].reshape(4, 4)  # column-major: factors in reverse order
             force = self._model.wrench(arm.q, at_k.T, self._external)
             rotation = self._model.pose(arm.q, at_k.T)[:3, :3]
             s["K_F_ext_hat_K"] = np.concatenate([rotation.T @ force[:3], rotation.T @ force[3:]])

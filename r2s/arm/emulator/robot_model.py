@@ -12,7 +12,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import LoadTorque, ee_pose
 from r2s.physics.robot import Robot
 
-SINGULAR = 0.03  # least singular value of the Jacobian (rows in m and 1); our choice. 0.22 at Franka's ready pose
+SINGULAR = 0.03  # least singular value of a regular pose's Jacobian (rows in m and 1); our choice; ready pose: 0.22
 
 
 def urdf(robot: Robot) -> str:

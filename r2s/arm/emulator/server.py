@@ -17,7 +17,7 @@ from r2s.physics.robot import SIM_DT
 LOOPBACK = "127.0.0"
 IDLE_MS = 20  # ms between states of an idle arm in lock-step; clients do not need 1 kHz at rest
 ANSWER_S = 0.9 * SIM_DT  # s, least time between two states in real time; our choice, a real box allows 1 ms
-BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's first answer; clients time out at 1 s
+BACKOFF_S = (1e-3, 0.4)  # s, time between states before the first answer, doubles in this range; client timeout: 1 s
 
 
 class Server:
@@ -121,7 +121,7 @@ class Server:
         elif name == "GetRobotModel":
             self._reply(name, number, fci.DONE, self._urdf)
         elif name in ("LoadModelLibrary", "GetCartesianLimit") or self._control.running:
-            self._reply(name, number, fci.NOT_POSSIBLE)  # the model library is machine code
+            self._reply(name, number, fci.NOT_POSSIBLE)  # the emulator has no model library
         else:
             if name in fci.SETTINGS:  # the emulator ignores impedances
                 self._control.set(name, np.frombuffer(payload, fci.SETTINGS[name], 1)[0].copy())
@@ -184,7 +184,7 @@ class Server:
                     self._send()
                 elif not self._realtime:
                     self._cycle(command["tau_J_d"].copy())
-                elif not self._ahead:  # at once, as a real box computes in parallel with the client
+                elif not self._ahead:  # at once, like a real box, which computes in parallel with the client
                     self._control.cycle(command["tau_J_d"].copy())
                     self._ahead = True
 

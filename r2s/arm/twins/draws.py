@@ -16,7 +16,7 @@ def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
     small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # scale for joints weaker than a Panda's wrist
     masses = model.body_mass[bodies] * rng.uniform(0.98, 1.02, n)  # U(0.98, 1.02) of the nominal mass
     coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
-    scale = rng.uniform(0.73, 1.37, n)  # the range of the paper's NEW / OLD; a scaled tensor stays physical
+    scale = rng.uniform(0.73, 1.37, n)  # range of the ratios NEW / OLD in the paper; a scaled tensor stays physical
     return masses, coms, robot.inertia * scale[:, None, None]
 
 
@@ -36,7 +36,7 @@ def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
-    """Draw rows (8, n) of torque offset, Nm, 4 arguments of `drag`, and standard deviations of noise on q, dq, tau_J.
+    """Draw an array (8, n): torque offset, Nm; 4 arguments of `drag`; standard deviations of noise on q, dq, tau_J.
 
     Args:
         robot: the arm. rng: random number generator. hold: (n,) Nm, lower bound of each joint's stiction.

@@ -1,19 +1,20 @@
 """Simulate a 1 ms cycle of the elastic twin (compiled): elastic gears, and friction that decreases with heat.
 
-A joint has the motor angle theta and velocity w, scaled to the joint's side of the gear, and the link's q and v:
+A joint has the motor angle theta and velocity w, scaled to the joint's side of the gear, and the link angle q and
+velocity v:
     rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v + J'F
     s = K (theta - q) + D (w - v)
     f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c has a value per direction
 s is the gear torque, and F the contact force of a surface (r2s/physics/contact.py). The drive's torque loop damps the
 gear by L (w - v). A resting motor stays at rest while the net torque on it is below the breakaway torque f(w = 0).
-warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus three sines of theta, whose periods are one joint
-revolution, one motor revolution and half a motor revolution (the two lobes of a strain wave gear).
+The factor warm is 1 - fall (1 - exp(-heat / 0.6)). The factor ripple is 1 plus three sines of theta, whose periods
+are one joint revolution, one motor revolution and half a motor revolution (the two lobes of a strain wave gear).
 
 A step follows position Verlet: positions advance by half a step, velocities by a whole step with the forces at
-mid-step, then positions by the other half. A first pass predicts the velocities at mid-step; a second pass computes
-the velocity-dependent forces at the predicted velocities. A motor whose velocity reaches zero within a step stays at
-rest or reverses, as in r2s/physics/stick_slip.py. Motors act on each other only through their gears, so each motor is
-solved separately.
+mid-step, then positions by the other half of the step. A first pass predicts the velocities at mid-step; a second
+pass computes the velocity-dependent forces at the predicted velocities. A motor whose velocity reaches zero within a
+step stays at rest or reverses, as in r2s/physics/stick_slip.py. Motors act on each other only through their gears, so
+the step solves for each motor's velocity separately.
 """
 
 import numpy as np
@@ -26,18 +27,18 @@ from r2s.physics.linear_algebra import factor, solve
 from r2s.physics.newton_euler import WORK, equations
 from r2s.physics.robot import SIM_DT
 
-# Rows of the parameters (ROWS, n) ...
+# Rows of the joint parameters (ROWS, n)
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, SHAPE, VISCOUS, POWER, RATIO = range(9)
-RIPPLE, PHASE = 9, 12  # three rows each: joint, motor and half motor revolution
+RIPPLE, PHASE = 9, 12  # three rows each: per joint revolution, motor revolution and half motor revolution
 FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: friction power, W, at which heat settles at 1
 HELP, HELP_VISCOUS, HELP_WIDTH = range(18, 21)  # the arm's own friction compensation: Nm, Nm s/rad, rad/s
 ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
 OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
-# ... of the state (STATES, n); *_AT: at the time of measurement; ADDED: Nm, torque that the arm adds to a command
+# Rows of the joint states (STATES, n); *_AT: at the time of measurement; ADDED: Nm, added to a command by the arm
 LINK_Q, LINK_V, THETA, W, MOTOR, HEAT, Q_MEASURED, DQ_MEASURED, TAU_MEASURED, THETA_AT, W_AT, S_AT, ADDED, STATES = (
     range(14)
 )
-# ... and of the forces within a step (FORCES, n), with the velocities at mid-step
+# Rows of the forces within a step (FORCES, n), and of the velocities at mid-step
 F_DRIVE, F_FACTOR, F_SPRING, F_LINK_V, F_W, F_POWER, F_TOUCH, FORCES = range(8)
 HALF_WARM = 0.6  # heat scale of the friction decrease; steady motion at a quarter of the speed limit has heat 1
 

@@ -6,9 +6,9 @@ compensates part of the friction, has a clock that jitters, and occasionally los
 between joints. Links, offsets, cable drag, noise and quantization are as in the rigid variant. The seed determines
 the robot's parameters, which only the twin reads. Seeds 0-9 are for development, seeds >= 200 for evaluation.
 
-In each 1 ms cycle the control box adds gravity and friction compensation to the command. elastic_joints.py then
-integrates rotors and links in steps of at most 0.05 ms. The sensors measure the motors up to 0.5 ms before the end of
-the cycle.
+In each 1 ms cycle the control box adds gravity and friction compensation to the command. The code in
+elastic_joints.py then integrates rotors and links in steps of at most 0.05 ms. The sensors measure the motors up to
+0.5 ms before the end of the cycle.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 MIN_STEPS = 20  # per cycle; finer steps change an open-loop motion of 1 s by less than 1e-5 rad
 MAX_STEPS = 200
-PHASE_STEP = 0.1  # rad, largest phase change of the home posture's fastest oscillation in one step
+PHASE_STEP = 0.1  # rad, largest phase change per step of the fastest gear oscillation in the home posture
 SLOTS = 8  # number of stored commands, one per cycle
 WARM_SPEED = 0.25  # share of dq_max, speed at which heat settles at 1
 STATIC_ROUNDS = 50  # fixed-point iterations that find the posture in which the gears balance gravity
@@ -95,7 +95,7 @@ class ElasticTwin(TwinBase):
             s[ej.LINK_Q] = q - (self._gravity(self._links, s[ej.LINK_Q]) - pull) / p[ej.STIFF]
         s[ej.THETA_AT], s[ej.S_AT] = q, p[ej.STIFF] * (q - s[ej.LINK_Q])
         self._line[:] = 0
-        self._q, self._dq = s[ej.THETA], s[ej.W]  # views: the reflexes check the motors
+        self._q, self._dq = s[ej.THETA], s[ej.W]  # views of the motors' state, which the reflexes check
         self._sense()
 
     def _advance(self, tau: np.ndarray) -> None:
@@ -138,15 +138,15 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
     """
     n, model = robot.n, robot.model(gravity=False)
-    own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, without torque on the other joints
+    own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, while the other joints are free to move
     p = np.zeros((ej.ROWS, n))
     size = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
-    coulomb = 0.75 * size  # viscous friction adds to this value; the control box compensates about a quarter
+    coulomb = 0.75 * size  # viscous friction adds to this; the control box compensates about a quarter of both
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[ej.C_NEG] = coulomb - asymmetry + model.dof_frictionloss
     p[ej.C_POS] = coulomb + asymmetry + model.dof_frictionloss
-    p[ej.BREAK] = rng.uniform(1.1, 1.35, n)  # times the Coulomb level
-    p[ej.MU] = rng.uniform(0.01, 0.02, n)  # Nm per Nm of gear torque
+    p[ej.BREAK] = rng.uniform(1.1, 1.35, n)  # breakaway torque / Coulomb friction
+    p[ej.MU] = rng.uniform(0.01, 0.02, n)  # friction, Nm per Nm of gear torque
     p[ej.V_STRIBECK], p[ej.SHAPE] = rng.uniform(0.02, 0.08, n), rng.uniform(1.0, 1.6, n)
     p[ej.VISCOUS], p[ej.POWER] = 0.5 * size * rng.uniform(0.7, 1.3, n), rng.uniform(0.6, 0.9, n)
     p[ej.RATIO] = rng.choice([50.0, 80.0, 100.0, 120.0, 160.0], n)

@@ -14,11 +14,11 @@ from r2s.physics.contact_layout import GUESS
 from r2s.physics.linear_algebra import packed_element
 from r2s.physics.robot import SIM_DT
 
-# Rows of the parameters (ROWS, n) ...
+# Rows of the joint parameters (ROWS, n)
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, S0, S1, S2, OFFSET = range(9)
 DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE, COMPLIANCE = range(9, 18)
 DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; LAG, DQ_FILTER: gains per cycle of torque lag and speed filter
-# ... and of the state (STATES, n)
+# Rows of the joint states (STATES, n)
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED, TAU_MEASURED, BENT = range(12)
 Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, joint torque of the contact with a surface
 
@@ -62,9 +62,9 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
     """Apply a command; return passive torque (n,) Nm and implicit damping (n,) Nm s/rad for the engine's step.
 
     Gauss-Seidel iteration solves the coupled implicit equation mass (w - v) / h + bias + f(w) = drive for the next
-    velocity w; v is the present velocity, h the time step and f the friction. Each joint's equation has an exact
-    solution, because the bristle's backward Euler step z' = (z + h w) / (1 + k |w|), k = h s0 / g, makes the equation
-    quadratic in w, with one root of the right sign.
+    velocity w; v is the present velocity, h the time step and f the friction. With k = h s0 / g,
+    the bristle's backward Euler step z' = (z + h w) / (1 + k |w|) makes each joint's equation quadratic in w. One of
+    its two roots has the right sign, so each joint's solution is exact.
 
     Args:
         p: joint parameters. s: joint states. line: (slots, n) Nm, the last commands. cycle: index of this cycle.
@@ -87,7 +87,7 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
         s[LEVEL, i] = _stribeck(p, s[Z, i], v[i], compensation[i], i)
         limit = s[LEVEL, i] / p[S0, i]
         s[Z, i] = min(max(s[Z, i], -limit), limit)
-        damping[i] = p[S1, i] * np.exp(-((v[i] / DQ_BRISTLE) ** 2)) / h  # s1 / h until the end of this function
+        damping[i] = p[S1, i] * np.exp(-((v[i] / DQ_BRISTLE) ** 2)) / h  # s1 / h; replaced by the damping below
     if touch[2]:
         _solve_touch(p, s, damping, mass, touch[0], touch[1])
     else:

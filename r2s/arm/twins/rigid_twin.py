@@ -6,10 +6,10 @@ centers and inertia tensors of the links differ from the nominal values that gra
 determines the robot's parameters, which only the twin reads. Seeds 0-9 are for development, seeds of 100 and above
 for final evaluation.
 
-In each cycle, delay and lag act on the command first. lugre_joints.py then solves the next step implicitly for joint
-velocities, friction and contact force. DART integrates the step with the contact force and friction that
-lugre_joints.py has computed; the friction is linearized about the computed velocities. Finally the sensors measure
-the new state.
+In each cycle, delay and lag act on the command first. The code in lugre_joints.py then solves the next step
+implicitly for joint velocities, friction and contact force. DART integrates the step with the contact force and
+friction that lugre_joints.py has computed; the friction is linearized about the computed velocities. Finally the
+sensors measure the new state.
 """
 
 from typing import Any
@@ -121,8 +121,8 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     coulomb = 0.6 * level  # viscous friction supplies the remainder of the level
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[lj.C_NEG], p[lj.C_POS] = coulomb - asymmetry, coulomb + asymmetry
-    p[lj.BREAK] = rng.uniform(1.1, 1.5, n)  # times the Coulomb level
-    p[lj.MU] = rng.uniform(0.01, 0.02, n)  # Nm per Nm of joint load
+    p[lj.BREAK] = rng.uniform(1.1, 1.5, n)  # breakaway torque / Coulomb friction
+    p[lj.MU] = rng.uniform(0.01, 0.02, n)  # friction, Nm per Nm of joint load
     p[lj.V_STRIBECK] = rng.uniform(0.05, 0.15, n)
     p[lj.S0] = p[lj.BREAK] * coulomb / rng.uniform(3e-4, 8e-4, n)  # breaks away after U(0.3, 0.8) mrad
     p[lj.S1] = 2 * rng.uniform(0.2, 0.4, n) * np.sqrt(p[lj.S0] * inertia)  # U(0.2, 0.4): bristles' damping ratio

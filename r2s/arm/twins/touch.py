@@ -89,7 +89,7 @@ class Touch:
         return float(self.contact[DEPTH]) if self.near(q, np.zeros_like(q)) else -np.inf
 
     def near(self, q: np.ndarray, dq: np.ndarray) -> bool:
-        """Return whether the tip may touch the surface in a cycle from q, dq (n,) rad, rad/s; update `jacobian`."""
+        """Return whether the tip at q, dq (n,) rad, rad/s may touch the surface in one cycle; update `jacobian`."""
         if not self.there:
             return False
         link_frames(self.links, q, self.frames, self.axes)
@@ -121,12 +121,12 @@ class Touch:
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
     """Draw a random surface near the nominal pose that the setting `surface` describes.
 
-    False: no surface. True: a work table below the tip of the home posture. {point: (3,) m, normal: (3,)}: a plane
+    False: no surface. True: a work table below the tip in the home posture. {point: (3,) m, normal: (3,)}: a plane
     through the point. box: a box with edges `r2s.physics.box.SIZE` on a work table ahead of the tip. {box: (3,) m}: a
     box with the given edges; if point and normal are also given, the box stands at the point.
 
     Raises:
-        UserError: `surface` is invalid, the robot has no tool, or the surface contains the home posture's tip.
+        UserError: `surface` is invalid, the robot has no tool, or in the home posture the tip is inside the surface.
     """
     if surface is False or surface is None:
         return None

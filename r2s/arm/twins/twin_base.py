@@ -83,7 +83,7 @@ class TwinBase:
         self._stopped: str | None = "no motion was started; call move_to first"
         self._cycle, self._tau_J_d = 0, np.zeros(robot.n)
         self._q, self._dq = robot.q_home, np.zeros(robot.n)
-        self._pending: deque[np.ndarray] = deque()  # commands within the extra delay
+        self._pending: deque[np.ndarray] = deque()  # commands that wait for the extra delay
         self._sent = np.zeros(robot.n)
 
     def move_to(self, q: np.ndarray) -> ArmState:

@@ -68,7 +68,7 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     document["mujoco"] = mujoco_contact(simulated.surface, inverse_mass(robot))
     document["sdf"] = sdf_surface(simulated.surface)
     draws = found.draws | {f"{RIGID_GEARS}_{name}": values for name, values in simulated.draws.items()}
-    with atomic_write(path.with_name("contact_posterior.npz")) as part:  # first, so contact.yaml never exists alone
+    with atomic_write(path.with_name("contact_posterior.npz")) as part:  # before contact.yaml, which needs it
         np.savez_compressed(part, **draws)  # type: ignore[arg-type]
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))

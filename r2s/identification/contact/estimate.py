@@ -46,16 +46,16 @@ class ContactEstimate:
 
     Attributes:
         surface: the estimate; `surface.point` is the mean of the tip centers in contact, projected onto the plane.
-        draws: posterior draws {name: (S, ...)} of the parameters, point and normal of a `Surface`, of the force
-            curve's `slope` at LOAD, N/m, and of the compliance (S, n) rad/Nm of the `gears`.
+        draws: posterior draws {name: (S, ...)}. The names are parameters, point and normal of `Surface`; slope, N/m,
+            of the force curve at LOAD; gears, rad/Nm, the compliance (S, n).
         identifiable: {name: whether the data determine this value}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
         training: predicted and measured forces of fitted presses. validation: forces of presses that were not fitted;
             None if there are no such presses.
-        gears: (n,) rad/Nm, compliance of the gears, for encoders on the motors; 0 for rigid gears or encoders on the
-            links. For a joint with little load, the ratio of its deflection to the mean deflection remains at the
-            prior mean.
-        stated: whether the user stated the stiffness of the gears.
+        gears: (n,) rad/Nm, compliance of the gears between encoders and links; near 0 for rigid gears or encoders on
+            the links. If a joint bears little load, the ratio of its gear's deflection to the mean deflection stays
+            at the prior mean.
+        stated: whether the stiffness of the gears was known, see `Gears.stated`.
         tau_max: (n,) Nm, largest torques of the joints.
         rigid_gears: the estimate for simulations with rigid gears; its surface includes the compliance of the gears.
             `rigid_gears` is None in an estimate that assumes rigid gears.
@@ -113,9 +113,9 @@ def identify_contact(
 
     Args:
         arm: identified arm with a tool. recording: free motion, presses and slides, with commanded torque.
-        held_out: presses on the same surface for validation; if None, the last press validates a refit without this
-            press.
-        gears: prior of the gears' deflection; if None, the prior is that for gears of unknown stiffness.
+        held_out: further presses on the surface, for validation; if None, r2s refits without the last press and
+            validates the refit on this press.
+        gears: prior of the gears' deflection; if None, `unknown_gears`.
         seed: seed of the posterior's draws. report: function that receives the completed share and the next step.
 
     Raises:
@@ -138,7 +138,7 @@ def identify_contact(
 
 
 def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | None, refit: Fit) -> Press | None:
-    """Return the forces of all presses in `other` or, if None, of the last press after a refit without this press.
+    """Return the forces of held-out presses: all in `other` or, if None, the last press after a refit without it.
 
     Return None if `other` is None and there are fewer than two presses.
     """
@@ -154,9 +154,9 @@ def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | No
 def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
     """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution u (8,) for rigid gears.
 
-    The weights remain those of the fit with rigid gears. Weights from the smaller residual of elastic gears would
-    ignore the friction law's error: on the elastic twins 0 to 9, the number of intervals that miss the true value
-    would rise from 9 to 23 of 80.
+    The weights remain those of the fit with rigid gears. A fit with elastic gears has a smaller residual, which hides
+    the friction law's error. Weights from this residual would make intervals too narrow: on the elastic twins 0 to 9,
+    23 instead of 9 of 80 intervals would miss the true value.
     """
     return _fitted(problem, problem.space.with_gears(u))
 

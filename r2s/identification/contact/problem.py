@@ -18,12 +18,12 @@ from r2s.recordings.recording import Recording
 
 SLOWEST = 0.01  # rad/s, slowest sliding; slower joints may stick and slip, which increases the residual
 DRIFT = 0.02  # standard deviation of friction and offset drift since calibration, relative to a joint's friction
-EXACT = 1e-4  # lower limit of a row's sigma, relative to the joint's friction, even in a noise-free simulation
-SEEN = 0.03  # standard deviations; errors of the arm's model with a smaller effect on all rows together are dropped
+EXACT = 1e-4  # least sigma of a row, relative to the joint's friction, also for noise-free simulations
+SEEN = 0.03  # model errors of the arm are dropped if they change all rows together by fewer standard deviations
 FTOL = 1e-6  # a search ends when a step reduces the cost by less than this share
 STEP = 1e-5  # finite-difference step on the unit cube
 REACH = 10.0  # half-width of the unit cube along w, in standard deviations of w
-PLAY = 3.0  # `TipMotion.play` in standard deviations of the tip's encoder noise below 40 Hz
+PLAY = 3.0  # `TipMotion.play` / standard deviation of the tip's position due to encoder noise below 40 Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,9 @@ class ContactProblem:
     torques. Because the residual is linear in the model errors w, a closed form eliminates w (variable projection:
     Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
-    Encoders on the motors do not measure the gears' deflection, neither by gravity (`sag`) nor by contact. In
-    contact, gears and surface are springs in series. Presses with different lever arms distinguish the gears'
-    stiffness from the surface's.
+    Encoders on the motors do not measure how far gravity (`sag`) and contact deflect the gears. In contact, gears and
+    surface are springs in series. Presses with different lever arms distinguish the gears' stiffness from the
+    surface's.
 
     Attributes:
         torque: torque residual without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
@@ -112,7 +112,7 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + r + U) of vectors u (C, U): data at the best model errors w, priors of w and u."""
+        """Return residuals (C, R + r + U) of vectors u (C, U): data rows at the best w, then priors of w and u."""
         center, weight = self.space.prior(trials.shape[1])
         return np.stack([np.concatenate([self._projected(self.data(u)), weight * (u - center)]) for u in trials])
 

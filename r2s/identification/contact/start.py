@@ -16,7 +16,7 @@ KNOWN = 0.1  # standard error of a moving joint's friction, as a share of this f
 SURE = 4.0  # a force indicates contact if it exceeds this number of standard deviations
 LEAST_S = 0.2  # s, least duration of contact
 STIFFNESS = (5e2, 2e5)  # N/m, range of first guesses
-FLAT = 3.0  # positions determine the normal if their spread along the plane is above FLAT times that across the plane
+FLAT = 3.0  # positions determine the normal if they spread FLAT times more along the plane than across it
 
 
 def first_guesses(
@@ -56,7 +56,7 @@ def first_guesses(
 def _starts(
     surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield a start vector u for each normal (3,) and exponent; stiffness is from a line fit to height over force."""
+    """Yield a start vector u for each normal (3,) and exponent; a line fit of height to force gives the stiffness."""
     for normal in normals:
         height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
         slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0
@@ -69,9 +69,9 @@ def _starts(
 
 
 def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return tip center (T, 3) m, force on the tip (T, 3) N, and (T,) whether the force is certainly above 0.
+    """Return tip center (T, 3) m, force on the tip (T, 3) N, and whether the force is significant (T,), see SURE.
 
-    The force is a weighted fit to joint torques below 10 Hz; resting joints have low weights (unknown friction).
+    A weighted fit to joint torques below 10 Hz yields the force; resting joints have low weights (unknown friction).
     """
     space, motion = torque.space, torque.motion
     d = space.dynamics(x)

@@ -27,11 +27,11 @@ NAMES = tuple(BOUNDS)
 LOWER, UPPER = np.array(list(BOUNDS.values())).T
 WIDTH = UPPER - LOWER
 SURFACE = len(NAMES)  # number of values of a surface; u has 1 + n further values if the gears are elastic
-FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
+FLAT = np.sqrt(12.0)  # 1 / standard deviation of a uniform distribution over the unit interval
 # Deflection of gears, rad, at the largest torques: standard deviation of a normal prior about 0; upper bound. Strain
 # wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
 DEFLECTION, SOFTEST = 0.01, 0.05
-SCATTER, FARTHEST = 0.2, 0.6  # a joint's deflection / (mean deflection * `shape`) - 1: standard deviation; limit
+SCATTER, FARTHEST = 0.2, 0.6  # prior sigma and limit of (a gear's deflection / (mean deflection * `shape`) - 1)
 WIDEST = 0.25  # largest relative standard deviation of an identified gear's deflection
 LEAST_ACCURATE = 0.4  # largest allowed `accuracy`; two standard deviations then stay within FARTHEST and SOFTEST
 
@@ -43,8 +43,7 @@ class Gears:
     Attributes:
         shape: (n,) prior mean of each gear's deflection, relative to the mean over all gears.
         center, width: rad, prior mean and standard deviation of the mean deflection over all gears.
-        scatter: (n,) or one number, relative standard deviation of a gear's deflection about the mean deflection
-            times `shape`.
+        scatter: (n,) or one number, standard deviation of a gear's deflection / (mean deflection * `shape`).
         stated: whether the stiffness of the gears is known, from the user or from an identification of the gears.
     """
 
@@ -87,7 +86,7 @@ def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float 
 
 
 def _mean_deflection(deflection: np.ndarray, width: float) -> float:
-    """Return the mean of the deflections (n,) rad; raise UserError if it is not far below SOFTEST.
+    """Return the mean of the deflections (n,) rad; raise UserError if mean + 2 standard deviations exceeds SOFTEST.
 
     width: relative standard deviation of the mean.
     """
@@ -105,12 +104,13 @@ def identified_gears(
 ) -> Gears:
     """Return the prior of identified gears.
 
-    A gear that the slides did not determine deflects like the mean of the others. Half of the variance of the best
-    known gear is common to all gears.
+    A gear that the slides did not determine deflects like the mean of the others. Half of the least variance among
+    the gears is common to all gears.
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints. stiffness: (n,) Nm/rad. spread: (n,) relative standard
-            deviation of the stiffness; at most WIDEST counts, because of the bound FARTHEST. determined: (n,) bool.
+            deviation of the stiffness; WIDEST replaces larger values, because deflections are bounded by FARTHEST.
+            determined: (n,) bool.
 
     Raises:
         UserError: slides determined fewer than half of the gears, or the gears are too soft.
@@ -131,9 +131,8 @@ class SurfaceSpace:
     """The space of surfaces near a plane through `origin` (3,) m with unit normal `normal` (3,).
 
     A vector u contains two tilts of the plane about axes through `origin`, the tip's height along the normal under
-    the force LOAD, and five values of the force law. If the gears are elastic, u also contains the gears' mean
-    deflection at the largest torques, and for each gear the relative deviation of its deflection from this mean times
-    `Gears.shape`.
+    the force LOAD, and five values of the force law. For elastic gears, u also contains the gears' mean deflection at
+    the largest torques, and for each gear the ratio deflection / (mean deflection * `Gears.shape`).
 
     Attributes:
         tau_max: (n,) Nm, largest torques of the joints. gears: prior of the gears' deflection.
@@ -193,6 +192,6 @@ class SurfaceSpace:
         return self.axes @ (normal / (normal @ self.normal)) / WIDTH[:2]
 
     def unit(self, height: float, slope: float, exponent: float, friction: float) -> np.ndarray:
-        """Return vector u (8,) of an untilted plane, given the tip's height, m, and the force slope, N/m, at LOAD."""
+        """Return the vector u (8,) of an untilted plane; `height` (m) and `slope` (N/m) refer to the load LOAD."""
         p = np.array([0.0, 0.0, height, np.log(slope), exponent, 0.0, friction, np.log(2e-4)])
         return np.clip((p - LOWER) / WIDTH, 0.0, 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from r2s.identification.contact.problem import ContactProblem
 
-PAUSE_S = 1.0  # s without contact that separates two presses; a slide may lose contact for a moment
+PAUSE_S = 1.0  # s; a longer time without contact separates two presses; a slide may lose contact for less
 GUARD_S = 0.2  # s, time added before and after a press; it is longer than a window
 KNOWN = 0.05  # largest standard error of a measured force, as a share of the largest force (1 N of a Panda's 20 N)
 

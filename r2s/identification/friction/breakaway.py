@@ -8,14 +8,14 @@ exceeds the breakaway command U:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
-The command u at the joint is positive in the ramp's direction, and kappa is the inverse inertia. Below the breakaway
-command U, stiction balances the command u, and bristles bend over the creep length z (Dahl, J. Dyn. Sys. Meas.
-Control 98(4), 1976). At breakaway, friction falls from U to a lower value (0 in the paper's eq. 6, where z = 0);
-`jump` is this decrease times kappa. The fit without `Slide` estimates all parameters of the equation and needs no
-model of the arm.
+The command u, after delay and lag, is positive in the ramp's direction; kappa is the inverse inertia. Below the
+breakaway command U, stiction balances the command u, and bristles bend over the creep length z (Dahl, J. Dyn. Sys.
+Meas. Control 98(4), 1976). At breakaway, friction falls from U to a lower value; `jump` is this decrease times kappa.
+In the paper's eq. 6, z and the lower value are 0. The fit without `Slide` estimates all parameters of the equation
+and needs no model of the arm.
 
-If friction falls over a range of velocities (Stribeck), motion begins slowly, and the sudden `jump` makes the fit
-without `Slide` overestimate U (by 4 to 22 mNm on an arm with known U). The fit with `Slide` uses parameters of an
+If friction falls over a range of velocities (Stribeck), motion begins slowly. The sudden `jump` then makes the fit
+without `Slide` overestimate U, by 4 to 22 mNm on an arm with known U. The fit with `Slide` uses parameters of an
 identified arm and replaces `jump` by jump (1 - exp(-(v / fall)^2)), with velocity v and Stribeck velocity `fall`. On
 the arm with known U, the fit with `Slide` erred by less than 0.2 mNm. r2s uses the fit with `Slide` if it explains
 the motion as well as the fit without `Slide`.
@@ -32,7 +32,7 @@ from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.recordings.ramps import Ramps
 
-MOVED = 5e-3  # rad, largest motion of the rows in a fit; joints creep 1 to 3 mrad before breakaway, also on the twin
+MOVED = 5e-3  # rad; a fit uses rows up to this motion; joints creep 1 to 3 mrad before breakaway, also on the twin
 MIN_ROWS = 10  # least number of rows in a fit
 ENCODER = 2e-5  # rad, standard deviation of position residuals: encoder noise of a Panda
 DIFFERENCE = 1e-3  # finite-difference step, relative to the scale of each parameter
@@ -45,10 +45,11 @@ RIGID = 1e-8  # rad, creep length of a joint that does not creep
 DRIFT = 3e-4  # rad/s, prior sigma of a slow drift: a resting joint may still settle
 SIDES = "negative", "positive"
 KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
-WORSE = 1.01  # the fit with `Slide` is not used if its misfit exceeds that of the fit without by this factor
-BACK = 0.0, 0.03, 0.1  # initial values of U: distances below the last command, relative to the ramp's rise
+WORSE = 1.01  # the fit with `Slide` is used if its misfit is at most this multiple of that without `Slide`
+BACK = 0.0, 0.03, 0.1  # initial values of U: last command minus these multiples of the ramp's rise
 DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, which a short motion does not determine
-STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # initial creep length, rad, and share of the guessed slide time
+# initial values: creep length, rad; sliding time / time guessed from quadratic motion
+STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,14 +191,14 @@ def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarr
     factor = -np.expm1(-np.diff(t) / lag)
     out = late.copy()
     for k in range(len(factor)):
-        # first-order response to a linear segment: in the steady state, a lag shifts a ramp by `lag` s
+        # response of a first-order lag to a linear segment; in the steady state, the output is `lag` s late
         slope = (late[k + 1] - late[k]) / (t[k + 1] - t[k])
         out[k + 1] = out[k] + factor[k] * (late[k] - out[k] - lag * slope) + (late[k + 1] - late[k])
     return out
 
 
 def _fit_breakaway(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Return breakaway command, Nm (NaN near u[0]), and misfit, rad, from motion x (T,) rad, commands u (T,) Nm."""
+    """Fit motion x (T,) rad to command u (T,) Nm; return breakaway command, Nm (NaN near u[0]), and misfit, rad."""
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
@@ -303,14 +304,15 @@ def _slide(t, u, U, kappa, z, damping, jump, fall):
         for i in range(parts):
             before = u[k] + i * rise
             after = before + rise
-            beyond = min(max((max(before, after) - U) / max(abs(rise), 1e-12), 0.0), 1.0)  # share of the step
+            # share of the step with u > U
+            beyond = min(max((max(before, after) - U) / max(abs(rise), 1e-12), 0.0), 1.0)
             push = v + h * kappa * (0.5 * (before + after) - U)
             drop = h * jump * beyond
             hold = h * kappa * (U - u[0])
             w = v
             for _ in range(60):
                 e = hold * np.exp(-max(at + 0.5 * h * (v + w), 0.0) / z)
-                left, steeper = 0.0, 0.0  # share of friction's decrease still to come, and its slope
+                left, steeper = 0.0, 0.0  # remaining share of friction's decrease, and the slope of the decrease
                 if fall > 0.0:
                     ratio = 0.5 * (v + w) / fall
                     left = np.exp(-ratio * ratio)

@@ -1,10 +1,10 @@
 """Estimate the presliding distance, over which bristles bend after a joint has reversed its direction.
 
-The torque residual omits samples at which bristles bend. Replays of short windows include reversals, after which
-bristles bend, so replays determine the presliding distance. The torque fit determines all parameters except the
-presliding distance. However, only reversals distinguish some parameters from each other, such as offset and
-asymmetry. The last steps of the search therefore vary the parameters in WITH and the presliding distance together,
-but r2s keeps only the distance.
+The torque residual omits samples at which bristles bend, so the torque fit determines all parameters except the
+presliding distance. r2s estimates this distance from replays of short windows, which include reversals. But reversals
+also contain information on other parameters: only reversals separate offset from asymmetry. The last steps of the
+search therefore vary the parameters in WITH and the presliding distance together. r2s uses only the resulting
+distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,16 +26,16 @@ from r2s.physics.dynamics import Dynamics
 from r2s.recordings.recording import Recording
 
 NAME = "presliding"  # the parameter
-WINDOW_S, STRIDE = 0.2, 5  # s, ms: length and averaging time of replays; friction reverses within about 50 ms
+WINDOW_S, STRIDE = 0.2, 5  # length (s) and averaging time (ms) of replays; friction reverses within about 50 ms
 TRIED = 9  # number of log-spaced distances; within the usual bounds, neighbors differ by a factor of 1.8
 STEPS, FTOL = 4, 1e-2  # search for the distance alone: most steps; least relative gain of a step
-JOINT_STEPS, SMALL = 4, 0.05  # search that also varies WITH: most steps; it ends below this relative change
+JOINT_STEPS, SMALL = 4, 0.05  # search that also varies WITH: most steps; relative change of the distance that ends it
 # parameters whose errors change the estimated distance; viscous friction, inertia and delay change it by 1 % or less
 WITH = ("coulomb", "asymmetry", "rise", "offset")
-# lower limit of the log distance's sigma: a window's first bristle state comes from smoothed velocity, so
-# in tests estimates of known distances erred by up to 1.5 %, even with true values of all other parameters
+# Least sigma of the log distance. A window's first bristle state comes from smoothed velocity. In tests, estimates of
+# known distances therefore erred by up to 1.5 %, although all other parameters had their true values.
 MIN_SIGMA = 0.02
-RIDGE = 1e-6  # information added to every value on the unit cube: a distance may have a flat prior and no data
+RIDGE = 1e-6  # information added to every value on the unit cube, because a distance may lack both prior and data
 
 
 def estimate_presliding(
@@ -81,10 +81,10 @@ def estimate_presliding(
 
 
 def nearest_distance(data: ReplayResidual) -> np.ndarray:
-    """Simulate TRIED presliding distances, each in all joints; return each joint's best one (n,) on the unit cube.
+    """Simulate TRIED presliding distances, each in all joints; return each joint's best distance (n,), unit cube.
 
-    A search must not start at a presliding distance that is several times too small, because the residual's weights
-    at such a distance would suppress all reversals.
+    A search must not start at a distance that is several times too small, because the residual's weights would then
+    suppress all reversals.
     """
     u = np.tile(np.linspace(0.0, 1.0, TRIED)[:, None], data.space.n)
     cost = (data(data.space.from_unit(u)) ** 2).reshape(TRIED, -1, data.space.n).sum(1)
@@ -95,7 +95,7 @@ def nearest_distance(data: ReplayResidual) -> np.ndarray:
 class GaussNewton:
     """A Gauss-Newton step from `start` (P,) to `end` (P,); `parts`: residual and Jacobian at `start`.
 
-    `linearize` predicts the residual linearly, so that computing a posterior needs no further replays.
+    `linearize` extrapolates the residual linearly from `start`, so that `posterior` needs no further replays.
     """
 
     start: np.ndarray

@@ -1,11 +1,11 @@
 """Compute the standard error of breakaway commands from repeated ramps.
 
 Friction varies between ramps, because of posture, load and cables. Two ramps per joint and direction hardly determine
-a variance: by Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors. Therefore r2s
-averages a joint's variance with the mean variance of all joints of the same size; this mean has the weight of
-PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small, because the scatter
-differs between joints of the same size: on twins by factors of 3 and more. If no ramp is repeated, r2s assumes the
-standard deviation REPEATS, relative to tau_max.
+a variance: by Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors. r2s therefore
+averages a joint's variance with the mean variance of all joints with the same tau_max (the same size). This mean has
+the weight of PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small, because
+the scatter differs between joints of the same size: on twins by factors of 3 and more. If no ramp is repeated, r2s
+assumes the standard deviation REPEATS, relative to tau_max.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Certainty(NamedTuple):
 
 
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
-    """Return standard errors of mean breakaway commands; joints with equal tau_max (n,) Nm count as equally large.
+    """Return standard errors of mean breakaway commands; joints with equal tau_max (n,) Nm have the same size.
 
     If no joint of a size has repeated ramps, r2s assumes the mean scatter of all joints, in proportion to tau_max.
     """

@@ -9,9 +9,9 @@ from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 
-# standard deviation of net torque minus friction, relative to the command; due to creep and the onset of sliding
+# standard deviation of (net torque minus friction) / command; creep and the onset of sliding cause these errors
 SIGMA = 0.03
-LEAST = 1e-3  # relative to tau_max; commands smaller than this have the standard deviation of a command of this size
+LEAST = 1e-3  # relative to tau_max; below this command, SIGMA is relative to LEAST * tau_max
 
 
 class StaticFriction:

@@ -18,8 +18,8 @@ from r2s.recordings.recording import Recording
 
 HORIZON, WINDOWS = 0.5, 60  # length (s, enough for stops) and number of the replays that choose a model
 SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # in `scan_breakaway`: windows, passes, and how many passes are coarse
-SCAN_BATCH = 12  # candidates replayed at once, with 50 windows each; 36 candidates need three times the memory
-LEAST = 5e-4  # lower limit of the friction that determines the scan range, relative to tau_max
+SCAN_BATCH = 12  # candidates replayed at once, with 50 windows each; 36 would need three times the memory
+LEAST = 5e-4  # the scan range assumes at least this friction, relative to tau_max
 POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # coarse pass: points; fine pass: points per side, and divisor of the step
 
 
@@ -50,7 +50,7 @@ def choose_stiction(
     for model in STICTION_MODELS:
         dq_min = dynamics.dq_min if model == "command" else min(dynamics.dq_min, CREEP)
         trial = replace(dynamics, stiction_model=model, dq_min=dq_min)
-        if largest is not None:  # each model has its own breakaway torques
+        if largest is not None:  # each stiction model fits other breakaway torques
             friction = np.maximum(dynamics.level, np.abs(dynamics.family.at_rest(dynamics.phi)).max(-1))
             limit = largest * np.maximum(friction, LEAST * robot.tau_max)
             trial = replace(trial, breakaway=scan(robot, trial, recording, limit))
@@ -76,8 +76,8 @@ def scan_breakaway(
 
     A gradient search would fail: the replay error jumps if a joint starts to slide one step sooner. In each pass, a
     candidate changes the breakaway torque of one joint, and r2s minimizes the replay error of this joint. Coarse
-    passes scan from 0 to `largest` (n,) Nm; fine passes refine the best value. Two passes are coarse, because joints
-    affect each other.
+    passes scan from 0 to `largest` (n,) Nm; fine passes refine the best value. The second coarse pass is necessary,
+    because joints affect each other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
@@ -88,7 +88,7 @@ def scan_breakaway(
     step = most / (POINTS - 1)
     sign = np.repeat([-1.0, 1.0], robot.n)
     joint = np.tile(np.arange(robot.n), 2)
-    evaluations = 1 + 3 * robot.n  # finite differences for the residual's weights
+    evaluations = 1 + 3 * robot.n  # replays for the residual's weights, see `ReplayResidual`
     for k in range(PASSES):
         coarse = k < COARSE
         offsets = most * np.linspace(0, 1, POINTS) if coarse else step * np.arange(-FINE_POINTS, FINE_POINTS + 1)

@@ -1,8 +1,8 @@
 """Identify the stiffness of an arm's gears from slow slides under a multisine torque, with intervals.
 
 The encoders must be on the motors. The rotor, gear and link of each joint are a chain of two inertias: below the
-resonance, rotor and link move together; above, the rotor alone. The response in between determines the stiffness,
-even if the links' inertia tensors are uncertain.
+resonance, rotor and link move together; above the resonance, the rotor moves alone. The response between these two
+ranges determines the stiffness, even if the links' inertia tensors are uncertain.
 """
 
 from collections.abc import Callable
@@ -20,20 +20,21 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 DRAWS = 400  # posterior draws
-BLOCKS, STIFFNESS = 8, 1  # values per joint in a vector x: the fields of `Drives` and the link's tensor; index
+BLOCKS, STIFFNESS = 8, 1  # values per joint in a vector x (fields of `Drives`, link's tensor); index of the stiffness
 FTOL, XTOL = 1e-5, 1e-4  # a search ends when a step changes the cost or x by less than this share
 MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 4
-STIFF = np.log(20.0)  # if a gear is not determined, a second search begins with gears that resonate above all lines
-# Prior: mean and standard deviation, of the logarithm unless stated otherwise. Wide; no source gives these values for
-# a robot, and they matter only for light wrists, whose motors hardly feel the link.
+# if the data do not determine a gear, a second search starts at 20 times the stiffness: resonance above all lines
+STIFF = np.log(20.0)
+# Prior: median, and standard deviation of the logarithm unless stated otherwise. The priors are wide, because no
+# source gives these values for a robot. They matter only for light wrists, whose links hardly load the motors.
 DEFLECTION = 0.0055, 0.6  # rad, of a strain wave gear at the joint's largest torque (contact/surface_space.py)
-ROTOR = 0.2, 0.7  # inertia of the rotor beyond the model's, relative to the joint's links
+ROTOR = 0.2, 0.7  # rotor inertia that the model's armature lacks, relative to the inertia of the joint's links
 GEAR_DAMPING = 0.04, 0.7  # relative to critical damping; 0.01 to 0.1 for metal gears
 LOOP_DAMPING = 0.3, 1.0  # relative to critical damping
 DELAY = 3e-3, 2e-3  # s, not logarithmic
 LAG = 1.2e-3, 0.6  # s
-TENSOR = 0.3  # of the links' inertia tensors, which slow motion hardly shows (paper, Table IV: 0.73 to 1.37)
-VISCOUS = 0.3  # change of friction relative to its level, per sliding speed; not logarithmic
+TENSOR = 0.3  # scale of a link's inertia tensor, which slow motion hardly determines (paper, Table IV: 0.73 to 1.37)
+VISCOUS = 0.3  # slope of friction over speed, in friction level / sliding speed; mean 0, not logarithmic
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +69,10 @@ class GearProblem:
 
     Attributes:
         slides: measured spectra. mass: (W, n, n) kg m^2, mass matrices of the links. tensors: (n, W, n, n) kg m^2,
-            their parts due to each link's inertia tensor.
+            parts of `mass` due to each link's inertia tensor.
         rotor: (n,) kg m^2, stiffness: (n,) Nm/rad, prior medians.
-        critical: (n,) critical damping of a gear per sqrt(stiffness). viscous: (n,) Nm s/rad, prior deviation.
+        critical: (n,) critical damping of a gear / sqrt(stiffness). viscous: (n,) Nm s/rad, prior standard deviation
+            of `Drives.viscous`.
         noise: factor (W, 1) on `slides.sigma`.
     """
 
@@ -125,7 +127,8 @@ def gear_problem(robot: Robot, dynamics: Dynamics, slides: Slides) -> GearProble
         inertia = np.array(dynamics.inertia)
         inertia[link] *= 2.0
         tensors.append(masses(replace(dynamics, inertia=inertia), slides.q) - mass)
-    own = 1 / np.diag(np.linalg.inv(masses(dynamics, robot.q_home[None])[0]))  # kg m^2, with all other joints free
+    # kg m^2, if all other joints move freely
+    own = 1 / np.diag(np.linalg.inv(masses(dynamics, robot.q_home[None])[0]))
     rotor = dynamics.armature + ROTOR[0] * own
     stiffness = robot.tau_max / DEFLECTION[0]
     speed = np.array([np.abs(slides.speed[slides.joint == i]).mean() for i in range(robot.n)])
@@ -158,7 +161,7 @@ def identify_gears(
         again = _minimum(problem, stiff.ravel())
         x = again[0] if again[2] < cost else x
     report(0.6, "intervals")
-    # the neighbors of a line may underestimate what the model leaves unexplained
+    # the model's error may exceed the noise beside the lines: a misfit above 1 widens sigma
     size = np.abs(problem.misfit(x)) ** 2
     misfit = np.sqrt(0.5 * np.array([size[slides.joint == i].mean() for i in range(n)]))
     problem = replace(problem, noise=np.maximum(misfit, 1.0)[slides.joint, None])
@@ -187,8 +190,8 @@ def _determined(covariance: np.ndarray) -> np.ndarray:
 def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the minimum x (8 n,) near `start`, its covariance (8 n, 8 n) and its cost.
 
-    The loss grows linearly with large residuals of the data, because the friction ripple of a revolving motor may
-    meet a line.
+    The loss grows linearly with large residuals of the data, because a revolving motor's friction ripple may have the
+    frequency of a line.
     """
     count = problem.slides.sigma.size * 2
 

@@ -39,7 +39,7 @@ def save_gears(path: Path, robot: Robot, found: GearEstimate, source: Mapping[st
 def load_gears(folder: str | Path, robot: Robot, where: str) -> dict[str, np.ndarray]:
     """Return the arguments `stiffness`, `spread` and `determined` of `identified_gears`.
 
-    folder: run folder, or gears.yaml. where: the option with which the user named it, for error messages.
+    folder: run folder, or gears.yaml. where: the option with which the user named the folder, for error messages.
 
     Raises:
         UserError: the file is missing or damaged, or belongs to another robot.

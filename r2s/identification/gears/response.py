@@ -9,23 +9,23 @@ from r2s.excitation.multisine import LINES_HZ, PERIOD_S
 from r2s.recordings.recording import Recording
 
 RATE = 2.5  # least number of samples per period of the fastest line
-EXCITED = 3.0  # a line of the torque must exceed its unexcited neighbors by this factor, in the median over the lines
+EXCITED = 3.0  # least median ratio of the torque's lines to their unexcited neighbors
 GAP = 0.5  # longest gap between samples, in periods of the fastest line
-MOVED = 3.0  # another motor counts as moving at a line if its amplitude exceeds its noise by this factor
-NEIGHBORS = 6  # number of unexcited lines next to an excited one from which its noise is estimated
-LOWEST = 4  # periods per slide of the lowest neighbor; ramps and drift leak into lower lines
-# least standard deviation of a response, relative, from the elastic twins 1 to 3: friction is not exactly constant
+MOVED = 3.0  # another motor is treated as moving at a line if amplitude / noise exceeds this ratio
+NEIGHBORS = 6  # number of neighboring unexcited lines that determine the noise of an excited line
+LOWEST = 4  # lowest neighbor, in periods per slide; ramps and drift leak into lower lines
+# least relative standard deviation of a response, because friction is not exactly constant (elastic twins 1 to 3)
 LINEAR = 0.06
 
 
 @dataclass(frozen=True, eq=False)
 class Slides:
-    """Spectra of W slides at the F lines LINES_HZ, with complex amplitudes at the phase of the slide's start.
+    """Spectra of W slides at the F lines LINES_HZ: complex amplitudes, with phases relative to the slide's start.
 
     Attributes:
         joint: (W,) index of the sliding joint. q: (W, n) rad, mean angles. speed: (W,) rad/s, mean speed.
-        angles: (W, F, n) rad, amplitudes of all motor angles. torque: (W, F) Nm, of the sliding joint's command.
-            The amplitude of another motor is 0 where it is not clear of noise.
+        angles: (W, F, n) rad, amplitudes of all motor angles. torque: (W, F) Nm, amplitudes of the sliding joint's
+            command. Another motor's amplitude is 0 if it hardly exceeds noise (MOVED).
         sigma: (W, F) rad/Nm, standard deviation of the real and of the imaginary part of `response`.
     """
 
@@ -38,7 +38,7 @@ class Slides:
 
     @property
     def response(self) -> np.ndarray:
-        """(W, F) rad/Nm, amplitude of the sliding joint's angle over that of its command."""
+        """(W, F) rad/Nm, amplitude of the sliding joint's angle / amplitude of the joint's command."""
         own = np.take_along_axis(self.angles, self.joint[:, None, None], 2)[..., 0]
         return own / self.torque
 
@@ -82,13 +82,14 @@ def slides_of(recording: Recording) -> Slides:
 
 
 def _spectra(q: np.ndarray, tau: np.ndarray) -> tuple[int, float, tuple]:
-    """Return a slide's joint, the median ratio of its torque's lines to their neighbors, and a row of `Slides`.
+    """Return a slide's joint, the median ratio of excited to unexcited lines of its torque, and a row of `Slides`.
 
     Args:
-        q: (N + 1, n) rad, angles during one period, with its end. tau: (N, n) Nm, commands.
+        q: (N + 1, n) rad, angles during one period, end point included. tau: (N, n) Nm, commands.
     """
     count, joint = len(tau), int(np.ptp(q, axis=0).argmax())
-    line = np.linspace(0.0, 1.0, count + 1)[:, None] * (q[-1] - q[0])  # a constant speed has no spectrum of its own
+    # motion at constant speed, which is not part of the response
+    line = np.linspace(0.0, 1.0, count + 1)[:, None] * (q[-1] - q[0])
     angles = np.fft.rfft(q[:-1] - line[:-1], axis=0) * 2 / count
     torque = np.fft.rfft(tau[:, joint]) * 2 / count
     lines = np.round(LINES_HZ * PERIOD_S).astype(int)
@@ -128,7 +129,8 @@ def motor_response(slides: Slides, mass: np.ndarray, drives: Drives) -> np.ndarr
     For motor angles y, link angles q, gear torque g = K (y - q) + D (y' - q'), and command u of the sliding joint:
         rotor y'' + viscous y' + g + loop (y' - q') = u, delayed and lagged (sliding joint only)
         M q'' = g (all joints; Spong, ASME J. Dyn. Sys. Meas. Control 109, 1987, without the links' effect on rotors)
-    The other motors move as measured, or rest, held by their friction. A zero-order hold adds half a sample.
+    Each other motor moves as measured, or friction holds it at rest. A zero-order hold delays the command by half a
+    sample.
 
     Args:
         mass: (W, n, n) kg m^2, mass matrices of the links without rotors.
@@ -142,7 +144,8 @@ def motor_response(slides: Slides, mass: np.ndarray, drives: Drives) -> np.ndarr
     others[each, :, j] = 0.0
     own = np.zeros_like(others)
     own[each, :, j] = gear[:, j].T
-    moved = np.linalg.solve(links, np.stack([own, others], -1))  # link angles per rad of the motor; from other motors
+    # link angles per rad of the motor; due to other motors
+    moved = np.linalg.solve(links, np.stack([own, others], -1))
     moved = moved[each, :, j]  # (W, F, 2)
     coupling = gear[:, j].T + drives.loop[j, None] * s
     motor = drives.rotor[j, None] * s**2 + drives.viscous[j, None] * s + coupling * (1.0 - moved[..., 0])

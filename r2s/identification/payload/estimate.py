@@ -165,7 +165,7 @@ def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEsti
     drawn = np.clip(u + posterior(fit, u, seed).steps, 0.0, 1.0)[:, :10] * (high - low) + low
     mass, centre, tensor = fit.space.body(drawn)
     draws = {"mass": mass, "centre": centre, "inertia": tensor_elements(tensor)}
-    # spread of the prior alone at this mass: a value is identifiable if its interval is far narrower
+    # draws of the prior at this mass: a value is identifiable if its interval is far narrower than their spread
     alone = np.where(
         np.isinf(fit.space.sigma), fit.z, rng.normal(size=drawn.shape) * np.nan_to_num(fit.space.sigma, posinf=0.0)
     )

@@ -14,8 +14,8 @@ from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass
 from r2s.physics.rigid_body import LinkInertia, nominal_torque
 from r2s.recordings.recording import Recording
 
-# standard deviations of changes since the calibration: friction, relative (WARMED in adaptation: warming within
-# minutes); offset, relative to friction; link-side offset, relative to the largest torque (conf/identify)
+# Standard deviations of drift since the calibration: of friction, relative (warming within minutes, WARMED in
+# adaptation); of offsets, relative to friction; of link-side offsets, relative to the largest torque (conf/identify)
 FRICTION_DRIFT, OFFSET_DRIFT, SENSOR_DRIFT = 0.07, 0.02, 7e-4
 LOAD_FRICTION = 0.015  # standard deviation of friction, Nm per Nm of load (adaptation/tuning.py: PAYLOAD_FRICTION)
 RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; recordings longer than LONG_S (s) have fewer
@@ -50,18 +50,18 @@ class Rows:
 
     @cached_property
     def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gain (r, 10), constant (r,): for a payload phi (10,), model errors w = gain @ phi + constant cost least."""
+        """Gain (r, 10), constant (r,): model errors w = gain @ phi + constant minimize the cost of a payload phi."""
         h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
         solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
         return solved[:, :-1], solved[:, -1]
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,): a payload phi costs at least |slope @ phi + constant|^2 + a fixed number."""
+        """Slope (K, 10), constant (K,): a payload phi costs |slope @ phi + constant|^2 plus a fixed term, or more."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
-        size = 1.0 / np.sqrt(np.maximum(h.diagonal(), 1e-300))  # kg, kg m and kg m^2
+        size = 1.0 / np.sqrt(np.maximum(h.diagonal(), 1e-300))  # scales in kg, kg m and kg m^2
         values, axes = np.linalg.eigh(0.5 * size[:, None] * (h + h.T) * size)
         some = values > 1e-12 * values.max()
         root = np.sqrt(values[some])[:, None] * axes[:, some].T
@@ -129,7 +129,7 @@ class LoadedTorque:
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Linearize the residual at `payload` (phi (10,)); the weights omit the torque of the model errors w (r,)."""
+        """Linearize the residual at `payload` (phi (10,)). Weights ignore torque explained by model errors w (r,)."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

@@ -16,8 +16,8 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-USUAL = 0.9  # share of the windows, those with the least residual, from which noise is estimated
-HUBER = 1.5  # ratio of a window's RMS residual to the median, above which the window is down-weighted
+USUAL = 0.9  # noise is estimated from this share of the windows: those with the least residual
+HUBER = 1.5  # a window is down-weighted if its RMS residual exceeds this multiple of the median
 Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite-difference steps
 TORQUE_SIGMA, MIN_TORQUE_SIGMA = 0.05, 1e-4  # Nm, first guess and lower limit of a window's unexplained torque
 BAYES_ROUNDS = 30  # fixed-point iterations of `_random_effects`
@@ -130,7 +130,7 @@ class ReplayResidual:
             block = blocks_of(w.t, w.q0, self._period, mean, seconds)
             self.clusters = np.repeat(block, self._target[0].size)
         self._trust = np.ones(self.count)
-        moves = self._seen.any((1, 2))  # windows without a seen row are all padding
+        moves = self._seen.any((1, 2))  # a window without a seen row is only padding
         if fitted and moves.any():
             usual = moves
             for _ in range(2):  # an outlier window must not raise the noise of other windows
@@ -155,7 +155,7 @@ class ReplayResidual:
         return r - part[..., 0, :]
 
     def _whiten(self, z: np.ndarray) -> None:
-        """Set A and f = 1 - 1 / sqrt(1 + l^2) in (I + E E^T)^(-1/2) = I - A f A^T for E = z sigma / s = A l V^T."""
+        """Set A and f in (I + E E^T)^(-1/2) = I - A f A^T; E = z sigma / s = A l V^T, f = 1 - 1 / sqrt(1 + l^2)."""
         effect = z * self._sigma / np.tile(self._noise, self._target.shape[1])[:, None]
         self._axes, size, _ = np.linalg.svd(effect, full_matrices=False)
         self._shrink = 1.0 - 1.0 / np.sqrt(1.0 + size**2)

@@ -27,13 +27,14 @@ from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, too small for curvature to matter
-MAX_CORRELATION = 40  # rows, limit of the correlation length: a slow drift still counts as several rows
+MAX_CORRELATION = 40  # rows, limit of the correlation length, so that a slowly drifting error has some weight
 MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 30_000  # recordings above 5 min (at 100 Hz) get fewer rows per s; for a cutoff of 10 Hz, 20 per s suffice
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
 AT_ONCE = 8  # candidates whose link torques are computed in one pass over the regressor
 PART = 2048  # number of moments whose Jacobian is in memory at once
-FULLY_BENT = 4.0  # presliding distances, over which bristles bend to 98 % from rest, and to 96 % after a reversal
+# presliding distances; after this slide, bristles are bent to 98 % from rest, to 96 % after a reversal
+FULLY_BENT = 4.0
 
 
 class TorqueResidual:
@@ -110,7 +111,7 @@ class TorqueResidual:
         return self._with(space=space).reweighted(space.start, fitted=False)
 
     def with_lead(self, lead_s: float) -> "TorqueResidual":
-        """Return a copy for a simulator with implicit friction; `_friction` explains the time `lead_s` in s."""
+        """Return a copy for a simulator with implicit friction; see `_friction` for the time `lead_s` in s."""
         return self._with(lead_s=lead_s)
 
     def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
@@ -148,7 +149,7 @@ class TorqueResidual:
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _known(self, d: Dynamics, like: "_Known | None" = None, links: np.ndarray | None = None) -> "_Known":
-        """Return the torques that are slow to compute; torques in `like` with unchanged parameters are reused.
+        """Return the torques that are slow to compute; reuse torques in `like` whose parameters have not changed.
 
         links: (T, n) Nm, torque of the links of `d`; if None, the method computes this torque.
         """
@@ -239,10 +240,10 @@ class TorqueResidual:
     ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
         """Return the torque error (T, n) at x, and a list of (parameter block, indices in x, change).
 
-        The change results from a step of the block from x to `stepped`. It is a change of torque (T, n) or, for L
-        link parameters, of standard parameters (n, 10 n, L). Changes of standard parameters need no evaluation,
-        because torque is linear in standard parameters. Other parameters of a joint, such as its friction, affect
-        only this joint's torque, so one evaluation changes the values of all joints.
+        Each change is due to a step of the block from x to `stepped`: a change of torque (T, n) or, for L link
+        parameters, of standard parameters (n, 10 n, L). Link parameters need no further evaluation of torque, because
+        torque is linear in standard parameters. Other parameters of a joint, such as its friction, affect only this
+        joint's torque, so one evaluation steps all joints at once.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]

@@ -85,9 +85,8 @@ def cut_windows(
 
     Args:
         limit: largest number of windows; a longer recording yields `limit` evenly spaced windows.
-        slowest: rad/s. A window ends when a joint is slower than `slowest`, and the next one starts when all joints
-            are faster, because tiny parameter changes could shift a slow joint's breakaway. Joints that never move
-            are ignored.
+        slowest: rad/s. In a window, all joints are faster than `slowest`, because tiny parameter changes could shift
+            a slow joint's breakaway. Joints that never move are ignored.
         edges: (n, 2) Nm, lower and upper breakaway command of each joint, widened by SCATTER. A slow joint ends a
             window only if its command lies between its two breakaway commands.
 

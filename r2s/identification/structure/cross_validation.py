@@ -22,7 +22,7 @@ GUARD_S = 0.1  # s, gap between fitted rows and a held-out block, as the low-pas
 
 
 def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
-    """Return (fitted part, held-out part) of each fold; a fold holds out `blocks` blocks between gaps of GUARD_S."""
+    """Return (fitted part, held-out part) of each fold; a fold holds out `blocks` blocks, with gaps of GUARD_S."""
     period = recording.period or np.inf
     clock = recording.t % period if recording.period else recording.t
     edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
@@ -82,7 +82,7 @@ class CrossValidation:
         return search_space(self.robot, nominal or self.nominal, self.bounds, terms, self.recording, self.stated)
 
     def split(self, space: ParameterSpace, *, blocks: int = 1, slowest: float = 0.0) -> Iterator[Fold]:
-        """Yield all folds; `held_out` explains `blocks`, and `TorqueResidual` explains `slowest`."""
+        """Yield all folds. blocks: see `held_out`. slowest: see `TorqueResidual`."""
         for pair in held_out(self.recording, self.folds, blocks):
             fit, test = (
                 TorqueResidual(space, part, cutoff_hz=self.cutoff_hz, rate_hz=RATE_HZ, slowest=slowest)
@@ -100,7 +100,7 @@ def per_joint(squares: np.ndarray) -> np.ndarray:
 
 
 def clearly_worse(more: np.ndarray) -> bool:
-    """Return whether the mean increase of the error, `more` (blocks,), exceeds the standard error of this mean.
+    """Return whether the mean of the error increases `more` (blocks,) exceeds the standard error of this mean.
 
     The one-standard-error rule is from Breiman et al., Classification and Regression Trees, 1984.
     """

@@ -10,8 +10,9 @@ from r2s.identification.structure.cross_validation import CrossValidation, clear
 from r2s.physics.dynamics import with_family
 from r2s.physics.friction import FAMILIES, Family
 
-# largest ratio of a simpler family's torque error to the least error in windows of motion; the ratio was 1.00 to 1.20
-# on simulated arms with Coulomb friction, 1.86 to 6.8 with falling friction (independent_arms.py, seeds 1 to 31)
+# r2s selects a simpler family if its torque error in windows of motion is at most this multiple of the least error.
+# On simulated arms, the multiple was 1.00 to 1.20 with Coulomb friction, 1.86 to 6.8 with falling friction
+# (independent_arms.py, seeds 1 to 31).
 CLOSE = 1.45
 
 
@@ -20,9 +21,9 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
 
     r2s selects a family with more parameters only if it predicts torque clearly better. Rows of slow motion show
     whether friction falls with velocity, but the low-pass mixes friction at rest into these rows. If `slowest` > 0
-    (rad/s) and the best family has no memory, r2s therefore compares the families without memory a second time, in
-    windows in which a joint is faster than `slowest` (modulating_functions.py). The errors and the best family of the
-    second comparison replace those of the first; each comparison divides by its own least error.
+    (rad/s) and the best family has no memory, r2s therefore compares the families without memory again. The second
+    comparison uses windows in which a joint is faster than `slowest` (modulating_functions.py). Its errors and best
+    family replace those of the first; each comparison divides by its least error.
 
     Raises:
         UserError: the recording is too short to hold out motion.

@@ -1,8 +1,8 @@
 """Decide whether an identification corrects the lateness of link-side torque and of the logged dq.
 
 The log alone determines the lateness of dq relative to q (r2s/recordings/lateness.py); the lateness of torque needs a
-fit. If an arm filters torque and dq alike, they are equally late and need no correction, because inertial torque and
-friction refer to the same time; a correction of only dq would increase the error. On a physical Panda, dq is 5.3 ms
+fit. If an arm filters torque and dq alike, both are equally late and need no correction, because inertial torque and
+friction then refer to the same time. Correcting only dq would increase the error. On a physical Panda, dq is 5.3 ms
 late and torque about 2 ± 0.5 ms. Correcting only the Panda's dq raised the error on held-out motion of the training
 data; the residual of the fit did not reveal this increase.
 """
@@ -20,7 +20,8 @@ from r2s.identification.structure.cross_validation import RATE_HZ, CrossValidati
 from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
-SURE = 4.0  # standard deviations: 3, raised by a third, because 95 % intervals covered 85 % due to model error
+# standard deviations of a clear delay: 3, plus a third, because model error made 95 % intervals cover only 85 %
+SURE = 4.0
 UNCLEAR = 2.0  # standard deviations between an estimated delay and the largest plausible one
 BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted motion have similar speeds
 
@@ -28,11 +29,11 @@ BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether to estimate the delay of torque, "alike": whether torque and dq are equally late}.
 
-    If dq is on time or has an unknown lateness, r2s estimates the delay of torque unless this delay is clearly below
-    LATE_S: a delay fixed at 0 would have no uncertainty. If dq is late, r2s first fits torque with corrected dq, and
-    corrects torque and dq if torque clearly has a delay in this fit. If torque has no clear delay, r2s corrects only
-    dq; but if this correction hardly lowers the error of held-out torque (by one standard error or less), r2s treats
-    torque and dq as equally late. With fewer than 2 folds, r2s corrects only dq if torque has no clear delay.
+    If dq is on time or has an unknown lateness, r2s estimates the delay of torque, because a delay fixed at 0 would
+    have no uncertainty. r2s fixes this delay only if it is clearly below LATE_S. If dq is late, r2s first fits torque
+    with corrected dq. If this fit shows a clear delay of torque, r2s corrects torque and dq; otherwise only dq. If
+    correcting only dq hardly lowers the error of held-out torque (by one standard error or less), r2s treats torque
+    and dq as equally late. With fewer than 2 folds, r2s skips this comparison.
     """
     on_time = not np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure).any()
     if DELAY in terms:

@@ -28,9 +28,10 @@ class AdapterComparison:
 
     Attributes:
         measures: {key: compared measure}. headline: the measure that summarizes a row.
-        scores: a line per measure, condition and row: `mean`, 95 % interval `low` to `high`; `difference` from the
-            row `reference` (None: no reference); 95 % interval `worse_low` to `worse_high` of how much worse the row
-            is; counts of `stopped` episodes, episodes common to all rows (`asked`), averaged `episodes`, and `arms`.
+        scores: a line per measure, condition and row. `low` to `high` is the 95 % interval of `mean`. `difference` is
+            the mean minus that of the row `reference` (None: no reference); `worse_low` to `worse_high` is the 95 %
+            interval of how much worse the row is. Counts: `stopped` episodes, `asked` (episodes common to all rows),
+            `episodes` in the mean, `arms`.
         losses: table with a line per condition and row. The column `value` is the mean of the headline measure in the
             condition; the column `nominal` is its mean over the same arms and episodes in the nominal condition.
         costs: table with a line per row. The column `us` is the adapter's computing time per cycle, microseconds.
@@ -98,7 +99,7 @@ def in_common(part: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
 
 
 def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return the table `AdapterComparison.losses` from `shared`, the outputs of `in_common` for all conditions."""
+    """Return the table `AdapterComparison.losses`. shared: outputs of `in_common` for all conditions, joined."""
     key = ["row", "arm", "goal"]
     values = shared.rename(columns={measure: "value"})
     nominal = values.loc[values["condition"] == NOMINAL, [*key, "value"]].rename(columns={"value": "nominal"})
@@ -110,15 +111,14 @@ def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | 
     """Return the lines of the table `AdapterComparison.scores` for one measure and one condition.
 
     An episode without a finite value in one row, such as a stopped episode without an RMSE, is omitted in all rows. A
-    row that has no finite value at all does not make other rows omit episodes. The mean of a single episode has no
-    interval.
+    row without any finite value does not affect the other rows. The mean of a single episode has no interval.
 
     Args:
         shared: output of `in_common`. measure: the compared measure. reference: {row: its reference row or None}.
         seed: seed of the bootstrap.
     """
     wide = shared.pivot(index=["arm", "goal"], columns="row", values=measure.key)[list(shared["row"].unique())]
-    wide = wide.replace([np.inf, -np.inf], np.nan)  # a stopped episode has no distance; some tasks report inf
+    wide = wide.replace([np.inf, -np.inf], np.nan)  # for a stopped episode, some tasks report inf
     stopped = shared.groupby("row", sort=False)["arm_stopped"].sum()
     power = 2 if measure.root_mean_square else 1
     kept = wide.dropna(axis=1, how="all").dropna()
@@ -146,10 +146,10 @@ def _interval(draws: np.ndarray, count: int) -> tuple[float, float]:
 
 
 def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]], list[str]]:
-    """Return {row name: transfers} with the shortest distinct names, and lines that explain the names of policies.
+    """Return {row name: transfers}, and lines that explain the names of policies.
 
-    If any arm ran several policies, a row is an adapter with one policy. If each arm ran only one policy, a row
-    combines all policies of an adapter.
+    If any arm ran several policies, a row is an adapter with one policy. Otherwise, a row combines all policies of an
+    adapter.
     """
     of_arm: dict[str, set[str]] = {}
     for r in found:
@@ -175,7 +175,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return {path: short path}: the last k components of each path, with the least k that tells the paths apart."""
+    """Return {path: short path}: the last k components of each path, with the smallest k for which they differ."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -184,7 +184,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the reference of row `name`: adapt=none with its policy, else the only adapt=none row, else None."""
+    """Return the adapt=none row to compare `name` with: one with a common policy, else the only one, else None."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]
@@ -192,7 +192,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Describe a row: headline measure in its worst condition, and what is significantly worse than the reference."""
+    """Describe a row: headline measure in the worst condition, measures significantly worse than the reference."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:

@@ -25,7 +25,7 @@ ABOUT = (
 
 
 def tables(found: AdapterComparison) -> dict[str, pd.DataFrame]:
-    """Return {title: table of strings}: one per measure, one of costs and, after a stop, one of stopped episodes."""
+    """Return {title: table of strings}: per measure, of costs and, if an episode was stopped, of stopped episodes."""
     s = found.scores
     out = {m.heading: _cells(s[s["measure"] == key], m) for key, m in found.measures.items() if len(s)}
     first = s[s["measure"] == found.headline.key]
@@ -55,7 +55,7 @@ def _square(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def lines(found: AdapterComparison) -> list[str]:
-    """Return lines of text about the tables: a verdict per row, names of policies, episodes that the means omit."""
+    """Return lines of text about the tables: a verdict per row, names of policies, and omitted episodes."""
     s = found.scores
     out = [verdict(found, row) for row in found.runs]
     if len(s) and not s["stopped"].any():

@@ -5,7 +5,7 @@ from typing import Any
 
 NOMINAL = "nominal"
 IDENTITY = ("_target_", "name", "variant", "seed", "noise", "address")  # keys of conf/arm that identify the arm
-SETTINGS: dict[str, tuple[Any, str]] = {  # keys of conf/arm that set a condition -> nominal value, words
+SETTINGS: dict[str, tuple[Any, str]] = {  # key of conf/arm -> nominal value, description
     "payload": (0.0, "{} kg"),
     "declared_payload": (0.0, "{} kg declared"),
     "friction_scale": (1.0, "friction x {}"),
@@ -18,23 +18,23 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     """Return the settings of conf/arm that differ from their nominal values, such as {"payload": 1.0}.
 
     Args:
-        arm: config of the arm. typed: config keys that the user overrides; a key that begins with "arm.", such as
-            arm.live, also counts as a setting, unless IDENTITY contains the key.
+        arm: config of the arm. typed: config keys that the user overrides. Those of the arm, such as arm.live, are
+            settings too, except the keys in IDENTITY.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
     values = {k: _plain(arm[k]) for k in keys if k in arm and k not in IDENTITY}
 
     def empty(key: str, value: Any) -> bool:
-        return "payload" in key and not isinstance(value, str) and not _size(value)  # a string is a run folder
+        return "payload" in key and not isinstance(value, str) and not _size(value)  # a string: payload's run folder
 
     return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and not empty(k, v)}
 
 
 def without_common(conditions: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the `conditions` without settings that are equal in all of them, such as the surface of a task's arms.
+    """Return the `conditions` without the settings that are equal in all conditions, such as the surface of a task.
 
-    Keys of SETTINGS remain, because SETTINGS states their nominal values.
+    The keys of SETTINGS remain even if equal, because their nominal values are known.
     """
     first = conditions[0]
     common = {k for k in first.keys() - SETTINGS if all(k in c and c[k] == first[k] for c in conditions)}

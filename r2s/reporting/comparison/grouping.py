@@ -7,7 +7,7 @@ from typing import Any
 
 from r2s.reporting.comparison.trainings import Trained
 
-LONGEST = 40  # largest number of letters in a label; longer labels would take space from the figure
+LONGEST = 40  # largest number of letters in a label; longer labels would leave too little space for the figure
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ def group(runs: Sequence[Trained]) -> Groups:
     """Group the runs by their settings, so that the runs of a group differ only in their seeds.
 
     A group's label is the algorithm and the overrides of settings that differ among groups. A setting that the label
-    omits has its default value, or the same value in all groups. The algorithm and a number, such as "tqc #1",
-    replace a label longer than LONGEST letters (`Groups.key`).
+    omits has its default value, or the same value in all groups. A label longer than LONGEST letters becomes the
+    algorithm and a number, such as "tqc #1" (see `Groups.key`).
     """
     sets: dict[str, list[Trained]] = {}
     for run in runs:
@@ -62,7 +62,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
     names = [_joined(seeds[0].algo, p) for seeds, p in zip(sets, parts, strict=True)]
     for name in list(names):
         twins = [k for k, other in enumerate(names) if other == name]
-        if len(twins) > 1:  # the sets differ in settings without an override, such as settings of +experiment=
+        if len(twins) > 1:  # the sets differ in settings that no override names, such as settings of +experiment=
             changed = differing([sets[k][0].settings for k in twins])
             for k in twins:
                 more = {_short(s): sets[k][0].settings[s] for s in changed if s in sets[k][0].settings}
@@ -71,7 +71,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: settings that differ}: algo.* within the algorithm, other settings across all algorithms."""
+    """Return {algorithm: keys that differ}: algo.* compared within the algorithm, other keys among all algorithms."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}
@@ -82,7 +82,7 @@ def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys whose values differ among the mappings `settings`; a missing key counts as None."""
+    """Return the keys whose values differ among the mappings `settings`; a missing key has the value None."""
     keys = dict.fromkeys(k for s in settings for k in s)
     return [k for k in keys if len({repr(s.get(k)) for s in settings}) > 1]
 

@@ -1,4 +1,4 @@
-"""Write the page of stage=compare for trainings: tables, learning curves and scores of groups of seeds."""
+"""Write the page of stage=compare for trainings: tables, learning curves and scores per group."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -50,14 +50,14 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 
 
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
-    """Return how much a measure depends on the settings of an algorithm, for each algorithm with several settings.
+    """Return, for each algorithm with several groups, how much a measure depends on the settings of the groups.
 
-    `best`, `median` and `worst` are the best, median and worst interquartile mean of all settings. `best` is
-    optimistic, because the same seeds select and score the setting. For `held_out`, each seed scores the setting that
-    is best at the other seeds; `held_out` is the mean of these scores. `spread` says by how much `held_out` is better
-    than the mean over seeds of the median score of all settings; `low` and `high` limit the 95 % interval of
-    `spread`. With fewer than two seeds common to all settings, `held_out` and `spread` are nan. An algorithm
-    with a small `spread` needs little tuning.
+    `best`, `median` and `worst` are the best, median and worst interquartile mean of all groups. `best` is
+    optimistic, because the same seeds select and score the group. For `held_out`, each seed scores the group that is
+    best at the other seeds; `held_out` is the mean of these scores. The median score of all groups is subtracted from
+    the score in `held_out` at each seed; `spread` is the mean difference (positive: better), and `low` to `high` is
+    its 95 % interval. An algorithm with a small `spread` needs little tuning. With fewer than two seeds common to all
+    groups, `held_out` and `spread` are nan.
 
     Args:
         grouped: groups of trainings. measure: key of the measure; if None, the last of `MeasureTable.selection`.
@@ -81,11 +81,11 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return, for S seeds, the score (S,) of the setting best at other seeds, and all settings' median score (S,).
+    """Return two scores (S,) for S seeds: of the group that is best at the other seeds, and the median of all groups.
 
     Args:
-        settings: {seed: score} of each setting; a larger score is better. Only seeds common to all settings are used;
-            the result is None for fewer than two common seeds.
+        settings: {seed: score} of each group; a larger score is better. Only seeds common to all groups are used; the
+            result is None for fewer than two common seeds.
     """
     seeds = sorted(set.intersection(*(set(s) for s in settings)))
     if len(seeds) < 2:
@@ -96,7 +96,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line per algo or reward setting with its best value at an end of three or more tried values."""
+    """Return a line for each algo or reward setting whose best value is an extreme of three or more tried values."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -132,10 +132,10 @@ def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
 def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
     """Return a grid of x (points,), and interquartile mean, minimum and maximum of y over seeds as (3, points).
 
-    The curves of all seeds are interpolated to the grid, which covers their common range of x.
+    The curves of all seeds are interpolated to the grid. The grid covers the range of x that all curves share.
     """
     curves = [r.curve for r in group]
     grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)
-    with np.errstate(invalid="ignore"):  # values are infinite where arms were stopped: no curve there
+    with np.errstate(invalid="ignore"):  # values are inf where arms were stopped: no curve there
         values = np.stack([np.interp(grid, c[x], c[y]) for c in curves], -1)
     return grid, np.stack([interquartile_mean(values), values.min(-1), values.max(-1)])

@@ -41,7 +41,7 @@ def interval(
 
 
 def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return bootstrap means (DRAWS, A) of A rows; each draw uses the same resampled arms and episodes for all rows.
+    """Return bootstrap means (DRAWS, A) of A rows; a draw uses the same resampled arms and episodes for all rows.
 
     Args:
         each: one array (E, A) per arm, with the values of E episodes in A rows of a comparison. rng: random

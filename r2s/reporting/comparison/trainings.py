@@ -16,16 +16,16 @@ from r2s.reporting.trackers.tracker import flat
 from r2s.runs import parts_of
 from r2s.tasks.measures import MeasureTable
 
-# config groups that a training reads, besides its seed; runs with equal values in all these groups are one group
+# config groups that affect a training; runs of one algorithm that agree in all of them differ only in their seeds
 READ = (
     *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
 )
 ALIKE = ("robot", "task")  # config groups that must have equal values in comparable runs
-# {key of `origin`: why runs with different values are not comparable}; code affects results, a machine affects speed
+# {key of `origin`: reason if two runs differ in it}; code affects the results, a machine affects the speed
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
-MOST_BUDGETS = 2.0  # largest ratio of comparable budgets: beyond this ratio, the longer training wins by its length
+MOST_BUDGETS = 2.0  # largest ratio of comparable budgets: beyond it, the longer training would win by its length
 UNFINISHED = {"running": "unfinished"}
 
 
@@ -188,7 +188,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
     """Return the largest set of comparable runs, and {run: reason} for all other runs.
 
     Runs are comparable if robot, task, number of evaluation episodes, use of +experiment=toy and all keys of ORIGIN
-    agree, and if the ratio of their budgets is at most `MOST_BUDGETS`. Of sets of equal size, sets without
+    agree. The ratio of their budgets must be at most `MOST_BUDGETS`. Of sets of equal size, sets without
     +experiment=toy have priority, then sets with more env steps. Only the first run with given settings and seed is
     kept, because a repetition adds no evidence.
     """
@@ -209,7 +209,7 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
 
 def _difference(run: Trained, first: Trained) -> str:
-    """Return why `run` is not comparable with `first`, a set's run with the least budget; "" if it is comparable."""
+    """Return why `run` is not comparable with `first`, the run with the least budget in a set; "" if comparable."""
     if run.toy != first.toy:
         return "+experiment=toy" if run.toy else "not +experiment=toy"
     keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]
@@ -231,7 +231,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """List names as ["a, b (failed)", "c (unfinished)"]: up to `most` names per reason, cut to `width` letters."""
+    """List names as ["a, b (failed)", "c (unfinished)"]: up to `most` per reason, each cut to `width` letters."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

@@ -20,7 +20,7 @@ from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
 FILES = ("config.yaml", "policy.yaml", "overrides.yaml", "summary.json")
-ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that depend on the arm instead of being settings of the adapter
+ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that describe the arm, and so are no settings of the adapter
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def _cost(path: Path) -> float:
 def _names(goals: np.ndarray) -> Iterator[str]:
     """Yield a name for each goal; a goal has the same name in all transfers, and a number distinguishes equal goals.
 
-    Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometers.
+    Goals are rounded to 10 micrometers, because two machines may compute them with different last digits.
     """
     seen: Counter[bytes] = Counter()
     for goal in goals:
@@ -119,8 +119,8 @@ def _names(goals: np.ndarray) -> Iterator[str]:
 def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[str, str]]:
     """Return the largest set of comparable transfers, and {run: reason} for all other transfers.
 
-    Transfers are comparable if robot, task and number of goals agree, and if some goals are the same. Of several runs
-    with one policy, adapter, arm and condition, only the latest run is used.
+    Transfers are comparable if robot, task and number of goals agree, and if at least one goal is common to both. Of
+    several runs that agree in policy, adapter, settings, arm and condition, only the latest is used.
     """
     first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
     apart = {r.folder.name: why for r in found if (why := _difference(r, first))}

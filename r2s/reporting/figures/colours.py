@@ -13,8 +13,8 @@ OTHERS = (
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
-    For each of the words "measured", "nominal" and "identified", the first label that contains the word has the color
-    of the word in KNOWN. All labels without a color in KNOWN cycle through the twelve colors in OTHERS.
+    KNOWN has a color for each of the words "measured", "nominal" and "identified". The first label that contains such
+    a word has the word's color. All other labels cycle through the twelve colors in OTHERS.
     """
     found: dict[str, str] = {}
     others = 0

@@ -53,7 +53,7 @@ def traces_figure(path: Path, episodes: Mapping[str, Episodes], reward: str) -> 
 
 
 def latency_figure(path: Path, seconds: Mapping[str, Sequence[float]]) -> Path:
-    """Draw a histogram in ms, with logarithmic axes, for each list of latencies {name: list of s}."""
+    """For each entry of {name: latencies, s}, draw a histogram in ms with logarithmic axes."""
     present = {name: 1e3 * np.array(values) for name, values in seconds.items() if len(values)}
     with panels(path, len(present), len(present), "latencies on this computer", height=2.4) as axes:
         for axis, (name, ms) in zip(axes, present.items(), strict=True):

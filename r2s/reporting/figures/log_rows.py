@@ -2,8 +2,8 @@
 
 import numpy as np
 
-MOST_POINTS = 4000  # points of a line in a figure: three per pixel of a panel
-PAUSE = 0.1  # s, drawn length of a pause of any length
+MOST_POINTS = 4000  # largest number of points of a line in a figure: about three per pixel of a panel
+PAUSE = 0.1  # s, length to which each pause is shortened
 
 
 def thin(count: int, most: int = MOST_POINTS) -> slice:
@@ -12,7 +12,7 @@ def thin(count: int, most: int = MOST_POINTS) -> slice:
 
 
 def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
-    """Return indices that sample a log with times t (T,) s at about `rate` Hz, including its first and last row."""
+    """Return indices that sample a log with times t (T,) s at about `rate` Hz, including its first and last time."""
     grid = np.arange(t[0], t[-1], 1 / rate)
     return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
 

@@ -16,7 +16,7 @@ LEGEND_WIDTH = 160  # number of letters that fit into WIDTH, in one line of the 
 # fixed inches around and between panels: matplotlib's layout engines are slow, because they measure every text
 LEFT, RIGHT, TOP, BOTTOM, ACROSS, DOWN, LINE = 0.8, 0.15, 0.75, 0.5, 0.85, 0.75, 0.22
 LETTER = 0.085  # inches per letter of a tick label left of the first panel
-TITLE, AGAIN = 0.9, 0.2  # inches added to the heights of the rows: once, and for each row after the first
+TITLE, AGAIN = 0.9, 0.2  # inches of height added to the rows of panels: per figure, and per row after the first
 
 
 @contextmanager

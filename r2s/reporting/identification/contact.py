@@ -43,7 +43,7 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def press_table(found: ContactEstimate) -> pd.DataFrame:
-    """Tabulate the RMSE of modeled normal force against joint torques, for fitted presses and the held-out press."""
+    """Tabulate the RMSE between modeled normal force and force from joint torques: fitted and held-out presses."""
     parts = {"fitted presses": found.training, "held-out press": found.validation}
     cells = {
         name: [f"{part.summary()['seconds']:.1f}", *(number(part.rmse(side), "{:.2f}") for side in (0.0, 1.0, -1.0))]
@@ -55,7 +55,7 @@ def press_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def contact_figure(path: Path, found: ContactEstimate) -> Path:
-    """Draw the normal force over penetration depth with a 95 % band, and over time in the held-out contact."""
+    """Draw the normal force over penetration depth with a 95 % band, and over time in the held-out press."""
     colour = colours(["measured", "identified"]) | {"measured": "#30363d"}
     validation = found.validation
     with panels(path, 1 + (validation is not None), 2, "normal force of the surface", height=3.6) as axes:

@@ -15,7 +15,7 @@ from r2s.reporting.figures.log_rows import thin, without_pauses
 from r2s.reporting.figures.panels import joint_panels, log_axis, panels
 
 LONGEST = 30.0  # s of torque in a figure; more would look like a solid band
-SCANS = {  # searches whose costs in the history are not comparable -> title and color of the shaded area
+SCANS = {  # search without comparable costs -> title and color of its shaded area
     "family": ("comparison of friction families", "#9aa0a6"),
     "terms": ("choice of terms", "#57ab5a"),
     "breakaway": ("search for breakaway", "#c9a227"),
@@ -128,7 +128,7 @@ def friction_figure(
 def _band(
     axis: Axes, speed: np.ndarray, torque: np.ndarray, limits: tuple[float, float], colour: str, label: str
 ) -> tuple[float, float]:
-    """Draw the 95 % band of S torque draws (T, S) Nm; return y limits that cut a wide band but show the curves."""
+    """Draw the 95 % band of S torque draws (T, S) Nm; return y limits that show the curves and cut a wide band."""
     low, high = limits
     bottom, top = np.quantile(torque, [0.025, 0.975], axis=1)
     axis.fill_between(speed, bottom, top, label=f"95 % band, {label}", color=colour, alpha=0.25, linewidth=0)
@@ -137,7 +137,7 @@ def _band(
 
 
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw each search's cost over time, relative to its first cost; for searches in SCANS, shade the time instead.
+    """Draw each search's cost over time, relative to its first cost; for a search in SCANS, shade its duration.
 
     Costs are comparable only within one search, because each search uses new weights of the residuals.
     """

@@ -17,7 +17,7 @@ TICKS_HZ = (6, 10, 20, 50, 100)
 
 
 def gears_table(found: GearEstimate) -> pd.DataFrame:
-    """Return a row per joint: stiffness, 95 % interval, deflection at tau_max, and whether the data determine it."""
+    """Return a row per joint: stiffness, 95 % interval, deflection, misfit, whether the stiffness is determined."""
     low, high = np.percentile(found.draws, COVERED, axis=0)
     stiffness, rows = found.drives.stiffness, {}
     for i, value in enumerate(stiffness):
@@ -33,9 +33,9 @@ def gears_table(found: GearEstimate) -> pd.DataFrame:
 
 
 def gears_figure(path: Path, found: GearEstimate) -> Path:
-    """Draw each motor's response over frequency, measured and fitted, relative to that of a rigid rotor."""
+    """Draw each motor's angle per torque over frequency, measured and fitted, relative to that of the rotor alone."""
     colour = colours(["measured", "identified"])
-    inverse = (2 * np.pi * LINES_HZ) ** 2 * found.drives.rotor[:, None]  # response of the rotor alone: 1
+    inverse = (2 * np.pi * LINES_HZ) ** 2 * found.drives.rotor[:, None]  # scales the response of the rotor alone to 1
     measured: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 4, "color": colour["measured"]}
     with joint_panels(path, len(found.tau_max), "motor angle per torque, relative to the rotor alone") as axes:
         for i, axis in enumerate(axes):

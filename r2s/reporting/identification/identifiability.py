@@ -6,11 +6,11 @@ from r2s.identification.link_inertia import LINK
 from r2s.identification.result import SHARPER, IdentificationResult
 from r2s.reporting.document import Item
 
-MOST_LINES = 10  # largest number of listed null directions
+MOST_LINES = 10  # largest number of listed combinations of parameters
 
 
 def identifiability(found: IdentificationResult) -> list[Item]:
-    """Return sentences on parameters at nominal values or bounds, and undetermined combinations of parameters."""
+    """Return sentences on parameters that remained nominal or reached a bound, and undetermined combinations."""
     space = found.space
     count, total = int(found.found.identifiable.sum()), len(space.names)
     items: list[Item] = [
@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """List up to MOST_LINES parameter combinations that only the prior determines; count all other combinations."""
+    """List up to MOST_LINES parameter combinations that only the prior determines; state the number of the others."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}

@@ -1,6 +1,6 @@
 """Write the page of an identification: Tables I to IV of the paper for this arm, identifiability, and figures.
 
-In tables, "old" is the nominal and "new" the identified model. Intervals contain 95 % of the posterior.
+In tables, "old" denotes the nominal model and "new" the identified model. Intervals contain 95 % of the posterior.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,7 +52,7 @@ FIGURE_WINDOW_S = 0.5  # s, shortest open-loop window in the position figure, un
 
 
 class Evidence(NamedTuple):
-    """Content of an identification's page that `IdentificationResult` does not contain.
+    """What the page of an identification shows besides `IdentificationResult`.
 
     Attributes:
         pictures: {"torque": PNG file, ...}. fastest: (n,) rad/s, 99.5 % quantile of each joint's speed in validation.

@@ -89,7 +89,7 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
 
 
 def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
-    """Tabulate the base parameters by link (row) and by the first parameter of their combination (column)."""
+    """Tabulate the base parameters; the first parameter of a combination sets its row (link) and column (name)."""
     columns: dict[str, list[str]] = {}
     rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
     for first, row in zip(base["parameter"], rows.tolist(), strict=True):
@@ -113,7 +113,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     known = dict(zip(space.names, found.found.identifiable, strict=True))
 
     def cells(get: Callable[[Dynamics], np.ndarray], blocks: Sequence[str]) -> list[str]:
-        """Return a cell per link with the value of `get`, and ? unless all `blocks` of the link are identifiable."""
+        """Return a cell per link with the value of `get`, with a ? unless all its `blocks` are identifiable."""
         low, high = np.quantile(get(draws), [0.025, 0.975], axis=0)
         rows = zip(get(before), get(d), low, high, strict=True)
         behind = [[f"{b}[{j + 1}]" for b in blocks if b in space.blocks] for j in range(robot.n)]
@@ -129,7 +129,7 @@ def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     if full:
         columns = {"mass, kg": cells(lambda x: x.mass, LINK[:1])}
         for k, axis in enumerate("xyz"):
-            # the log-Cholesky factor is upper triangular: coordinate k of the center depends on t_k to t_3
+            # the log-Cholesky factor is upper triangular: coordinate k of the center depends on elements t_k to t_3
             columns[f"centre {axis}, mm"] = cells(partial(_centre, k), LINK[7 + k :])
         words = (
             "Mass and centre of mass in the link's frame, old → new. A value is identifiable (no ?) if all its "

@@ -13,7 +13,7 @@ CONTRIBUTIONS = (
     "RMSE: torque of the fit to all training recordings, mean over joints; left out: of a fit to the others. The "
     "last column tells what a recording's information adds: how much wider intervals would be without it."
 )
-NARROWER = 1.02  # least ratio of interval widths, without over with a recording, if the recording narrows it
+NARROWER = 1.02  # least factor by which an interval widens without a recording, if that recording adds information
 
 
 def contribution_table(parts: Sequence[Contribution], names: Sequence[str]) -> pd.DataFrame:

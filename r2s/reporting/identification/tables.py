@@ -34,7 +34,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
     if set(LINK) & set(space.blocks):
         tables["links, nominal → identified"] = _links(robot, found)
     dynamics = found.dynamics
-    if np.any(dynamics.breakaway) and not dynamics.family.has_memory:  # laws with presliding model stiction
+    if np.any(dynamics.breakaway) and not dynamics.family.has_memory:  # presliding itself models stiction
         rule = "of the net torque at the joint" if dynamics.stiction_model == "net" else "of command and offset"
         tables[f"breakaway, Nm {rule}"] = _breakaway(robot, found)
     return tables | error_tables(robot, summary)
@@ -43,7 +43,7 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
 def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
     """Return a parameter's row heading and a cell per joint: value, ± half the interval's width, and nominal value.
 
-    If all joints have the same nominal value, the heading contains this value instead of the cells.
+    A nominal value that all joints share is in the heading, not in the cells.
     """
     unit = units()[block]
     if unit == "rad":

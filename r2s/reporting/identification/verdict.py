@@ -51,7 +51,7 @@ def width_table(expected: Widths, n: int) -> pd.DataFrame:
 
 
 def print_verdict(console: Console, robot: Robot, verdict: Verdict, title: str) -> None:
-    """Print the checks of a verdict as a table, and expected interval widths of the verdict, if any, as a table."""
+    """Print the table of a verdict's checks and, if there are expected interval widths, their table."""
     print_table(console, verdict_table(verdict), title, sentences=True)
     if verdict.expected is not None:
         print_table(console, width_table(verdict.expected, robot.n), WIDTHS, LEGEND)

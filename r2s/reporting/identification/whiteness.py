@@ -1,4 +1,4 @@
-"""Test the whiteness of the torque residual: compare the residual with white noise after the same filter."""
+"""Test the whiteness of the torque residual: compare the residual with equally filtered white noise."""
 
 from collections.abc import Mapping
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Run each tracker in a thread of its own, so that no tracker can delay or end a run.
+"""Run each tracker in a separate thread, so that no tracker can delay or end a run.
 
 If a tracker fails, r2s prints one warning and does not call the tracker again.
 """
@@ -15,7 +15,7 @@ from typing import Any
 from r2s.reporting.trackers.tracker import Tracked, Tracker, flat
 
 MOST_WAITING = 10_000  # largest number of rows that wait for a slow tracker: some megabytes
-LAST_S = 60.0  # s for which a run, at its end, waits for each tracker
+LAST_S = 60.0  # s, longest wait for each tracker at the end of a run
 FILES = ("recording.rrd", "report.html", "report.md", "parameters.yaml", "policy.onnx", "measures.json")
 
 
@@ -29,14 +29,14 @@ class AsyncTracker:
         self._thread.start()
 
     def send(self, call: Callable[[Tracker], None] | None) -> None:
-        """Queue a call of the tracker, or None to end the thread."""
+        """Queue a call, which the thread executes; None ends the thread."""
         try:
             self._queue.put_nowait(call)
         except Full:
             self._give_up(f"{MOST_WAITING} rows are waiting")
 
     def join(self, seconds: float) -> None:
-        """Wait at most `seconds` s for the queued calls; then warn and drop the remaining calls."""
+        """Wait at most `seconds` s for the queued calls; if calls remain, warn and drop them."""
         self._thread.join(seconds)
         if self._thread.is_alive():
             self._give_up(f"not finished {seconds:.0f} s after the run")

@@ -23,7 +23,7 @@ BATCH = 100  # parameters per call: MLflow's limit
 
 
 class Logger(MLFlowLogger):
-    """TorchRL's MLflow logger, which can continue a run because mlflow.start_run receives the arguments `start`."""
+    """TorchRL's MLflow logger; it passes `start` to mlflow.start_run, and so can continue a run."""
 
     def __init__(self, *args: Any, start: dict[str, Any], **kwargs: Any):
         self._start = start
@@ -65,7 +65,7 @@ class Mlflow(LoggerTracker):
             store = Path(self._uri.removeprefix(SQLITE)).absolute()
             store.parent.mkdir(parents=True, exist_ok=True)
             lock, artifacts = FileLock(f"{store}.lock"), str(store.parent / "mlartifacts")
-        with lock:  # otherwise jobs of a sweep create the tables at the same time
+        with lock:  # otherwise jobs of a sweep may create the tables at the same time
             start = {"run_id": known} if known else {"run_name": run.name, "tags": tags}
             self._logger = Logger(self._experiment, self._uri, artifact_location=artifacts, start=start)
         run.keep("mlflow", self._logger.experiment.info.run_id)

@@ -32,7 +32,7 @@ class Tensorboard(LoggerTracker):
             self._begins = False
             self._settings()
         super().log(table, numbers, step)
-        self._logger.flush()  # otherwise a killed run loses its rows of the last two minutes
+        self._logger.flush()  # otherwise a killed run would lose its rows of the last two minutes
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
         """Log the figures, the paths of the files, and the status."""
@@ -48,7 +48,7 @@ class Tensorboard(LoggerTracker):
         self._logger.shutdown()
 
     def _settings(self) -> None:
-        """Log the settings and the measure for comparing runs; do not call add_hparams, which begins a new run."""
+        """Log the settings and the measure for comparing runs; add_hparams would begin a new run."""
         from torch.utils.tensorboard.summary import hparams
 
         metric = {f"summary/best/{self._run.measures.selection[0]}": 0}

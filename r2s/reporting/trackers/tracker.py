@@ -11,7 +11,7 @@ from r2s.files import write_json
 from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
-FILE = "trackers.json"  # file in the run folder with the run's id in each tracker, which a resumed run uses again
+FILE = "trackers.json"  # file in the run folder: {tracker: id of the run}, which a resumed run needs
 WRITING = Lock()  # every tracker has its own thread, and all threads write FILE
 
 
@@ -64,8 +64,8 @@ class Tracked:
 class Tracker(Protocol):
     """Interface to a tool that shows runs.
 
-    r2s makes a tracker before the run folder and calls the tracker from one thread. After an exception in a tracker,
-    the run prints one warning, does not call the tracker again, and continues.
+    r2s constructs a tracker before it creates the run folder, and calls the tracker's methods from one thread. After
+    an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
     """
 
     def start(self, run: Tracked) -> None:

@@ -204,7 +204,7 @@ def _shape(model: mujoco.MjModel, geom: int, colour: np.ndarray) -> rr.AsCompone
     solid: dict[str, Any] = {"colors": colour, "fill_mode": rr.components.FillMode.Solid}
     match int(model.geom_type[geom]):
         case kind.mjGEOM_CAPSULE:
-            below = [[0, 0, -half]]  # rerun's capsule starts at its frame, MuJoCo's is centered on it
+            below = [[0, 0, -half]]  # rerun's capsule starts at the origin of its frame; MuJoCo's is centered there
             return rr.Capsules3D(lengths=2 * half, radii=radius, translations=below, **solid)
         case kind.mjGEOM_CYLINDER:
             return rr.Cylinders3D(lengths=2 * half, radii=radius, **solid)

@@ -40,7 +40,7 @@ class Episode:
 
     @property
     def distance(self) -> np.ndarray:
-        """Distance (T,) m of the end effector, or of a pushed box, from the goal or the path's current point."""
+        """Distance (T,) m from the end effector, or a pushed box, to the goal or the current point of the path."""
         return np.linalg.norm((self.ee if self.box is None else self.box[:, :3]) - self.goal, axis=-1)
 
     @property
@@ -69,7 +69,7 @@ class Content:
     """Content of a rerun recording; the viewer shows a tab only for content that is not empty.
 
     Attributes:
-        measures: the task's measures, required with `episodes` and `curves`.
+        measures: the task's measures; `episodes` and `curves` need them.
         episodes: {label: episodes}, one arm per label; the k-th episodes of all arms start at the same time.
         overlays: {label: Overlay}; the viewer shows each overlay as a tab of torque plots.
         curves: {run: evaluations.csv}; all curves share one tab.
@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """The task's measures for learning curves and comparisons, if `curves` has their columns."""
+        """The task's measures for learning curves and comparisons, as far as `curves` has their columns."""
         table = self.measures
         if table is None:
             return []
@@ -95,7 +95,7 @@ class Content:
 
 
 def external_overlay(r: Recording) -> dict[str, Overlay]:
-    """Return {label: overlay of external torque and reported contact (0 or 1)}; {} without external torque."""
+    """Return {label: overlay of external torque and reported contact (0 or 1)}, or {} without external torque."""
     torque = r.signals.get("tau_ext_hat_filtered")
     if torque is None or not torque.any():
         return {}

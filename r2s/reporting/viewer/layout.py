@@ -1,4 +1,4 @@
-"""Set the viewer layout of a Rerun recording: tabs for arms, learning curves, each torque overlay and each figure."""
+"""Set the viewer layout of a rerun recording: tabs for arms, learning curves, each torque overlay and each figure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 

@@ -23,7 +23,7 @@ from r2s.reporting.viewer.data import Content, Overlay
 from r2s.reporting.viewer.layout import LEARNING, blueprint, entity, log_series, starts_of
 from r2s.tasks.measures import Measure
 
-OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times the cut-off of the torque's low-pass
+OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times the cutoff of the torque's low-pass
 
 
 def write_recording(path: str | os.PathLike, robot: Robot, content: Content) -> Path:
