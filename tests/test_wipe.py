@@ -42,6 +42,17 @@ def test_the_reference_on_the_true_model_wipes_the_path(task, wiped):
     assert row["contact"] == 1.0
 
 
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (-0.5, 0.2, 0.84)])
+def test_paths_stay_in_the_nominal_plane(task, normal):
+    """On tilted planes too, within `spread`."""
+    normal = np.array(normal) / np.linalg.norm(normal)
+    axes = np.linalg.svd(normal[None])[2][1:]
+    for seed in range(20):
+        path = task.path(np.random.default_rng(seed), axes)
+        np.testing.assert_allclose(path @ normal, 0.0, atol=1e-12)
+        assert np.linalg.norm(path, axis=1).max() <= task.spread
+
+
 def test_goals_lie_on_the_plane_and_in_reach(task):
     """The path stays within `spread`, at the drawn speed, from rest to rest; the tip starts above every surface."""
     starts, goals = fixed_episodes(PANDA, task, 12)

@@ -104,10 +104,11 @@ class WipeTask(SurfaceTask):
         shape = curve(self.kinds[rng.integers(len(self.kinds))], rng, size, axes)
         t = np.arange(self.steps + 1) / self.ctrl_hz - self.begin_s
         path = shape(speed * clock(t.clip(0.0), self.episode_s - REST_S - self.begin_s, self.ramp_s)[0])
-        middle = 0.5 * (path.max(0) + path.min(0))
-        free = self.spread - np.linalg.norm(path - middle, axis=1).max()
+        flat = path @ axes.T  # the path must stay in the plane, so it is centered in the plane's axes
+        flat -= 0.5 * (flat.max(0) + flat.min(0))
+        free = self.spread - np.linalg.norm(flat, axis=1).max()
         about, away = rng.uniform(0, 2 * np.pi), free * np.sqrt(rng.uniform())
-        return path - middle + away * np.array([np.cos(about), np.sin(about)]) @ axes
+        return (flat + away * np.array([np.cos(about), np.sin(about)])) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
         """Return a random force ~ U(force), N, twice: for the start and for the end of the path."""

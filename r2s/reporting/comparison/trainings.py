@@ -217,7 +217,7 @@ def _difference(run: Trained, first: Trained) -> str:
         part = {"robot": "another robot", "task": "another task"}.get(keys[0].split(".")[0], "another evaluation")
         values = f"{run.alike.get(keys[0])}, not {first.alike.get(keys[0])}"
         return f"{part}: {keys[0]}" + (f" is {values}" if len(values) <= 40 else " differs")
-    for key in run.origin.keys() & first.origin.keys():
+    for key in (key for key in first.origin if key in run.origin):
         if run.origin[key] != first.origin[key]:
             return f"{ORIGIN[key]}: {run.origin[key] or 'unknown'}, not {first.origin[key] or 'unknown'}"
     if not run.learned:
