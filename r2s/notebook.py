@@ -34,7 +34,7 @@ def r2s(*words: str) -> Path:
 
 
 def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520) -> None:
-    """Show a run in the notebook: in the rerun viewer, or as figures if rerun-notebook is not installed.
+    """Show a run in the notebook: in the Rerun viewer, or as figures if rerun-notebook is not installed.
 
     Args:
         folder: run folder. figures: names of the figures to show, such as "torque"; without names, show all.

@@ -211,9 +211,9 @@ class Run:
             self.tracker.log(table, row)
 
     def rewind(self, table: str, column: str, most: float) -> list[dict[str, float]]:
-        """Truncate <table>.csv to the rows with `column` <= most; return these rows, and open the file for `log`.
+        """Remove the rows of <table>.csv whose value of `column` exceeds `most`; return the remaining rows.
 
-        Truncation also removes an incomplete last row. The text of the remaining rows does not change.
+        An incomplete last row is also removed. The text of the remaining rows does not change; `log` appends to them.
         """
         path = self.folder / f"{table}.csv"
         if not path.is_file():

@@ -122,7 +122,11 @@ def _model(arm, noise, state, j, angle, side, speed, moved):
 
 @njit(cache=True, error_model="numpy")
 def _rest_or_motion(noise, joints, j, q):
-    """Detect whether joint j rests; a joint at rest that creeps is treated as moving for one cycle."""
+    """Detect whether joint j rests.
+
+    A resting joint whose angle has crept by more than the noise becomes a moving joint. It can rest again in the next
+    cycle if its speed is low.
+    """
     crept, joints[CREEP, j] = joints[CREEP, j], 0.0
     if joints[REST, j] == 1.0:
         joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])

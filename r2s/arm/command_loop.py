@@ -2,8 +2,8 @@
 
 Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives
 only the driver's torques; tests/test_command_loop.py checks that no other code commands an arm. The loop checks for a
-stop request (r2s/arm/stop_request.py) in every cycle. When the driver has stopped the arm, the loop ends the arm's
-motion and raises ArmStopped with the reason of the stop.
+stop request (r2s/arm/stop_request.py) in every cycle. When the driver has brought the arm to rest, the loop calls
+the arm's `stop` and raises ArmStopped with the reason.
 """
 
 import time

@@ -40,7 +40,7 @@ class Memory(NamedTuple):
     """State of the driver of m arms; `drive_cycle` updates this state in place.
 
     Attributes:
-        command: (m, c), the last finite commands. law: (m, k), memory of the control law.
+        command: (m, c), the last finite commands (no NaN, no infinity). law: (m, k), memory of the control law.
         target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `condition_joint`.
         sent: (m, n) Nm, the last torque command.
         held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop without contact still applies this sum.
@@ -100,7 +100,8 @@ class Given(NamedTuple):
 class Bounds(NamedTuple):
     """Settings of the driver: `torque` and `added`, (n,) Nm, bound the target torque and the adapter's torque.
 
-    The driver stops an arm beyond q_low, q_high, dq_max (n,) rad, rad/s, or without finite command for `deadline` s.
+    The driver stops an arm beyond q_low, q_high or dq_max, (n,) rad, rad/s, or `deadline` s after its last finite
+    command.
     spring: (n,) Nm/rad, stiffness for `resist`. factor: gain of the low-pass. fade: number of soft-start cycles.
     """
 
@@ -127,7 +128,11 @@ class Model(NamedTuple):
 
 @njit(cache=True)
 def _watch(i, q, dq, given, bounds, memory):
-    """Store a finite command of arm i, set `why` if the arm must stop, and return whether q and dq are finite."""
+    """Check the inputs of arm i; return whether q and dq contain neither NaN nor infinity.
+
+    Store a new command unless the command or the adapter's torque contains NaN or infinity. Set `why` if the arm must
+    stop.
+    """
     seen = np.isfinite(q).all() and np.isfinite(dq).all()
     helped = given.adds and np.isfinite(given.added[i]).all()
     if given.new and np.isfinite(given.command[i]).all() and helped == given.adds:

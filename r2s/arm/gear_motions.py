@@ -1,4 +1,4 @@
-"""Record an arm while each joint in turn slides slowly under a multisine torque, to identify the gears."""
+"""Record an arm to identify its gears: one joint at a time slides slowly, excited by a multisine torque."""
 
 from collections.abc import Callable
 from dataclasses import replace

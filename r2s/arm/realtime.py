@@ -100,7 +100,7 @@ class Timing:
     success: list[float] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Begin a new motion: forget the times of the last cycle, and store the index of the first success rate."""
+        """Begin a new motion: forget the last cycle's times, store the index in `success` where its rates begin."""
         self._begun, self._last = len(self.success), (0.0, 0.0)
 
     def cycle(self, clock: tuple[float, float, float], state: ArmState, adapts: bool = False) -> None:

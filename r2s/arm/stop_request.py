@@ -49,7 +49,7 @@ def begin_ending() -> None:
 
 
 def serve() -> None:
-    """Record that no motion runs after the stop request; the next signal raises KeyboardInterrupt at once."""
+    """Record that all motions have ended after the stop request; the next signal raises KeyboardInterrupt at once."""
     _request.ending, _request.served = False, True
 
 

@@ -41,8 +41,8 @@ def deviation_weights(space: Space, q: np.ndarray, most: float) -> np.ndarray:
     """Return the weights (T, K + n, n) 1/rad of `DeviationLimits` at postures q (T, n) rad.
 
     The first K limits ensure, to first order, that each distance of a link from the table, an obstacle or another
-    link stays above FENCE_M. The last n limits ensure that each joint deviates by at most `most` rad. All joints may
-    deviate by DEVIATION even near an obstacle, so that an arm that starts too near to the obstacle can move away.
+    link stays above FENCE_M. The last n limits keep each joint within `most` rad of its planned angle. All joints
+    may deviate by DEVIATION even near an obstacle, so that an arm that starts too near to the obstacle can move away.
     """
     distances, levers = space.measured(q)
     levers = levers[:, 1:]

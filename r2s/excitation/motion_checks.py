@@ -178,9 +178,9 @@ class Space:
     an arm stops beyond its `DeviationLimits`, which depend on the distances along the motion.
 
     Attributes:
-        clearance: (K,) m, smallest required distances. Element 0 is for the end effector above z_min: fourier.py uses
-            it as a scale, while `gaps` requires 0 m. Distances of geoms above the table follow, then distances
-            between the two geoms of each pair.
+        clearance: (K,) m, smallest required distances: of the end effector above z_min (element 0), of geoms above
+            the table, and between the two geoms of each pair. Element 0 is an exception: the end effector may come
+            down to z_min, and element 0 only scales its height above z_min in fourier.py.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -229,7 +229,7 @@ class Space:
         return distances - self._needed(levers)
 
     def _needed(self, levers: np.ndarray) -> np.ndarray:
-        """Return the required distances (T, K) m for levers (T, K, n) m/rad; the end effector needs 0 m."""
+        """Return the required distances (T, K) m for levers (T, K, n) m/rad; 0 m for the end effector."""
         need = np.clip(FENCE_M + self._deviation * levers.sum(2), self.clearance, self._most)
         need[:, 0] = 0.0
         return need

@@ -1,4 +1,4 @@
-"""Plan motions that reveal the gears' elasticity: each joint in turn slides slowly under an added multisine torque.
+"""Plan motions that reveal the gears' elasticity: one joint at a time slides slowly, excited by a multisine torque.
 
 While a joint slides in one direction, its friction is nearly constant, so the response of the motor's angle to the
 multisine is linear. The multisine repeats every PERIOD_S, so its spectrum has lines only at LINES_HZ (Pintelon and
@@ -33,7 +33,8 @@ MARGIN = 0.15  # rad, distance kept to the position limits
 def slide_speed(robot: Robot, joint: int, speed_share: float = 1.0) -> float:
     """Return the sliding speed, rad/s; `speed_share` scales the arm's speed limits, see `arm.speed_share`.
 
-    The speed decreases only for small shares, because a joint that slides too slowly sticks.
+    The sliding speed is SPEED * dq_max, or SLOW_SHARE of the scaled speed limit if this is lower. It is not
+    proportional to `speed_share`, because a joint that slides too slowly sticks.
     """
     return float(min(SPEED, SLOW_SHARE * speed_share) * robot.dq_max[joint])
 

@@ -88,7 +88,7 @@ class Problem:
 
     @property
     def on_torque(self) -> "Problem":
-        """The problem with the torque residual as data."""
+        """The problem with `data` replaced by the torque residual."""
         return replace(self, data=self.torque_data)
 
     @property
@@ -133,7 +133,7 @@ class Problem:
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
-        """Return the problem with `torque_data` replaced; `data` is also replaced unless it is a replay residual."""
+        """Return the problem with a new torque residual; it also replaces `data` unless that is a replay residual."""
         return replace(self, data=self.data if self.uses_replays else torque_data, torque_data=torque_data)
 
     def torque_reweighted(self, u: np.ndarray) -> "Problem":

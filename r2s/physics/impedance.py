@@ -90,7 +90,10 @@ def arm_pose(q, parameters, frames, jacobian, place):
 
 @njit(cache=True, error_model="numpy")
 def arm_tips(q, parameters):
-    """Return tip positions (m, 3) m and Jacobians (m, 3, n) at q (m, n) rad from an impedance law's parameters."""
+    """Return tip positions (m, 3) m and translational Jacobians (m, 3, n) m/rad of m postures q (m, n) rad.
+
+    parameters: array of an impedance law, which also describes the links and the tip.
+    """
     m, n = q.shape
     places, out = np.empty((m, 3)), np.empty((m, 3, n))
     frames, jacobian = np.empty((n, POSE)), np.empty((6, n))

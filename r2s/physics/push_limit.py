@@ -17,11 +17,12 @@ In free motion, the estimate R is 0, so the speed rule bounds the tip speed by v
 R is P, so the speed rule allows the push P to rise. If the tip moves inward faster than v_max, or outward faster than
 `speed_near` / OVERSHOOT, the push limit caps the estimate R at 0.
 
-On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). When the
-contact force F exceeds force_max, the tip's speed is at most speed_near, and the net force P + P_f - F < 0 brakes the
-tip. Surface friction mu F pushes a sliding tip inward with up to mu c F. The factor c is m |T J M^-1 J^T n|, with the
-full Jacobian J and the projection T onto the plane with the normal n. On a surface with friction, the bound therefore
-contains (1 - mu c) F and (1 - mu c) k instead of F and k.
+On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). By the
+speed rule, the tip is not faster than speed_near when F reaches force_max. By the force rule, P + P_f <= force_max,
+so the net force P + P_f - F brakes the tip while F exceeds force_max. Surface friction mu F pushes a sliding tip
+inward with up to mu c F. The factor c is m |T J M^-1 J^T n|, with the full Jacobian J and the projection T onto the
+plane with the normal n. On a surface with friction, the bound therefore contains (1 - mu c) F and (1 - mu c) k
+instead of F and k.
 
 The force rule and the speed rule restrict the torque to two half-spaces with the same normal J M^-1. Of all torques
 in both half-spaces, Gauss' principle selects the one nearest to the effort: the effort minus J^T f. Regula falsi
@@ -236,10 +237,10 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Limit push and joint accelerations of the torques `out` (n,) Nm, with the contact force as an external load.
+    """Limit the push and the joint accelerations that the torques `out` (n,) Nm cause.
 
-    Return whether `out` changed. `filter_torque` explains `share` and `limits`; `push_bound` explains the other
-    arguments.
+    The contact force acts as an external load. Return whether `out` changed. `filter_torque` explains `share` and
+    `limits`; `push_bound` explains the other arguments.
     """
     n = len(out)
     own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()

@@ -167,7 +167,11 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def set_links(
     model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
 ) -> None:
-    """Set a model's masses (n,) kg, centers (n, 3) m, tensors (n, 3, 3) about the centers, armature (n,), kg m^2."""
+    """Set the inertial parameters of a model's n links and rotors.
+
+    mass: (n,) kg. com: (n, 3) m, centers of mass. inertia: (n, 3, 3) kg m^2, tensors about the centers.
+    armature: (n,) kg m^2.
+    """
     at = model.jnt_bodyid
     model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com

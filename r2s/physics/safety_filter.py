@@ -49,7 +49,7 @@ PIVOTS = 5  # number of rounds of block pivoting; single pivots follow, which al
 ROUNDS = 100
 FRICTION_WIDTH = 0.05  # rad/s, width of the sign change of friction
 FRICTION_SHARE = 0.5  # share of the friction estimate that widens the bounds; only for joints with added inertia
-DELAY_PHASE = 1.25  # rad, phase lag that the delay may cause in a loop; pi / 2 is the stability limit
+DELAY_PHASE = 1.25  # rad, largest phase lag due to LATENCY_S in the loop of filter and arm; stable below pi / 2
 
 # Columns of the limits (n, COLUMNS), one row per joint.
 Q_LOW, Q_HIGH, Q_FADE, DQ_ALLOWED, DECELERATION, OFFSET, DQ_MAX, ADDED, TAU_MAX, STEP = range(10)
@@ -71,8 +71,8 @@ def filter_limits(robot: Robot, torque: np.ndarray, speed_share: float = 1.0) ->
     """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
     The filter's mass matrix adds inertia (column ADDED) to light joints, just enough that at rest the largest target
-    torque of any joint satisfies the acceleration limit. DELAY_PHASE bounds the added inertia, because added inertia
-    makes the control loop faster.
+    torque of any joint satisfies the acceleration limit. Added inertia raises the gain of the loop of filter and arm.
+    The added inertia is limited so that LATENCY_S causes a phase lag of at most DELAY_PHASE in this loop.
 
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
@@ -198,7 +198,7 @@ def bounded(arm, friction, limits, work, desk, out):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def limit_rate(last, limits, out):
-    """Limit range and rate of the torques `out` (n,) Nm; last: (n,) Nm, the previous command."""
+    """Limit the torques `out` (n,) Nm, and their change since the previous command `last` (n,) Nm."""
     n, scale = len(out), 1.0
     for j in range(n):
         out[j] = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX]) - last[j]

@@ -26,7 +26,8 @@ class JointForces(NamedTuple):
 
     dq: (n,) rad/s, joint velocities. drive: (n,) Nm, sum of torques without friction. friction: (n,) Nm, friction at
     dq. rest: (2, n) Nm, kinetic friction at zero speed in negative and positive direction. edges: (2, n) Nm,
-    negative and positive breakaway torques, with at least the magnitude of `rest`; 0: no stiction.
+    breakaway torques in negative and positive direction. Their magnitudes are at least those of `rest`. For a
+    joint without stiction, both edges are 0.
     """
 
     dq: np.ndarray

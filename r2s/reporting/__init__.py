@@ -1,1 +1,1 @@
-"""Report on runs: tables, pages, figures, rerun recordings, comparisons of runs, and experiment trackers."""
+"""Report on runs: tables, pages, figures, Rerun recordings, comparisons of runs, and experiment trackers."""

@@ -1,4 +1,4 @@
-"""Draw figures and write the rerun recording of stage=estimate: each estimate over time, with its 95 % interval."""
+"""Draw figures and write the Rerun recording of stage=estimate: each estimate over time, with its 95 % interval."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from r2s.reporting.figures.panels import panels
 from r2s.reporting.viewer.layout import log_series
 from r2s.reporting.wrench_page import DRAWN_HZ, FORCES, log_wrench
 
-LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in rerun: estimate, and limits of its 95 % interval
+LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in the Rerun viewer: estimate, and limits of its 95 % interval
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
@@ -49,7 +49,7 @@ def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Se
 def write_estimate_recording(
     path: Path, robot: Robot, recording: Recording, rows: pd.DataFrame, wrench: pd.DataFrame
 ) -> Path:
-    """Write a rerun recording: the arm, the force on the arm, and each estimate with its 95 % interval.
+    """Write a Rerun recording: the arm, the force on the arm, and each estimate with its 95 % interval.
 
     Args:
         rows: table of the estimates, with a row per time `t`. wrench: table of the external force from

@@ -1,4 +1,4 @@
-"""Write the report of a planned motion: table, figure and rerun recording."""
+"""Write the report of a planned motion: table, figure and recording for the Rerun viewer."""
 
 from typing import Any
 

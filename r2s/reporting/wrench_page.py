@@ -1,4 +1,4 @@
-"""Show the external force over time in a figure and, in rerun, as an arrow from the tip with a 95 % cone."""
+"""Show the external force over time in a figure, and as an arrow with a 95 % cone in the Rerun viewer."""
 
 from collections.abc import Sequence
 from pathlib import Path

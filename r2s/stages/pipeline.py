@@ -62,9 +62,10 @@ def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
 def run_step(words: dict[str, list[str]]) -> None:
     """Run the commands {label: words} in parallel; print each command's progress and finally its tables.
 
+    If a command ends with an error or because the arm stopped, r2s terminates the commands that still run.
+
     Raises:
-        UserError: a command failed; the remaining commands are terminated.
-        Stopped: the arm stopped during a command; the remaining commands are terminated.
+        UserError: a command failed. Stopped: the arm stopped during a command.
     """
     running: dict[str, subprocess.Popen] = {}
     last: dict[str, str] = {}

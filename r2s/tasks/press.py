@@ -1,4 +1,4 @@
-"""Task press: touch a surface of roughly known position, hold a requested force, and follow a step of this force."""
+"""`task=press`: touch a surface of roughly known position, hold a requested force, and follow a step of the force."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -78,7 +78,7 @@ class PressTask(SurfaceTask):
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of impedance control: position, m, and velocity, m/s.
+        """Return the target (m, 6) of impedance control: position (m, 3) m, then velocity (m, 3) m/s.
 
         The target position moves against the normal, through the nominal plane. At the end of this motion, the spring
         would exert the larger of the two forces even on the lowest allowed surface. The target velocity only sets the

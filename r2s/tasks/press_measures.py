@@ -1,4 +1,4 @@
-"""Compute the measures of task press from the contact force and the requested force."""
+"""Compute the measures of `task=press` from the contact force and the requested force."""
 
 import numpy as np
 
@@ -39,7 +39,7 @@ PRESS = MeasureTable(
 
 
 def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, float]:
-    """Return the measures of the task press, which form one row of evaluations.csv.
+    """Return the measures of `task=press`, which form one row of evaluations.csv.
 
     force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the force step, and in
     the last second. The next four are means over episodes. overshoot_N: largest excess over the new force in the

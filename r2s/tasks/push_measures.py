@@ -1,4 +1,4 @@
-"""Compute the measures of task push from the pose of the box."""
+"""Compute the measures of `task=push` from the pose of the box."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ PUSH = MeasureTable(
 
 
 def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
-    """Return the measures of the task push, which form one row of evaluations.csv.
+    """Return the measures of `task=push`, which form one row of evaluations.csv.
 
     within_3cm, within_10deg: share of episodes with the box within 3 cm, or 10 degrees, of its goal throughout the
     last 0.5 s. success: share of episodes within 3 cm and 10 degrees, without a stop, and with the tip always above

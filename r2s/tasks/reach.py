@@ -1,4 +1,4 @@
-"""Goals, observations and reward terms of task reach: move the end effector to a point and hold it there."""
+"""`task=reach`: move the end effector to a point and hold it there; goals, observations and reward terms."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Run policies in simulators and on arms with one function; compute the measures of task reach."""
+"""Run policies in simulators and on arms with one function; compute the measures of `task=reach`."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -157,7 +157,7 @@ def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
 
 
 def measures(episodes: Episodes) -> dict[str, float]:
-    """Return the measures of task reach, one row of evaluations.csv.
+    """Return the measures of `task=reach`, one row of evaluations.csv.
 
     success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
     of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth:

@@ -74,8 +74,8 @@ class Episodes:
     Attributes:
         t: (T,) s, time. q, dq: (E, T, n) rad, rad/s, angles and speeds. ee: (E, T, 3) m, end effector. goal: goal
             positions, (E, 3) m, or (E, T, 3) m if goals move. tau: (E, T, n) Nm, command at the end of each step.
-        distance: (E, T), distance in m, or force error in N for task press. reward: (E, T), weighted by
-            `Task.paper_weights`; in task reach, eq. (2).
+        distance: (E, T), distance in m, or force error in N for `task=press`. reward: (E, T), weighted by
+            `Task.paper_weights`; for `task=reach`, eq. (2).
         reward_smooth: (E, T), the reward computed from speeds without measurement noise.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.

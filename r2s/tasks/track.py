@@ -1,4 +1,4 @@
-"""Paths, observations and reward terms of task track: follow a timed path with the end effector."""
+"""`task=track`: follow a timed path with the end effector; paths, observations and reward terms."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -268,12 +268,12 @@ class TrackTask(BaseTask):
         return at_time(goals, self._at(t), ahead_s, self.ctrl_hz)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the impedance target (m, 6) at the times t (m,) s: planned position (m) and velocity (m/s)."""
+        """Return the impedance target (m, 6) at t (m,) s: planned position (m, 3) m, then velocity (m, 3) m/s."""
         now = goals[np.arange(len(goals)), self._at(t)]
         return np.concatenate([now[:, X], now[:, V]], axis=1)
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones, because the reward of task track needs no initial distance as a scale."""
+        """Return (m,) ones, because the reward of `task=track` needs no initial distance as a scale."""
         return np.ones(len(goals))
 
     def judge(
@@ -288,7 +288,7 @@ class TrackTask(BaseTask):
         return _judge(now[:, X] - state.ee, state.dq - speed, excess, state.limited)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
-        """Return the measures of task track, one row of evaluations.csv.
+        """Return the measures of `task=track`, one row of evaluations.csv.
 
         path_rmse_mm: RMS distance between end effector and reference over the steps of the paths without a stop.
         path_max_mm: largest distance on a path, mean over the paths without a stop. within_x: share of steps with a

@@ -1,4 +1,4 @@
-"""Task wipe: follow a timed path on a surface of roughly known position while pressing with a normal force."""
+"""`task=wipe`: follow a timed path on a surface of roughly known position while pressing with a normal force."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -147,7 +147,10 @@ class WipeTask(SurfaceTask):
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of impedance control, m and m/s, half a control period after t (m,) s."""
+        """Return the target (m, 6) of impedance control half a control period after t (m,) s.
+
+        The target consists of position (m, 3) m, then velocity (m, 3) m/s.
+        """
         middle, normal = t + 0.5 / self.ctrl_hz, goals[:, NORMAL]
         now, down = self.now(middle, goals), self.depth(middle, goals)[:, None] * normal
         return np.concatenate([now[:, X] - down, now[:, V]], axis=1)

@@ -1,4 +1,4 @@
-"""Compute the measures of task wipe from the path error and the contact force along the path."""
+"""Compute the measures of `task=wipe` from the path error and the contact force along the path."""
 
 import numpy as np
 
@@ -38,7 +38,7 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv: measures of task wipe over the steps from `begin`, where the path starts.
+    """Return one row of evaluations.csv: measures of `task=wipe` over the steps from `begin`, where the path starts.
 
     within_2N: share of steps with a force error <= 2 N. within_3mm: share of steps with a path error <= 3 mm. wiped:
     share of steps within 2 N and 3 mm. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes

@@ -53,9 +53,9 @@ class Franka:
     A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
 
     Attributes:
-        operator, blocked, hold: see `Operated` and `Holds`. Every stop sets `blocked`, except a successful call of
-            `stop`. Examples: a reflex, the stop button (even after its release), a stop by the driver, a rejected
-            command, and a `move_to` that failed in motion.
+        operator, blocked, hold: see `Operated` and `Holds`. `blocked` is set by a reflex, the stop button (even after
+            its release), a stop by the driver, a rejected command, and a `move_to` that failed in motion. The method
+            `stop` sets `blocked` only if it cannot end the motion without an error.
         findings: results of comparing the arm with `connection`.
         realtime: whether motions run in a `realtime_section`. In real time, r2s rejects recordings and episodes in
             which less than 99 % of the commands arrive in time.

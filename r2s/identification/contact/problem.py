@@ -112,7 +112,7 @@ class ContactProblem:
         return np.concatenate([rows + self.arm @ w, w])
 
     def residual(self, trials: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R + r + U) of vectors u (C, U): data rows at the best w, then priors of w and u."""
+        """Return residuals (C, R + r + U) of vectors u (C, U): data rows at `best_arm(u)`, then priors of w and u."""
         center, weight = self.space.prior(trials.shape[1])
         return np.stack([np.concatenate([self._projected(self.data(u)), weight * (u - center)]) for u in trials])
 
@@ -136,7 +136,7 @@ class ContactProblem:
         return replace(self, torque=self.torque.within(kept))
 
     def whole(self, u: np.ndarray) -> np.ndarray:
-        """Return the vector u (U,) and the best model errors w (r,) as one vector (U + r,) on the unit cube."""
+        """Return one vector (U + r,) on the unit cube: u (U,), then the model errors w (r,) from `best_arm`."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
     def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

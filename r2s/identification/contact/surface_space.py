@@ -55,12 +55,12 @@ class Gears:
 
 
 def unknown_gears(n: int) -> Gears:
-    """Return the prior of n gears of unknown stiffness; small deflections are most likely."""
+    """Return the prior of n gears' deflections for unknown stiffness; the most likely mean deflection is 0."""
     return Gears(np.ones(n), 0.0, DEFLECTION, SCATTER, False)
 
 
 def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float = 0.1) -> Gears | None:
-    """Return the prior of gears of known stiffness, or None if `stiffness` is None.
+    """Return the prior of the deflections of gears with known stiffness, or None if `stiffness` is None.
 
     Half of the variance of the stiffness is common to all gears, for example due to an error in the data sheet.
 
@@ -102,7 +102,7 @@ def _mean_deflection(deflection: np.ndarray, width: float) -> float:
 def identified_gears(
     tau_max: np.ndarray, *, stiffness: np.ndarray, spread: np.ndarray, determined: np.ndarray
 ) -> Gears:
-    """Return the prior of identified gears.
+    """Return the prior of the deflections of gears whose stiffness was identified.
 
     A gear that the slides did not determine deflects like the mean of the others. Half of the least variance among
     the gears is common to all gears.

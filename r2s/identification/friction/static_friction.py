@@ -1,4 +1,4 @@
-"""Compare the model's friction at the onset of sliding with the torque at breakaway in recorded ramps."""
+"""Compare the model's friction at zero speed with the net torque at breakaway in recorded ramps."""
 
 import numpy as np
 
@@ -15,7 +15,9 @@ LEAST = 1e-3  # relative to tau_max; below this command, SIGMA is relative to LE
 
 
 class StaticFriction:
-    """Residual of K ramps with a breakaway: net torque at breakaway minus the model's friction when sliding begins.
+    """Residual of K ramps in which a joint broke away.
+
+    The residual is the net torque at breakaway minus the model's friction at zero speed in the ramp's direction.
 
     Without ramps, recordings contain little information on the rise of Stribeck friction near standstill.
     """
@@ -43,7 +45,7 @@ class StaticFriction:
         return self.command + pull - left
 
     def slide(self, d: Dynamics) -> Slide:
-        """Return each ramp's parameters of motion after breakaway, for Stribeck friction; NaN without breakaway."""
+        """Return parameters of each ramp's motion after breakaway, see `Slide`; NaN for ramps without breakaway."""
         phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
         sign = np.where(self.side, 1.0, -1.0)
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load

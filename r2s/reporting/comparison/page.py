@@ -42,8 +42,8 @@ def comparison_page(
     """Write tables (CSV), figures, report.md and recording.rrd of a comparison of trainings.
 
     Args:
-        run: run folder to write to. robot: the arm. grouped: the trainings. apart: {incomparable run: reason}.
-        others: {folder without a finished training: reason}.
+        run: run folder to write to. robot: the arm. grouped: trainings in groups; the runs of a group differ only in
+            their seeds. apart: {incomparable run: reason}. others: {folder without a finished training: reason}.
 
     Returns:
         {"scores": table, "improvement": table, "sensitivity": table}; scores.py describes the columns of the tables.

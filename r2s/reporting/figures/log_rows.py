@@ -7,7 +7,7 @@ PAUSE = 0.1  # s, length to which each pause is shortened
 
 
 def thin(count: int, most: int = MOST_POINTS) -> slice:
-    """Return a slice that selects at most `most` evenly spaced rows out of `count` rows."""
+    """Return a slice of `count` rows that selects `most` or fewer evenly spaced rows."""
     return slice(None, None, max(1, -(-count // most)))
 
 

@@ -10,7 +10,11 @@ MOST_LINES = 10  # largest number of listed combinations of parameters
 
 
 def identifiability(found: IdentificationResult) -> list[Item]:
-    """Return sentences on parameters that remained nominal or reached a bound, and undetermined combinations."""
+    """Return sentences on the limits of an identification.
+
+    They name parameters that remained nominal, parameters that reached a bound, and combinations of parameters that
+    only the prior determines.
+    """
     space = found.space
     count, total = int(found.found.identifiable.sum()), len(space.names)
     items: list[Item] = [

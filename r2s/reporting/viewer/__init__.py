@@ -1,1 +1,1 @@
-"""Write the rerun recording (data and layout), and run the rerun viewer."""
+"""Write recordings for the Rerun viewer (data and layout), and run the viewer."""

@@ -1,4 +1,4 @@
-"""Log arms in a rerun recording: links, goals, the end effector's trail, error and torque plots."""
+"""Log arms for the Rerun viewer: links, goals, trails of the end effectors, and plots of error and torque."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ WORST_M = 0.01  # m, the trail on a path is red from this error on
 
 
 class _Arm(NamedTuple):
-    """An arm in the rerun recording; `frames`: indices of each episode's logged rows; `starts`: start times, s."""
+    """An arm in the Rerun recording; `frames`: indices of each episode's logged rows; `starts`: start times, s."""
 
     stream: rr.RecordingStream
     base: str
@@ -198,13 +198,13 @@ def _shapes(stream: rr.RecordingStream, model: mujoco.MjModel, body: int, path: 
 
 
 def _shape(model: mujoco.MjModel, geom: int, colour: np.ndarray) -> rr.AsComponents | None:
-    """Return rerun's shape for a geom, in the geom's frame; None if rerun has no shape (plane, height field)."""
+    """Return Rerun's shape for a geom, in the geom's frame; None if Rerun has no shape (plane, height field)."""
     radius, half, _ = size = model.geom_size[geom]
     kind = mujoco.mjtGeom
     solid: dict[str, Any] = {"colors": colour, "fill_mode": rr.components.FillMode.Solid}
     match int(model.geom_type[geom]):
         case kind.mjGEOM_CAPSULE:
-            below = [[0, 0, -half]]  # rerun's capsule starts at the origin of its frame; MuJoCo's is centered there
+            below = [[0, 0, -half]]  # Rerun's capsule starts at the origin of its frame; MuJoCo's is centered there
             return rr.Capsules3D(lengths=2 * half, radii=radius, translations=below, **solid)
         case kind.mjGEOM_CYLINDER:
             return rr.Cylinders3D(lengths=2 * half, radii=radius, **solid)

@@ -1,4 +1,4 @@
-"""Define the content of a rerun recording: episodes, torques, learning curves, figures."""
+"""Define the content of a recording for the Rerun viewer: episodes, torques, learning curves, figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from r2s.tasks.measures import Measure, MeasureTable
 if TYPE_CHECKING:
     from r2s.tasks.rollout import Episodes  # imports torch, which an identification does not need
 
-SHOWN = 4  # episodes in a rerun recording or figure, as in the paper's figures
+SHOWN = 4  # episodes in a Rerun recording or figure, as in the paper's figures
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Overlay:
 
 @dataclass(frozen=True)
 class Content:
-    """Content of a rerun recording; the viewer shows a tab only for content that is not empty.
+    """Content of a Rerun recording; the viewer shows a tab only for content that is not empty.
 
     Attributes:
         measures: the task's measures; `episodes` and `curves` need them.

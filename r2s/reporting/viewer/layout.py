@@ -1,4 +1,4 @@
-"""Set the viewer layout of a rerun recording: tabs for arms, learning curves, each torque overlay and each figure."""
+"""Lay out a recording in the Rerun viewer: tabs for arms, learning curves, each torque overlay and each figure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -19,7 +19,7 @@ LINE = 1.6  # points, width of a line
 
 
 def entity(*parts: str) -> str:
-    """Return the path of a rerun entity from its `parts`."""
+    """Return the path of a Rerun entity from its `parts`."""
     return rr.new_entity_path(list(parts))
 
 
@@ -50,7 +50,7 @@ def starts_of(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
 
 
 def blueprint(robot: Robot, content: Content) -> rrb.Blueprint:
-    """Return the layout of a rerun recording: its tabs and its time panel."""
+    """Return the Rerun viewer's layout for `content`: tabs and the time panel."""
     joints = [f"joint {j + 1}" for j in range(robot.n)]
     episodes, overlays, figures = content.episodes, content.overlays, content.figures
     tabs: list[rrb.View | rrb.Container] = []

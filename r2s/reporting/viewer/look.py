@@ -1,4 +1,4 @@
-"""Show one run, or several runs in one rerun recording, in the rerun viewer: the command `r2s look`."""
+"""`r2s look`: show one run, or several runs in one recording, in the Rerun viewer."""
 
 import os
 import re
@@ -64,7 +64,7 @@ def has_screen() -> bool:
 
 
 def open_native(recordings: Sequence[Path]) -> None:
-    """Open rerun recordings in the viewer, and wait until the viewer is closed."""
+    """Open recordings in the Rerun viewer, and wait until the viewer is closed."""
     with _viewer(map(str, recordings)):
         pass
 

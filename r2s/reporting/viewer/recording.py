@@ -1,6 +1,6 @@
-"""Write the rerun recording (.rrd): arms side by side, torques, learning curves and figures.
+"""Write a recording (.rrd) for the Rerun viewer: arms side by side, torques, learning curves and figures.
 
-One file contains everything, because two rerun recordings cannot share a timeline. Episodes and torque overlays use
+One file contains everything, because two Rerun recordings cannot share a timeline. Episodes and torque overlays use
 the timeline `time`; learning curves use the timelines `env_steps` and `wall_clock`. The command `rerun FILE` plays
 the episodes.
 """
