@@ -20,7 +20,7 @@ from r2s.arm.driver import Driver
 from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.friction import BRISTLE
+from r2s.physics.friction import BRISTLE, COULOMB, STRIBECK
 from r2s.physics.kinematics import POSE, hand_kinematics
 from r2s.physics.payload import ee_pose, mass_and_moment, payload_of
 from r2s.physics.rigid_body import mass_matrix
@@ -143,6 +143,50 @@ def test_a_joint_that_breaks_away_late_is_no_contact():
     tau[:, -1] = 1.2 * BAND[-1] * np.sin(2.0 * motion.t)
     table = observe_recording(ROBOT, observer, replace(motion, q=q, dq=dq, tau=tau))
     assert table["square"].rolling(tuning.CONFIRMED).min().max() < GAUSSIAN
+
+
+def slow_motion(dynamics, seconds=3.0):
+    """Return a recording in which all joints move at 0.03 rad/s, to and fro."""
+    arm = SimulatedArm(ROBOT, dynamics, position_noise=1e-2 * NOISE, velocity_noise=NOISE, seed=0)
+    loop = CommandLoop(arm, Driver(ROBOT, 0.3 * ROBOT.tau_max, truth().level))
+    loop.place(ROBOT.q_home)
+    rows, speed = [], 0.03 * np.array([1, -1, 1, -1, 1, -1, 1])
+    for k in range(round(seconds / SIM_DT)):
+        s, t = loop.state, k * SIM_DT
+        forth = t < seconds / 2
+        goal, rate = ROBOT.q_home + speed * min(t, seconds - t), speed if forth else -speed
+        loop(5.0 * SPRING * (goal - s.q) + 0.5 * SPRING * (rate - s.dq))
+        rows.append((s.q, s.dq, loop.sent))
+    q, dq, tau = (np.array(x) for x in zip(*rows, strict=True))
+    return Recording(np.arange(len(q)) * SIM_DT, q, dq, tau, "commanded")
+
+
+@pytest.mark.long
+def test_a_model_without_stribeck_effect_finds_no_force_in_slow_motion():
+    """The model is Coulomb friction with a 40 % larger breakaway torque; the arm has, or lacks, a Stribeck effect."""
+    phi = dict.fromkeys(STRIBECK.names, np.zeros(7)) | {"coulomb": BAND / 1.4, "viscous": 0.2 * BAND}
+    phi |= {"rise": np.full(7, 0.4), "stribeck_velocity": np.full(7, 0.03)}
+    arms = [
+        replace(
+            truth(),
+            family=family,
+            phi=np.stack([phi[name] for name in family.names], -1),
+            breakaway=np.column_stack([-BAND, BAND]),
+        )
+        for family in (STRIBECK, COULOMB)
+    ]
+    rms = {}
+    for arm in arms:
+        motion = slow_motion(arm)
+        for blind in (False, True):
+            observer = WrenchObserver(ROBOT, arms[1])
+            if blind:  # as if friction did not depend on the breakaway torque
+                observer._noise = observer._noise._replace(excess=0.0 * observer._noise.excess)
+            found, half, touches = (x[500:] for x in run(observer, motion))
+            rms[arm.family.name, blind] = np.sqrt((found**2).mean())
+            assert not touches.any()
+            assert blind or (np.abs(found) < half).mean() > 0.95
+    assert rms["stribeck", False] < 0.9 * rms["stribeck", True]  # by hand: 0.27 and 0.33 N
 
 
 @pytest.mark.long

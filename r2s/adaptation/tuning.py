@@ -99,6 +99,9 @@ SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
 FRICTION_NOISE_S = 0.02  # s, correlation time of the friction model's error
 # friction error: share of the friction level, plus share of the least tau_max, 3 mNm for a Panda's wrist of 12 Nm
 WRENCH_FRICTION, LEAST_FRICTION = 0.03, 3e-3 / 12.0
+# friction of a slow joint whose model has no Stribeck effect, as shares of the excess of the breakaway torque over
+# the model: mean, standard deviation; share of dq_max over which they decay. Chosen on elastic twins 0 to 5
+EXCESS_MEAN, EXCESS_ERROR, EXCESS_SPEED = 0.5, 0.5, 0.01
 INERTIA_SHARE = 0.05  # inertia error, as a share of a joint's net torque
 STIFFNESS = 4e4  # N/m, assumed stiffness of the surroundings: force per motion of the tip
 FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s, largest force rate from STIFFNESS; s, correlation time of the force rate

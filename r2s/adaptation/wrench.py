@@ -163,9 +163,15 @@ def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
     edges = np.array(dynamics.breakaway, dtype=float)
     measured = np.abs(edges).max(1) > 0.0
     edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))
-    presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
+    edges, names, still = np.ascontiguousarray(edges), dynamics.family.names, np.zeros(robot.n)
+    onset = np.stack([dynamics.friction(still, still - 1.0), dynamics.friction(still, still + 1.0)], -1)
+    excess = np.where(np.abs(edges) > np.abs(onset), edges - onset, 0.0)
+    if "coulomb" not in names or "rise" in names:
+        excess[:] = 0.0  # the family has a Stribeck effect, or is smooth at standstill
+    excess_speed = tuning.EXCESS_SPEED * np.array(robot.dq_max)
+    presliding = arm.presliding if "presliding" in names else np.zeros(robot.n)
     rest = tuning.INERTIA_SHARE, tuning.SPEED_NOISE, tuning.ANGLE_NOISE, tuning.FORCE_FLOOR * robot.payload_max[0]
-    return WrenchNoise(friction, np.ascontiguousarray(edges), presliding, *rest)
+    return WrenchNoise(friction, edges, excess, excess_speed, presliding, *rest)
 
 
 def observe_recording(

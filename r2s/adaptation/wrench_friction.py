@@ -117,7 +117,18 @@ def _model(arm, noise, state, j, angle, side, speed, moved):
     z = side
     if noise.presliding[j] > 0.0:
         z += (state.joints[DEFLECTION, j] - side) * np.exp(-moved / noise.presliding[j])
-    return friction_torque(arm.table[j], arm.max_speed[j], speed, z) + level * z, z
+    slow = tuning.EXCESS_MEAN * slow_friction(noise, j, side, speed)
+    return friction_torque(arm.table[j], arm.max_speed[j], speed, z) + level * z + slow, z
+
+
+@njit(cache=True, error_model="numpy")
+def slow_friction(noise, j, side, speed):
+    """Return the largest friction, Nm, that joint j may have at `speed` (rad/s) beyond its model.
+
+    Fast motion does not show whether friction falls with speed (Stribeck effect). If the model has no such effect but
+    a larger breakaway torque, the friction of a slow joint lies between both.
+    """
+    return noise.excess[j, 1 if side > 0.0 else 0] * np.exp(-abs(speed) / noise.excess_speed[j])
 
 
 @njit(cache=True, error_model="numpy")
@@ -153,15 +164,17 @@ def _unlagged(joints, j):
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, that uncertain sign and uncertain presliding cause in a moving joint's friction.
+    """Return the variance, Nm^2, of a moving joint's friction due to uncertain sign, presliding and Stribeck effect.
 
     If the sign of a friction f is wrong with probability p, the variance is 4 f^2 p (1 - p).
     """
+    now = _unlagged(joints, j)
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
-    p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # approximately the normal cdf
+    p = 1.0 / (1.0 + np.exp(min(1.7 * abs(now) / sd, 50.0)))  # approximately the normal cdf
     unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # due to presliding, whose law is uncertain
-    return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent)
+    slow = tuning.EXCESS_ERROR * slow_friction(noise, j, now, now)
+    return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent) + slow * slow
 
 
 @njit(cache=True, error_model="numpy")
