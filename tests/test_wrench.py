@@ -13,7 +13,14 @@ from r2s.adaptation import tuning
 from r2s.adaptation.adapters import AdapterContext, observer, rls
 from r2s.adaptation.estimator import Estimator
 from r2s.adaptation.momentum import BODY
-from r2s.adaptation.wrench import GAUSSIAN, WrenchObserver, contact_thresholds, contacts, observe_recording
+from r2s.adaptation.wrench import (
+    GAUSSIAN,
+    WrenchObserver,
+    contact_thresholds,
+    contacts,
+    observe_recording,
+    wrench_noise,
+)
 from r2s.adaptation.wrench_fusion import TRUSTED, FusedWrench, fuse, surface_law
 from r2s.arm.command_loop import CommandLoop
 from r2s.arm.driver import Driver
@@ -21,6 +28,7 @@ from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.friction import BRISTLE, COULOMB, STRIBECK
+from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.kinematics import POSE, hand_kinematics
 from r2s.physics.payload import ee_pose, mass_and_moment, payload_of
 from r2s.physics.rigid_body import mass_matrix
@@ -187,6 +195,22 @@ def test_a_model_without_stribeck_effect_finds_no_force_in_slow_motion():
             assert not touches.any()
             assert blind or (np.abs(found) < half).mean() > 0.95
     assert rms["stribeck", False] < 0.9 * rms["stribeck", True]  # by hand: 0.27 and 0.33 N
+
+
+def test_only_a_breakaway_torque_beyond_the_model_is_an_excess():
+    """Load-dependent friction at home, a breakaway torque that was not measured, and a smooth family are none."""
+    phi = dict.fromkeys(COULOMB.names, np.zeros(7)) | {"coulomb": BAND, "asymmetry": np.full(7, 0.2)}
+    phi = np.stack([phi[name] for name in COULOMB.names], -1)
+    arm = replace(truth(), family=COULOMB, phi=phi, load=np.full(7, 0.03))
+    sides = BAND[:, None] * np.array([-0.8, 1.2])
+    loaded = InverseDynamics(ROBOT, arm).load_friction(ROBOT.q_home[None])[0]
+    assert loaded.max() > 0.5  # Nm, joint 4
+    edges = sides + np.column_stack([-loaded, loaded])
+    assert np.abs(wrench_noise(ROBOT, replace(arm, breakaway=edges)).excess).max() < 1e-9
+    assert not wrench_noise(ROBOT, arm).excess.any()
+    assert not wrench_noise(ROBOT, replace(truth(), breakaway=2.0 * edges)).excess.any()
+    found = wrench_noise(ROBOT, replace(arm, breakaway=edges + 0.3 * sides)).excess
+    np.testing.assert_allclose(found, 0.3 * sides)
 
 
 @pytest.mark.long

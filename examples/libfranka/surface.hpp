@@ -53,6 +53,10 @@ struct Plan {
     if (deep > std::max(depth, after) + rounding || deep < std::min(depth, after) - rounding ||
         std::sqrt(dot(aside, aside)) > std::sqrt(dot(moved, moved)) + rounding)
       return here + " has a setpoint with another target";
+    if (c::setpoints >= 6 && length(given + 3) > c::plan_speed + rounding)
+      return here + " has a target velocity that the training did not have";
+    if (c::setpoints >= 15 && length(given + 12) > c::plan_feedforward + rounding)
+      return here + " has a feedforward force that the training did not have";
     if (c::setpoints < 12) return "";  // only hybrid control: normal, force, measured force, whether measured
     for (int i = 0; i < 6; ++i) {
       const double planned = i < 3 ? normal[i] : x[c::column_force];
@@ -61,6 +65,8 @@ struct Plan {
     }
     return "";
   }
+
+  static double length(const double* x) { return std::sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]); }
 
   std::string refused() const {
     const Vec point{c::plane_point[0], c::plane_point[1], c::plane_point[2]};

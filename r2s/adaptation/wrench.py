@@ -32,6 +32,7 @@ from r2s.adaptation.wrench_state import HANGING, IMPACT_SQUARE, REST, SQUARE, TO
 from r2s.errors import UserError
 from r2s.identification.posterior import Z_95
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.payload import ee_pose
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
@@ -163,13 +164,16 @@ def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
     edges = np.array(dynamics.breakaway, dtype=float)
     measured = np.abs(edges).max(1) > 0.0
     edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))
-    edges, names, still = np.ascontiguousarray(edges), dynamics.family.names, np.zeros(robot.n)
+    edges, family, still = np.ascontiguousarray(edges), dynamics.family, np.zeros(robot.n)
     onset = np.stack([dynamics.friction(still, still - 1.0), dynamics.friction(still, still + 1.0)], -1)
-    excess = np.where(np.abs(edges) > np.abs(onset), edges - onset, 0.0)
-    if "coulomb" not in names or "rise" in names:
-        excess[:] = 0.0  # the family has a Stribeck effect, or is smooth at standstill
+    loaded = InverseDynamics(robot, dynamics).load_friction(robot.q_home[None])[0]
+    onset += np.column_stack([-loaded, loaded])
+    larger = measured[:, None] & (np.abs(edges) > np.abs(onset))
+    if family.sharp is None or family.has_memory or "rise" in family.names:
+        larger[:] = False  # the family is smooth at standstill, or has a Stribeck effect or bristles
+    excess = np.where(larger, edges - onset, 0.0)
     excess_speed = tuning.EXCESS_SPEED * np.array(robot.dq_max)
-    presliding = arm.presliding if "presliding" in names else np.zeros(robot.n)
+    presliding = arm.presliding if "presliding" in family.names else np.zeros(robot.n)
     rest = tuning.INERTIA_SHARE, tuning.SPEED_NOISE, tuning.ANGLE_NOISE, tuning.FORCE_FLOOR * robot.payload_max[0]
     return WrenchNoise(friction, edges, excess, excess_speed, presliding, *rest)
 

@@ -102,6 +102,8 @@ def _surface(contract: Mapping[str, Any]) -> list[str]:
         "plan_force": trained["force_N"][1],
         "plan_high": -low,
         "plan_deep": deepest,
+        "plan_speed": trained["target_m_per_s"],
+        "plan_feedforward": trained["feedforward_N"],
         "regular": goal["regular_m2"],
     }
     own = trained["contact"]

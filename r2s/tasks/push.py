@@ -277,8 +277,8 @@ class PushTask(TipTask):
         Terms, with the yaw error e: distance = -tanh(d / 10 cm); yaw = -tanh(|e| / 0.5 rad); precision =
         `near`(d, 10 cm, 3 cm) `near`(|e|, 0.5 rad, 10 degrees); gap = -tanh(distance of the tip from the box / 5 cm);
         height = -tanh(height error of the tip / 2 cm); table = -tanh(u / 1 cm), u being the depth by which the tip's
-        lowest point is less than 1 cm above the table; smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2);
-        filter_penalty = -`State.limited`.
+        lowest point is less than 1 cm above the table (for low boxes, less than its target height); smoothness =
+        -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty = -`State.limited`.
         """
         place, _ = self.tip(state.q)
         box, _, error = self.planar(state, goals)
@@ -287,7 +287,8 @@ class PushTask(TipTask):
         gap = (np.linalg.norm(beyond.clip(0.0), axis=1) - self.tip_radius).clip(0.0)
         precise = near(d, FAR_M, GOOD_M) * near(yaw, FAR_RAD, GOOD_RAD)
         level = np.tanh(np.abs(place[:, 2] - self.height) / LEVEL_M)
-        low = np.tanh((CLEAR_M + self.tip_radius - place[:, 2]).clip(0.0) / CLEAR_M)
+        clear = min(CLEAR_M, self.height - self.tip_radius)  # a low box is pushed with less clearance
+        low = np.tanh((clear + self.tip_radius - place[:, 2]).clip(0.0) / CLEAR_M)
         terms = [-np.tanh(d / FAR_M), -np.tanh(yaw / FAR_RAD), precise, -np.tanh(gap / GAP_M), -level, -low]
         return d, np.stack([*terms, -rough(ddq), -state.limited], axis=1)
 
