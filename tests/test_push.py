@@ -177,6 +177,19 @@ def test_the_observation_has_the_box_and_not_its_mass(task):
     np.testing.assert_array_equal(observe(task, task.control(PANDA), touched, goals, task.torque_limit(PANDA)), seen)
 
 
+@pytest.mark.parametrize("high", [0.08, 0.03])
+def test_the_reward_keeps_the_tip_off_the_table(high):
+    """The term `table` is 0 at the height at which the tip pushes, and negative just above the table."""
+    task = make_task(size=(0.12, 0.12, high))
+    _, goals = fixed_episodes(PANDA, task, 1)
+    where = task.table.inside(Tip(PANDA)(goals[0, START:])[0][None])[0]
+    low = Tip(PANDA).posture(task.table.outside(np.array([*where[:2], task.tip_radius + 5e-4])))
+    column = task.reward_terms.index("table")
+    for q, least, most in ((goals[0, START:], -0.03, 0.0), (low, -1.0, -0.1)):  # postures are exact to 0.2 mm
+        terms = task.judge(resting(q[None]), np.zeros((1, N)), goals, np.ones(3))[1]
+        assert least <= terms[0, column] <= most
+
+
 def test_measures_of_known_poses(task):
     """3 cm and 10 degrees for the whole last 0.5 s, with the tip above the table."""
     steps = task.steps
