@@ -6,8 +6,8 @@ Trains what is missing, each on one core, and writes benchmarks/results/push.md;
 reports, boxes and arms selected nothing. With twins, identifies each and runs the reference on the twin with its box,
 with the nominal and with the identified model, EPISODES goals each, and replaces the page's section on twins. With
 env_steps, trains a policy on each identified model too, with the twin's seed, and replaces the section on policies
-instead. A twin takes about 3 minutes of one core, a policy 7 to 14 more. Run folders: runs/push. Finished runs are
-not repeated: after a change of the pusher, delete the folders train and transfer.
+instead. A twin takes 3 minutes of one core, a policy of 900,000 env steps 10 to 24 more. Run folders: runs/push.
+Finished runs are not repeated: after a change of pusher or task, delete the folders train and transfer.
 """
 
 import json

@@ -54,9 +54,9 @@ struct Plan {
         std::sqrt(dot(aside, aside)) > std::sqrt(dot(moved, moved)) + rounding)
       return here + " has a setpoint with another target";
     if (c::setpoints >= 6 && length(given + 3) > c::plan_speed + rounding)
-      return here + " has a target velocity that the training did not have";
+      return here + " has a target velocity of more than " + std::to_string(c::plan_speed) + " m/s";
     if (c::setpoints >= 15 && length(given + 12) > c::plan_feedforward + rounding)
-      return here + " has a feedforward force that the training did not have";
+      return here + " has a feedforward force of more than " + std::to_string(c::plan_feedforward) + " N";
     if (c::setpoints < 12) return "";  // only hybrid control: normal, force, measured force, whether measured
     for (int i = 0; i < 6; ++i) {
       const double planned = i < 3 ? normal[i] : x[c::column_force];

@@ -164,18 +164,24 @@ def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
     edges = np.array(dynamics.breakaway, dtype=float)
     measured = np.abs(edges).max(1) > 0.0
     edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))
-    edges, family, still = np.ascontiguousarray(edges), dynamics.family, np.zeros(robot.n)
-    onset = np.stack([dynamics.friction(still, still - 1.0), dynamics.friction(still, still + 1.0)], -1)
-    loaded = InverseDynamics(robot, dynamics).load_friction(robot.q_home[None])[0]
-    onset += np.column_stack([-loaded, loaded])
-    larger = measured[:, None] & (np.abs(edges) > np.abs(onset))
-    if family.sharp is None or family.has_memory or "rise" in family.names:
-        larger[:] = False  # the family is smooth at standstill, or has a Stribeck effect or bristles
-    excess = np.where(larger, edges - onset, 0.0)
+    excess = np.where(measured[:, None], _excess(robot, dynamics), 0.0)
     excess_speed = tuning.EXCESS_SPEED * np.array(robot.dq_max)
-    presliding = arm.presliding if "presliding" in family.names else np.zeros(robot.n)
+    presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
     rest = tuning.INERTIA_SHARE, tuning.SPEED_NOISE, tuning.ANGLE_NOISE, tuning.FORCE_FLOOR * robot.payload_max[0]
-    return WrenchNoise(friction, edges, excess, excess_speed, presliding, *rest)
+    return WrenchNoise(friction, np.ascontiguousarray(edges), excess, excess_speed, presliding, *rest)
+
+
+def _excess(robot: Robot, dynamics: Dynamics) -> np.ndarray:
+    """Return breakaway torques minus modeled friction at the onset of sliding at home, (n, 2) Nm, where larger.
+
+    The excess is 0 for a friction family with bristles, with a Stribeck effect, or without a jump at standstill.
+    """
+    family, edges = dynamics.family, np.array(dynamics.breakaway, dtype=float)
+    if family.sharp is None or family.has_memory or "rise" in family.names:
+        return np.zeros_like(edges)
+    loaded = InverseDynamics(robot, dynamics).load_friction(robot.q_home[None])[0]
+    onset = dynamics.onset_friction() + np.column_stack([-loaded, loaded])
+    return np.where(np.abs(edges) > np.abs(onset), edges - onset, 0.0)
 
 
 def observe_recording(

@@ -8,7 +8,7 @@ and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Transactions on I
 The uncertainty of a joint's friction depends on whether the joint moves (wrench_friction.py).
 - The momentum of a joint in motion determines the wrench precisely, because the friction error b is small and has a
   short correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain,
-  and because the model may lack a Stribeck effect (`slow_friction`).
+  and because the model may lack a Stribeck effect (`excess_friction`).
 - A joint at rest yields only bounds on the wrench. Friction at rest balances all other torques, and may be any torque
   between the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of
   a uniform distribution between the edges. If the friction family has bristles, the joint angle determines the

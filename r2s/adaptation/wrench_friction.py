@@ -117,12 +117,12 @@ def _model(arm, noise, state, j, angle, side, speed, moved):
     z = side
     if noise.presliding[j] > 0.0:
         z += (state.joints[DEFLECTION, j] - side) * np.exp(-moved / noise.presliding[j])
-    slow = tuning.EXCESS_MEAN * slow_friction(noise, j, side, speed)
+    slow = tuning.EXCESS_MEAN * excess_friction(noise, j, side, speed)
     return friction_torque(arm.table[j], arm.max_speed[j], speed, z) + level * z + slow, z
 
 
 @njit(cache=True, error_model="numpy")
-def slow_friction(noise, j, side, speed):
+def excess_friction(noise, j, side, speed):
     """Return the largest friction, Nm, that joint j may have at `speed` (rad/s) beyond its model.
 
     Fast motion does not show whether friction falls with speed (Stribeck effect). If the model has no such effect but
@@ -173,7 +173,7 @@ def side_variance(noise, joints, j):
     sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(now) / sd, 50.0)))  # approximately the normal cdf
     unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # due to presliding, whose law is uncertain
-    slow = tuning.EXCESS_ERROR * slow_friction(noise, j, now, now)
+    slow = tuning.EXCESS_ERROR * excess_friction(noise, j, now, now)
     return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent) + slow * slow
 
 

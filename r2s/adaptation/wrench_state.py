@@ -34,7 +34,7 @@ class WrenchNoise(NamedTuple):
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a joint in motion
     edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway torque: at rest, friction stays between them
-    excess: np.ndarray  # (n, 2) Nm, `edges` minus the model's friction at the onset of sliding, see `slow_friction`
+    excess: np.ndarray  # (n, 2) Nm, `edges` minus the model's friction at the onset of sliding, see `excess_friction`
     excess_speed: np.ndarray  # (n,) rad/s, speed over which `excess` decays
     presliding: np.ndarray  # (n,) rad, decay length of presliding; 0: a joint sticks until it breaks away
     inertia: float  # inertia error as a share of a joint's net torque

@@ -76,8 +76,8 @@ def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
     """Raise BundleError if the setpoint, which commands the controller, differs from target, normal or force.
 
     The setpoint's target must lie between the targets of its row and of the next row, because the setpoint of a
-    sliding target is valid for the middle of the control period. Target velocity and feedforward force must not
-    exceed those of the training.
+    sliding target is valid for the middle of the control period. The contract limits target velocity and
+    feedforward force.
 
     Args:
         goal: entry `goal` of the contract. plan: (rows, columns), a plan on a surface.
@@ -104,7 +104,7 @@ def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
         if size.max() > most + ROUNDING:
             row = int(size.argmax())
             raise BundleError(
-                f"row {row} of the plan: {what} of {size[row]:.3g} {unit}; the training had up to {most:.3g} {unit}"
+                f"row {row} of the plan: {what} of {size[row]:.3g} {unit}, expected at most {most:.3g} {unit}"
             )
     if setpoint.shape[1] < CONTACT.stop:
         return

@@ -109,6 +109,11 @@ class Dynamics:
         """Return the load-independent friction (..., n) Nm at dq (..., n) rad/s; `bristle`: see Family.torque."""
         return self.family.torque(dq, self.phi, bristle)
 
+    def onset_friction(self) -> np.ndarray:
+        """Return the load-independent friction (..., n, 2) Nm at the onset of negative and of positive motion."""
+        still = np.zeros(self.phi.shape[:-1])
+        return np.stack([self.friction(still, still - 1.0), self.friction(still, still + 1.0)], -1)
+
     @property
     def level(self) -> np.ndarray:
         """Friction level (..., n) Nm: the smaller of the friction magnitudes at 1 rad/s and -1 rad/s."""

@@ -67,7 +67,6 @@ class StaticFriction:
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
         """Return the residual (C, K), in standard deviations, of candidates x (C, P)."""
         d = space.dynamics(x)
-        sign, still = np.where(self.side, 1.0, -1.0), np.zeros(d.phi.shape[:-1])
-        sides = np.stack([d.friction(still, still - 1.0), d.friction(still, still + 1.0)], -1)
-        friction = sides[..., self.joint, self.side] + sign * d.load[..., self.joint] * self._load
+        sign = np.where(self.side, 1.0, -1.0)
+        friction = d.onset_friction()[..., self.joint, self.side] + sign * d.load[..., self.joint] * self._load
         return (self.net_torque(d) - friction) / (SIGMA * np.maximum(np.abs(self.command), self._least))
