@@ -12,10 +12,11 @@ from r2s.arm.ramp import ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.identification.friction.static_friction import SIGMA
 from r2s.identification.structure.cross_validation import held_out
+from r2s.identification.structure.family_selection import CLOSE, simplest
 from r2s.identification.structure.forward_selection import forward_selection
 from r2s.identification.terms import add_terms
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
-from r2s.physics.friction import COULOMB, STRIBECK
+from r2s.physics.friction import COULOMB, SIGMOID, STRIBECK
 from r2s.physics.rigid_body import set_links
 from r2s.physics.robot import SIM_DT
 
@@ -149,6 +150,25 @@ def test_an_uncertain_candidate_does_not_end_the_selection():
     gains = {"link": link, "load": load, "drag": np.zeros(16)}
     assert link.mean() > load.mean()
     assert forward_selection(lambda chosen: np.full(16, 5.0) - sum(gains[c] for c in chosen), list(gains)) == ["load"]
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [
+        ((1.3, 1.0, 1.0), COULOMB),  # the sigmoid is clearly worse, although by less than CLOSE
+        ((2.6, 1.3, 1.0), COULOMB),  # Stribeck friction is better by less than CLOSE
+        ((1.6, 1.3, 1.0), COULOMB),
+        ((2.0, 1.6, 1.0), STRIBECK),
+        ((1.0, 1.0, 1.0), SIGMOID),
+        ((1.0, 3.0, 3.0), SIGMOID),
+    ],
+)
+def test_the_simplest_friction_family_that_predicts_as_well_is_selected(errors, chosen):
+    """Only Stribeck friction needs an error that is smaller by CLOSE; every family must be clearly better."""
+    families = (SIGMOID, COULOMB, STRIBECK)
+    error, best = simplest(families, np.square(errors)[:, None] * np.linspace(0.8, 1.2, 40), CLOSE)
+    assert families[best] is chosen
+    np.testing.assert_allclose(error, np.array(errors) / min(errors), rtol=1e-12)
 
 
 def test_a_link_takes_the_place_of_its_tensor():

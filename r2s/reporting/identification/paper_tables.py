@@ -205,7 +205,7 @@ def family_table(found: IdentificationResult) -> list[Item]:
     table = pd.DataFrame.from_dict(rows, orient="index", columns=["error / best error", ""]).rename_axis("family")
     words = (
         "Each family was fitted to a part of the recording and scored by its torque error on the rest. A family with "
-        "more parameters is chosen only if it is better by more than one standard error and, of commanded torque in "
-        f"windows of sliding, if the error of the simpler family is more than {CLOSE} times its own."
+        "more parameters is chosen only if it is better by more than one standard error. In windows of sliding, "
+        f"Stribeck friction is chosen only if the error of Coulomb friction is more than {CLOSE} times its own."
     )
     return [words, table]
