@@ -213,7 +213,7 @@ def test_the_pipeline_identifies_arm_and_surface(task, tmp_path):
     summary = json.loads((tmp_path / "pipeline/a/summary.json").read_text())
     truth = slope_at_10_newton(make_twin(PANDA, surface=True)._touch.contact)
     assert summary["contact"]["slope_N_per_m"] == pytest.approx(truth, rel=0.1)  # 10 s of motion identify the arm
-    rows = {"identified model, twin", "nominal model, twin", "hybrid control, identified model, twin"}
+    rows = {"identified model, twin", "nominal model, twin", "controller without learning, identified model, twin"}
     assert rows <= set(summary["reach"])
     assert all(summary["reach"][row]["contact"] > 0.9 for row in rows)
     assert (tmp_path / "identify/a_surface/contact.npz").is_file()

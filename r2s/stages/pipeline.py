@@ -29,11 +29,11 @@ STOPPED = 3  # exit status of a command that ended because the arm stopped, see 
 MODELS = ("identified", "nominal")
 # labels: computed torque, policy "identified" with adapter (both only with adapt=), identification of the surface
 COMPUTED, ADAPTED, SURFACE = "computed", "adapted", "surface"
-REFERENCE = "reference"  # for a task on a surface: hybrid control with the identified model, without learning
+REFERENCE = "reference"  # for a task on a surface: its controller without learning, with the identified model
 ROWS = {
     COMPUTED: "computed torque",
     ADAPTED: "identified model + adapter",
-    REFERENCE: "hybrid control, identified model",
+    REFERENCE: "controller without learning, identified model",
 }
 PATHS = 6  # number of contact motions on the surface, 8 s each; the last motion is for validation
 CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # see `commands`
