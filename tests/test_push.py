@@ -208,7 +208,9 @@ def test_measures_of_known_poses(task):
     assert (row["success"], row["within_3cm"], row["within_10deg"], row["on_table"]) == (0.25, 0.75, 0.75, 0.25)
     assert row["yaw_median_deg"] == pytest.approx(9.0, abs=0.2)
     ended = replace(episodes, distance=np.where(np.arange(steps) == steps - 1, np.inf, distance))
-    assert task.measures(ended)["success"] == 0.0
+    row = task.measures(ended)
+    assert (row["success"], row["within_3cm"], row["within_10deg"], row["stopped"]) == (0.0, 0.0, 0.0, 1.0)
+    assert row["yaw_median_deg"] == np.inf
 
 
 def test_dart_pushes_alike(task):

@@ -146,3 +146,5 @@ def test_an_episode_that_stops_keeps_its_last_state():
     assert np.array_equal(done.q[1], np.broadcast_to(done.q[1, 0], done.q[1].shape))
     assert np.isinf(done.distance[1, -1])
     assert np.isfinite(done.distance[0]).all()
+    still = replace(done, dq=np.zeros_like(done.dq))
+    assert measures(still)["rest"] == 0.5  # the arm that stopped did not come to rest itself

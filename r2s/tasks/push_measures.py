@@ -49,11 +49,12 @@ def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
     assert box is not None
     ended = ~np.isfinite(episodes.distance[:, -1])
     away, yaw = episodes.distance[:, -hold:], np.abs(box[:, -hold:, YAW_ERROR])
+    yaw = np.where(ended[:, None], np.inf, yaw)
     near, aligned = away.max(1) <= GOOD_M, yaw.max(1) <= GOOD_RAD
     low = box[:, :, TIP_HEIGHT].min(1) < 0.0
     force = episodes.force[..., 0].max(1)  # type: ignore[index]
     return {
-        "success": float((near & aligned & ~ended & ~low).mean()),
+        "success": float((near & aligned & ~low).mean()),
         "within_3cm": float(near.mean()),
         "within_10deg": float(aligned.mean()),
         "distance_median_m": float(np.median(np.where(ended, np.inf, away.mean(1)))),

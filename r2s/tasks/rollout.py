@@ -164,9 +164,10 @@ def measures(episodes: Episodes) -> dict[str, float]:
     return_paper computed from speeds without noise, because noise causes false accelerations in eq. (2).
     time_to_reach_s: time after which the end effector stays within 2 cm, median over the episodes that end within 2
     cm. overshoot_m: largest distance minus 2 cm after the end effector has first come within 2 cm, mean over
-    episodes. rest: share of episodes in which every joint is slower than REST throughout the last 0.5 s; joints can
-    move although the end effector is at rest. q_left_rad: smallest distance of a joint from its position limits, 5 %
-    quantile over episodes. limited: mean filter rate. collision: share of episodes that a contact ended.
+    episodes. rest: share of episodes without a stop in which every joint is slower than REST throughout the last 0.5
+    s; joints can move although the end effector is at rest. q_left_rad: smallest distance of a joint from its
+    position limits, 5 % quantile over episodes. limited: mean filter rate. collision: share of episodes that a
+    contact ended.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)
@@ -191,7 +192,7 @@ def measures(episodes: Episodes) -> dict[str, float]:
         "return_smooth": float(episodes.reward_smooth.sum(1).mean()),
         "time_to_reach_s": float(np.median(since[there]) * step) if there.any() else float("nan"),
         "overshoot_m": float(np.mean(later)) if later else float("nan"),
-        "rest": float((np.abs(episodes.dq[:, -hold:]).max((1, 2)) < REST).mean()),
+        "rest": float(((np.abs(episodes.dq[:, -hold:]).max((1, 2)) < REST) & np.isfinite(last[:, -1])).mean()),
         "q_left_rad": float(np.quantile(episodes.q_left, 0.05)),
         "limited": float(episodes.limited.mean()),
         "collision": float((episodes.collision != "").mean()),
