@@ -25,7 +25,7 @@ PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 MOST_SEED = 2**32 - 1  # largest seed that all generators of NumPy accept
 ABSENT = "not there"
-# keys in which skip_completed allows differences: run folder, display, number of cores and the like
+# keys that may differ from an earlier run with skip_completed: run folder, display, number of cores and so on
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
 
 
@@ -109,7 +109,7 @@ def run_job(cfg):
 
 
 def check_paths(cfg):
-    """Check the options that name a file or folder; convert a name that YAML read as a number to a string."""
+    """Check the options that name a file or folder; convert names that YAML read as numbers to strings."""
     for key in PATHS:
         value = cfg[key]
         if value is not None and (isinstance(value, bool) or not isinstance(value, str | int | float) or value == ""):
@@ -130,7 +130,7 @@ def resumed(cfg, overrides):
     if extra := [o for o in overrides if not o.startswith(("resume=", "trust=", "device="))]:
         raise UserError(f"resume: a run continues with its own config; leave out {' '.join(extra)}")
     before = run_config(folder, cfg.trust)
-    if before.stage == "tune":  # the search's trainings reuse the overrides in its folder
+    if before.stage == "tune":  # trainings of a search reuse the overrides in the search's folder
         os.environ[TRUST] = ",".join(modules(cfg.trust))
     if before.stage not in RESUMABLE:
         raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: {choices(RESUMABLE)}")
@@ -166,9 +166,9 @@ def is_completed(cfg):
 
 
 def differing(saved, cfg, most=3, counts=lambda key: True):
-    """Return a line for each key that differs between `saved` and `cfg` and that the function `counts` accepts.
+    """Return a line for each key that differs between `saved` and `cfg` and for which `counts` returns True.
 
-    After `most` keys, a last line contains the number of further keys.
+    The first `most` keys get a line; a last line contains the number of further keys.
     """
     from omegaconf import OmegaConf
 
@@ -234,7 +234,7 @@ def end_workers():
 
 
 def end_job(error):
-    """Print an error and exit with status 2; in a sweep, do not exit but append it to the sweep's error file."""
+    """Print an error, then exit with status 2; in a sweep, append the error to the sweep's error file instead."""
     status = fail(error)
     if FAILED not in os.environ:
         sys.exit(status)

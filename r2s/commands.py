@@ -16,7 +16,7 @@ from r2s.errors import UserError, choices, instead_of, nearest, nearest_file
 PORT = 9090
 CONVERTED = ("robot", "data", "calibration", "friction", "inertia")  # config groups that `convert` reads
 JUDGED = (*CONVERTED, "identify")
-ARM = ("robot", "friction", "inertia")  # config groups of an arm; friction and inertia have a value per joint
+ARM = ("robot", "friction", "inertia")  # config groups of an arm; friction and inertia have one value per joint
 TRUSTED = "modules that a run may execute beside r2s, with commas between, also trust=MODULES"
 
 
@@ -62,7 +62,7 @@ def run_command(words: Sequence[str]) -> None:
     )
     converting.add_argument("--trust", help=TRUSTED)
     commands.add_parser("engines", help="the physics engines: version, or how to install it")
-    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first: KEY=VALUE allows many words
+    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # before KEY=VALUE ...
     others = [w for w in words[1:] if not w.startswith(("to=", "trust="))]
     typed, unknown = parser.parse_known_args([words[0], *options, *others])
     if unknown:
@@ -251,7 +251,7 @@ def viewable(folder: Path) -> Path:
 
 
 def arm_config(folder: Path, trust: str | None = None) -> Any:
-    """Return the config that describes a run's robot: for a transfer the training's config, otherwise the run's own.
+    """Return the config of a run's robot: the training's config if the run is a transfer, otherwise the run's config.
 
     Raises:
         UserError: the file cannot be read or names an untrusted module.
@@ -260,7 +260,7 @@ def arm_config(folder: Path, trust: str | None = None) -> Any:
 
     from r2s.stages.run_config import checked, loaded, run_config
 
-    path = folder / "policy.yaml"  # written by stage=transfer; its config.yaml contains the default robot
+    path = folder / "policy.yaml"  # a transfer's config.yaml contains only the default robot
     if not path.is_file():
         return run_config(folder, trust)
     cfg = loaded(path)

@@ -1,11 +1,11 @@
 """Provide numba's `njit`, `cfunc` and `vectorize` with a compilation cache that notices changes in other modules.
 
 numba caches a compiled function and recompiles the function when its source file changes. But numba does not notice
-changes in other files from which cached code calls functions. After a change in physics/safety_filter.py, numba would
-therefore run arm/driver.py with the old filter. This module makes numba recompile the functions of a package such as
-r2s/arm after a change in a compiled module of this package or of r2s/physics. A change in a module from which a
-compiled module imports constants also causes a recompilation. Compiled code may call functions only in its own
-package and in r2s/physics.
+changes in other files whose functions the cached code calls. After a change in physics/safety_filter.py, numba would
+therefore run arm/driver.py with the old filter. This module makes numba recompile all functions of a package, such as
+r2s/arm, after a change in a compiled module of this package or of r2s/physics. A change in a module from which a
+compiled module imports constants also causes this recompilation. Compiled code of a package may therefore call only
+functions of this package and of r2s/physics.
 """
 
 import hashlib
@@ -48,7 +48,7 @@ def _imports(path: Path) -> list[list[str]]:
 
 
 class _Sources:
-    """Mixin for numba's cache locators: include the hash of `_sources` in the stamp that numba compares."""
+    """Mixin for numba's cache locators: add the hash of `_sources` to the stamp by which numba detects changes."""
 
     _py_file: str
 

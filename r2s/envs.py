@@ -61,7 +61,7 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
         TypeError: a name in `settings` is not in SETTINGS. UserError: a value or an override is wrong.
     """
     for name in settings:
-        if name not in SETTINGS:  # after a TypeError, stable-baselines3 omits render_mode
+        if name not in SETTINGS:  # stable-baselines3 passes render_mode, and omits it after a TypeError
             raise TypeError(f"unexpected keyword argument '{name}'; {instead_of(name, SETTINGS)}")
     words = [_word(k, v) for k, v in settings.items() if v is not None]
     if isinstance(overrides, str):
@@ -79,7 +79,7 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
 
 
 def _word(name: str, value: Any) -> str:
-    """Return an option as a word of the command line; put quotes around a path, which may contain any character."""
+    """Return an option as a word of the command line, with quotes around a path, which may contain any character."""
     from hydra.core.override_parser.types import Quote, QuotedString
 
     is_path = name == "calibration"

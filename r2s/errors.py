@@ -12,7 +12,7 @@ FAILED = "R2S_FAILED"  # environment variable that a sweep sets: path of the fil
 
 
 class UserError(ValueError):
-    """A user's mistake; the message names option or file, expected value, actual value and nearest allowed name."""
+    """A user's mistake; the message states option or file, expected value, actual value and nearest allowed name."""
 
 
 class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
@@ -26,7 +26,7 @@ def nearest(name: object, allowed: Iterable[str]) -> str:
 
 
 def nearest_file(path: Path, pattern: str = "*") -> str:
-    """Return the suggestion of `nearest` for a missing file, from the files in its folder that match `pattern`."""
+    """Return the suggestion of `nearest` for a missing file, from files that match `pattern` in the same folder."""
     return nearest(path.name, (p.name for p in path.parent.glob(pattern)))
 
 
@@ -44,7 +44,7 @@ def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
     """Import a module that only an extra of r2s installs (docs/how_to/install.md).
 
     Args:
-        module: name such as "panda_py". needed_by: option or file that needs the module. extra: the extra's name.
+        module: name such as "panda_py". needed_by: option or file that needs the module. extra: name of the extra.
 
     Raises:
         UserError: the module, or a module that it imports, is not installed.
@@ -60,7 +60,7 @@ def import_failure(error: ImportError, package: str, install: str) -> str:
     """Return why an import failed: the package, a package that it needs, or a shared library is missing.
 
     Args:
-        error: exception that the import raised, a ModuleNotFoundError if a package is missing, another ImportError if
+        error: exception that the import raised: a ModuleNotFoundError if a package is missing, another ImportError if
             a shared library such as libGL is missing.
         install: argument of `pip install` that installs the package.
     """

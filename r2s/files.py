@@ -13,7 +13,7 @@ from typing import Any
 
 from r2s.errors import UserError, nearest_file
 
-# Exceptions that NumPy, pandas, h5py and zipfile raise if a file is truncated, altered or of a wrong format.
+# Exceptions that NumPy, pandas, h5py and zipfile raise if a file is truncated, altered or has a wrong format.
 DAMAGED = (
     KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
     SyntaxError, TokenError,  # NumPy parses an array's header as a Python literal
@@ -22,7 +22,7 @@ OWN = "r2s:"  # prefix of paths inside the package
 
 
 def located(path: str | os.PathLike) -> Path:
-    """Return a path in which the package's folder replaces the prefix `r2s:`, as in r2s:models/panda.xml."""
+    """Return `path`, with the package's folder in place of a prefix `r2s:` (example: r2s:models/panda.xml)."""
     name = os.fspath(path)
     return Path(__file__).parent / name.removeprefix(OWN) if name.startswith(OWN) else Path(name)
 
@@ -43,7 +43,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def run_file(folder: str | Path, name: str, option: str) -> Path:
-    """Return the path of the file `name` in `folder`, or `folder` if `folder` is a file; errors begin with `option`.
+    """Return the path of the file `name` in `folder`, or `folder` itself if it is a file; errors begin with `option`.
 
     Raises:
         UserError: the file does not exist.

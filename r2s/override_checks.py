@@ -14,9 +14,9 @@ COMMANDS = ("look", "list", "export", "check", "convert", "engines")
 OPTIONAL = ("tracker", "experiment")  # config groups that may remain without a selected option
 EXTENSIBLE = ("tune.space",)  # keys under which + may add new keys
 STATED = re.compile(r"identify\.prior\.(?!(?:commanded|measured|motor)\b)[A-Za-z_]\w*(?:\.\w+)?=")
-NO_OPTION = "base"  # file that a group's options share; `base` itself cannot be selected
+NO_OPTION = "base"  # name of the file that a group's options share; the file is no option itself
 SEARCHPATH = "hydra.searchpath"
-# old names of keys and values: new names
+# {old name: new name} of keys and values
 RENAMED = {
     "arm.friction": "arm.friction_scale",
     "arm.late": "arm.extra_delay_s",
@@ -56,7 +56,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
         words: overrides KEY=VALUE and GROUP=OPTION. config_dir: folder of --config-dir. multirun: whether -m is set.
 
     Raises:
-        UserError: an option is unknown or no job reads it, a sweep has no -m, or a folder is missing.
+        UserError: an option is unknown or read by no job, -m is missing for a sweep, or a folder is missing.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -75,7 +75,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             return [o for o in loader.repository.get_group_options(group) if o != NO_OPTION]  # type: ignore[attr-defined]
 
         groups = {g: options(g) for g in loader.list_groups("") if g != "hydra"}
-        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # may name a launcher
+        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # these may set a launcher
         of_groups = {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")}
         if of_hydra:
             _check_hydra(of_hydra, [*own, *experiments], of_groups)
@@ -97,7 +97,7 @@ def _check_configs(
     from hydra import compose
     from omegaconf import OmegaConf
 
-    for cfg in configs:  # Hydra uses `root` before a job could check it
+    for cfg in configs:  # Hydra uses `root` before a job can check this option
         if cfg.get("stage") not in STAGES:
             raise UserError(f"stage: expected one of {choices(STAGES)}, got {cfg.get('stage')}")
         root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
@@ -145,7 +145,7 @@ def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[st
 
 
 class UnknownOption(Exception):  # noqa: N818 (its message is made where the options are known)
-    """Error for an override with a new key, because no stage reads new keys."""
+    """An override adds a key that conf/ lacks; no stage reads added keys."""
 
 
 def _jobs(
@@ -184,14 +184,14 @@ def _check_switches(cfg: Any, names: Sequence[str], defaults: Any) -> None:
     for name in names:
         try:
             default, value = OmegaConf.select(defaults, name), OmegaConf.select(cfg, name)
-        except OmegaConfBaseException:  # an interpolation without a target, which the stage reports
+        except OmegaConfBaseException:  # an interpolation without a target; the stage reports this error
             continue
         if isinstance(default, bool) and not isinstance(value, bool):
             raise UserError(f"{name}: expected true or false, got {value!r}")
 
 
 def check_option(group: str, value: Any, options: Sequence[str]) -> None:
-    """Raise UserError unless a group's value consists of strings; Hydra would print a traceback for other values."""
+    """Raise UserError unless a group's value is a string or strings; Hydra prints a traceback for other values."""
     words = value if isinstance(value, list) else [value]
     if not all(isinstance(w, str) for w in words) or not (words or group in OPTIONAL):
         raise UserError(f"{group}: expected one of {choices(options)}, got {value}")

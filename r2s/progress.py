@@ -19,7 +19,7 @@ class Progress:
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
         self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
-        # time and share at the first call in the current part (share > 0 in a resumed run); share at the last call
+        # time and share at the first call of the current part (in a resumed run, share > 0); share at the last call
         self._part, self._first, self._share = self._began, -1.0, 0.0
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._bar: Bar | None = None

@@ -19,7 +19,7 @@ def sha256(path: str | Path) -> str:
 
 
 def git() -> dict[str, Any]:
-    """Return the checkout's commit, and whether it has uncommitted changes; without a checkout, both are None."""
+    """Return the commit of the git checkout, and whether it has uncommitted changes; both None without a checkout."""
     root = Path(__file__).parent.parent
     if not (root / ".git").exists():  # an installed r2s may lie inside another project's repository
         return {"commit": None, "dirty": None}

@@ -1,8 +1,8 @@
 """Make, resume and read run folders runs/<stage>/<name>/ with config, provenance, tables and summary.
 
 The status in meta.json is `running` from the start, and remains `running` if the process is killed. A run folder
-receives its final name when the first files are complete. A lock on overrides.yaml allows only one process to write
-in a run folder.
+receives its final name when config, overrides and meta.json are complete. A lock on overrides.yaml allows only one
+process to write in a run folder.
 """
 
 import csv
@@ -29,7 +29,7 @@ from r2s.provenance import git, machine, packages, sha256
 
 # keys of meta.json for each part of a run; every resume begins a new part
 PART = ("start", "wall_clock_s", "status", "process", "threads", "device", "git", "packages", "machine")
-NOTE_S = 30.0  # s between updates of the wall clock in meta.json, so that the duration of a killed run is known
+NOTE_S = 30.0  # s between updates of wall_clock_s in meta.json, from which the duration of a killed run is known
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Job:
     """Description of a job, stored in the job's run folder.
 
     Attributes:
-        stage, name: run folder runs/<stage>/<name>. r2s adds a number to a name that exists; if name is None,
-            `default_name` chooses a name.
+        stage, name: run folder runs/<stage>/<name>. r2s adds a number to an existing name; None selects the result of
+            `default_name`.
         config: composed config as YAML text. overrides: overrides as the user typed them.
         seed: seed of the run. threads: number of threads; 0: one per core. device: device of the learner.
         inputs: files that the run reads; meta.json records their SHA-256. parents: run folders that the run uses.
@@ -63,7 +63,7 @@ class Run:
             Trackers neither raise errors nor block.
 
     Args:
-        root: folder of all runs. job: see `Job`. exact_name: whether to raise an error if the name exists.
+        root: folder of all runs. job: see `Job`. exact_name: whether an existing name is an error.
         resume: existing run folder to continue; the input files of the run must be unchanged.
 
     Raises:
@@ -165,7 +165,7 @@ class Run:
         return self._meta
 
     def memo(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays that `make` computes; if checkpoints/<name>.npz exists, read them from this file.
+        """Return the arrays that `make` computes, or read them from checkpoints/<name>.npz if this file exists.
 
         A resumed run skips computations whose results are saved.
 
@@ -187,7 +187,7 @@ class Run:
         return self.folder / "figures" / f"{name}.png"
 
     def log(self, table: str, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to <table>.csv and return the row, rounded as in the file; the first row defines the columns.
+        """Append a row to <table>.csv, and return the row as rounded in the file; the first row defines the columns.
 
         Callers must base decisions on the returned row, because a resumed run reads that row from the file.
         """
@@ -360,9 +360,9 @@ def _lock(folder: Path) -> int:
 
 
 def status_of(meta: Mapping[str, Any]) -> str:
-    """Return done, stopped, failed, running, or killed (meta.json says running, but the process has ended).
+    """Return the status of a run; it is `killed` if meta.json says `running`, but the process has ended.
 
-    If the process is on another computer, which r2s cannot check, return the status in meta.json.
+    r2s cannot check a process on another computer; the status is then that in meta.json.
     """
     process = meta.get("process", {})
     if meta["status"] != "running" or process.get("host") != platform.node():
@@ -390,7 +390,7 @@ def _take_name(folder: Path, parent: Path, name: str, exact_name: bool) -> Path:
     for k in range(1, 2 if exact_name else 1000):
         final = parent / (name if k == 1 else f"{name}_{k}")
         try:
-            os.rename(folder, final)  # also replaces an empty folder; if two processes rename, the second fails
+            os.rename(folder, final)  # replaces even an empty folder; if two processes rename, the second fails
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                 raise

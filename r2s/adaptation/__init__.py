@@ -1,1 +1,1 @@
-"""Estimate payload, friction, offsets and external wrench while an arm works, and correct the arm's torque."""
+"""Estimate payload, friction, offsets and external wrench of a working arm; add a torque against model errors."""

@@ -6,9 +6,9 @@ import numpy as np
 
 
 class Adapter(Protocol):
-    """An object that computes a torque for one arm at 1 kHz; the driver adds this torque before the safety filter.
+    """An object that computes a torque at 1 kHz; the driver adds it to the policy's torque before the safety filter.
 
-    An adapter must be picklable, because the adapter and the policy of a real-time arm run in different processes.
+    An adapter must be picklable, because on a real-time arm, adapter and policy run in different processes.
     """
 
     def begin(self) -> None:

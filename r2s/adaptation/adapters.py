@@ -1,7 +1,7 @@
 """Create the adapters of conf/adapt from the result of an identification.
 
-To add an adapter, write a function or class whose arguments are an `AdapterContext` and the adapter's settings, and
-name this function or class in a new file of conf/adapt.
+To add an adapter, write a function or class that accepts an `AdapterContext` and the adapter's settings. Then name
+this function or class in a new file of conf/adapt.
 """
 
 from dataclasses import dataclass, replace
@@ -26,12 +26,12 @@ from r2s.recordings.recording import Recording
 
 @dataclass(frozen=True)
 class AdapterContext:
-    """Result of an arm's identification, from which a function such as `observer` creates an adapter for this arm.
+    """Result of an arm's identification; functions such as `observer` create an adapter from this result.
 
     Attributes:
         robot, dynamics: the identified arm.
-        posterior: parameter space and samples of the posterior. If None, `default_noise` assumes a prior.
-        unloaded: two recordings with commanded torque and without a payload. If None, the model stays uncorrected.
+        posterior: parameter space and samples of the posterior; if None, `default_noise` assumes a prior.
+        unloaded: two recordings with commanded torque and without a payload; if None, the model is not corrected.
     """
 
     robot: Robot
@@ -46,7 +46,7 @@ class AdapterContext:
 
     @cached_property
     def corrected(self) -> tuple[ArmModel, Noise]:
-        """Return the arm's model, corrected by a fit to `unloaded`, and the uncertainty of the corrected model."""
+        """Return the arm model corrected by a fit to `unloaded`, together with the corrected model's uncertainty."""
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 
@@ -63,7 +63,7 @@ class AdapterContext:
 def observer(context: AdapterContext, filter_s: float) -> Adapter:
     """Return the disturbance observer of `adapt=observer`; raise UserError unless filter_s is above 0.
 
-    The observer's model omits the declared payload: the arm compensates the payload's weight itself.
+    The observer's model omits the declared payload, because the arm itself compensates this payload's weight.
     """
     bare = replace(context.dynamics, declared_payload=np.zeros(4))
     return context.gated(Observer(make_arm_model(context.robot, bare), filter_s))

@@ -1,8 +1,8 @@
 """Convert an identified arm to arrays for compiled functions: links, friction and latency.
 
-A table per joint represents any friction law. The table has a column for each speed, and the rows FORWARD, BACKWARD
-and SPEED_ONLY. At the presliding deflection z in [-1, 1], friction is z * FORWARD + SPEED_ONLY if z >= 0, else
-z * BACKWARD + SPEED_ONLY.
+Each joint has a table, which can represent any friction law. It has a column per speed and the rows FORWARD, BACKWARD
+and SPEED_ONLY. At the presliding deflection z in [-1, 1], friction is z * FORWARD + SPEED_ONLY if z >= 0, else z *
+BACKWARD + SPEED_ONLY.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from r2s.physics.newton_euler import links_of
 from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 
-POINTS = 401  # speeds per direction of a table, denser near rest
+POINTS = 401  # number of speeds per direction of a table; the speeds are denser near 0
 FORWARD, BACKWARD, SPEED_ONLY = range(3)  # rows of a table
 
 
@@ -31,7 +31,7 @@ class ArmModel(NamedTuple):
     links: np.ndarray  # (n, LINK)
     compensated: np.ndarray  # (n, 4) kg and kg m, mass and first moment that gravity compensation uses
     declared: np.ndarray  # (4,) kg and kg m, the declared payload, which `compensated` includes
-    payload_frame: np.ndarray  # (12,), position and axes of the payload frame in the last link
+    payload_frame: np.ndarray  # (12,), position and axes of the payload frame in the last link's frame
     gravity: np.ndarray  # (3,) m/s^2
     armature: np.ndarray  # (n,) kg m^2
     offset: np.ndarray  # (n,) Nm; `Dynamics` explains offset, load and drag
@@ -45,11 +45,11 @@ class ArmModel(NamedTuple):
     level: np.ndarray  # (n,) Nm, sliding friction
     breakaway: np.ndarray  # (n,) Nm, largest torque that stiction balances
     latency: np.ndarray  # (2,) cycles, delay and lag
-    payload_max: np.ndarray  # (2,) kg, m, largest mass and distance of a payload, see `Robot`
+    payload_max: np.ndarray  # (2,) kg, m, largest mass of a payload and largest distance of its center, see `Robot`
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
-    """Return the `ArmModel` of the arm with the dynamics `d`, whose arrays have no batch dimension."""
+    """Return the `ArmModel` of an arm; the arrays of its dynamics `d` must have no batch dimension."""
     position, axes = ee_pose(robot)
     compensated = np.column_stack([robot.mass, robot.mass[:, None] * robot.com])
     compensated[-1] += d.declared_payload

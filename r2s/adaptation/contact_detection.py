@@ -23,12 +23,12 @@ from r2s.physics.robot import SIM_DT
 
 @njit(cache=True, error_model="numpy")
 def detect(thresholds, floor, state):
-    """Test whether a contact begins or ends, but only while a joint moves: friction of resting joints hides forces.
+    """Detect the start and the end of a contact, but only while a joint moves: at rest, joint friction hides forces.
 
     A force test and an impact test check the hypothesis that no force acts. An impact raises the variances of the
-    wrench filter, and high variances hide the impact from the force test. When the innovations rise suddenly, the
-    impact test therefore uses the covariance before the rise, for at most IMPACT cycles. The impact test low-passes
-    the force, because vibrating gears make the estimated force oscillate.
+    wrench filter, and high variances hide the impact from the force test. After a sudden rise of the innovations, the
+    impact test therefore uses the covariance from before the rise, for at most IMPACT cycles. The impact test
+    low-passes the force, because vibrating gears make the estimated force oscillate.
     """
     x, P, contact, calm, smooth = state.x, state.P, state.contact, state.calm, state.smooth
     n = state.joints.shape[1]
@@ -54,7 +54,7 @@ def detect(thresholds, floor, state):
 
 @njit(cache=True, error_model="numpy")
 def _square(P, floor, force):
-    """Return the squared force f^T C^-1 f in units of its covariance C = P[:3, :3] + floor^2 I; f: `force` (3,) N."""
+    """Return the squared force f^T C^-1 f with f = `force` (3,) N and the covariance C = P[:3, :3] + floor^2 I."""
     square = floor**2
     a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]
     d, e, f = P[1, 1] + square, P[2, 1], P[2, 2] + square
@@ -69,7 +69,7 @@ def _square(P, floor, force):
 
 @njit(cache=True, error_model="numpy")
 def weigh(arm, state):
-    """Measure the tip's path while the force points down; after 5 cm, the force counts as a payload's weight."""
+    """In contact, measure the tip's path with a downward force; after 5 cm, this force is a payload's weight."""
     x, P, joints, J, contact = state.x, state.P, state.joints, state.jacobian, state.contact
     g = np.sqrt((arm.gravity * arm.gravity).sum())
     if contact[TOUCHES] == 0.0 or g == 0.0:

@@ -1,8 +1,9 @@
 """Freeze an adapter in contact, because adapters treat a contact force as a model error and push against the force.
 
 In contact, the gate freezes the adapter's estimate and returns the torque that the adapter added REWIND cycles before
-the gate detected the contact. The weight of a payload that the arm's model lacks is not a contact, so the gate passes
-the estimated payload to the wrench observer. If the adapter has no `Estimator`, the gate runs one.
+the gate detected the contact. The gate passes the estimated payload to the wrench observer, so that the observer does
+not detect the payload's weight as a contact. For an adapter without an `Estimator`, the gate itself estimates the
+payload.
 """
 
 from typing import Any, Protocol
@@ -15,7 +16,7 @@ from r2s.adaptation.estimator import Estimator
 from r2s.adaptation.kalman import Noise
 from r2s.adaptation.wrench import WrenchObserver
 
-REWIND = 100  # cycles, age of the torque added in contact: longer than a detection takes (benchmarks/wrench.py)
+REWIND = 100  # cycles, age of the torque added in contact; a detection takes less time (benchmarks/wrench.py)
 
 
 class Holdable(Adapter, Protocol):
@@ -28,9 +29,9 @@ class ContactGate:
     """Wrap an adapter, and freeze the wrapped adapter in contact.
 
     Args:
-        adapter: the wrapped adapter; the gate uses the payload estimate of its attribute `estimator`, if present.
+        adapter: the wrapped adapter; if it has an attribute `estimator`, the gate uses the payload of this estimator.
         wrench: observer that detects contacts.
-        arm, noise: arm model and its uncertainty for the gate's own estimator.
+        arm, noise: arm model and model uncertainty, for an estimator of the gate.
     """
 
     def __init__(self, adapter: Holdable, wrench: WrenchObserver, arm: ArmModel, noise: Noise):
@@ -45,7 +46,7 @@ class ContactGate:
         given: Any = getattr(self.adapter, "estimator", None)
         self._own = given is None
         self._estimator: Estimator = Estimator(*self._model) if self._own else given
-        self._past = np.zeros((REWIND, len(self.wrench.rests)))  # added torques of the last cycles without contact
+        self._past = np.zeros((REWIND, len(self.wrench.rests)))  # torques added in the last cycles without contact
         self._cycle = 0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:

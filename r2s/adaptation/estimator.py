@@ -4,9 +4,9 @@
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A call takes about 15 us, or 50 us at the end of each 20 ms span. Reading `now` takes longer. `now` reports the
-payload as a physical body, whose second moment about the center is non-negative (Wensing, Kim, Slotine, RA-L 3(1),
-2018).
+Most calls take about 15 us; the call that ends a 20 ms span takes 50 us. Reading `now` takes longer. `now` reports a
+physically possible payload: its second-moment matrix about the center is positive semi-definite (Wensing, Kim,
+Slotine, RA-L 3(1), 2018).
 """
 
 from dataclasses import dataclass
@@ -42,11 +42,11 @@ class Estimate:
     rests: bool  # no joint slides
     odds: float  # log odds of a payload change
     changed: bool  # whether a payload change was detected in this span
-    beyond: bool = False  # whether mass - mass_half exceeds the largest payload, which limits compensation
+    beyond: bool = False  # whether mass - mass_half exceeds the largest payload mass that r2s compensates
 
 
 class Estimator:
-    """Estimate one arm's payload, friction and offsets recursively, in every cycle.
+    """Estimate one arm's payload, friction and offsets recursively; a new estimate follows every 20 ms.
 
     Attributes:
         changes: times in s at which the estimator detected payload changes.
@@ -66,18 +66,18 @@ class Estimator:
         self._before = self._payload()
         self._moved = 0  # spans of motion since a rest, up to SETTLING_SPANS
         self._now: Estimate | None = None
-        apply_jump(Filter.fresh(noise), noise)  # compile before an arm waits
+        apply_jump(Filter.fresh(noise), noise)  # compile now, while no arm waits
         self.begin()
 
     def begin(self, pause_s: float = 0.0) -> None:
-        """Start a motion from rest and keep the estimate; a pause of `pause_s` s before the motion adds variance."""
+        """Start a motion from rest with the last estimate; a pause of `pause_s` s before it adds variance."""
         if pause_s:
             pause(self._filter, self._noise, pause_s)
             self._paused_s, self._now = self._paused_s + pause_s, None
         self._state, self._residual = ResidualState.fresh(self._n), MomentumResidual.empty(self._n)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
-        """Process q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether the estimate is new.
+        """Process q, dq (n,) rad, rad/s and command tau (n,) Nm without gravity; return whether the estimate changed.
 
         If a value is not finite, the estimator ignores this cycle and calls `begin`.
 
@@ -114,7 +114,8 @@ class Estimator:
     def _replaced_at_rest(self) -> bool:
         """Return whether the payload after a rest differs from the payload before that rest.
 
-        At rest the payload's variance grows, so the Kalman filter follows a payload change without a detected jump.
+        At rest the payload's variance grows; the Kalman filter then follows a payload change without detecting a
+        jump.
         """
         if self._filter.counts[AT_REST] >= REST_SPANS:
             self._moved = 0
@@ -172,11 +173,11 @@ class Estimator:
 
 
 def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the physical body nearest to x (10,): mass kg, center (3,) m, tensor (3, 3) kg m^2 about the center.
+    """Return mass kg, center (3,) m and tensor (3, 3) kg m^2 of the physical body nearest to the parameters x (10,).
 
-    Mass and first moments stay unchanged, because the data determine them well. The nearest non-negative second
-    moment about the center replaces the estimated second moment, so the pseudo-inertia [[Sigma, h], [h, m]] is
-    positive semi-definite.
+    The tensor is about the center. Mass and first moments stay unchanged, because the data determine them well. The
+    nearest positive semi-definite matrix replaces the second moment about the center, so that the pseudo-inertia
+    [[Sigma, h], [h, m]] is positive semi-definite, too.
     """
     m = float(x[0])
     if m <= 0.0:

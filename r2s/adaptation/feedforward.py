@@ -1,9 +1,9 @@
-"""Compute the feedforward torque of the estimated payload, friction and offsets.
+"""Compute a feedforward torque from the estimated payload, friction and offsets.
 
 The feedforward uses the payload's estimated mass and center, clipped by `plausible_payload`. For joint j, the
 estimate x with covariance P predicts the torque c = h x - g_d in Nm. The vector h consists of ten payload terms
-(gravity, Coriolis, acceleration), the model's friction, and 1 for the offset. The torque g_d is the weight of the
-declared payload, which the arm itself compensates. The torque c has the variance s^2 = h P h^T. The feedforward
+(gravity, Coriolis, acceleration), the model's friction, and 1 for the offset. The torque g_d is the gravity torque of
+the declared payload, which the arm itself compensates. The torque c has the variance s^2 = h P h^T. The feedforward
 torque is w c with a weight w. For the true torque c*, the mean square error E (w c - c*)^2 is smallest at w = c*^2 /
 (c*^2 + s^2). Because c^2 - s^2 is an unbiased estimate of c*^2, r2s chooses the weight
 
@@ -13,9 +13,9 @@ The weight w is 0 if |c| < s. The torque w c is the positive-part James-Stein es
 c*.
 
 The feedforward follows the motion without delay, but a low-pass with a time constant of 20 ms smooths the torque step
-at a new estimate. Without a low-pass, a torque step twists elastic gears, the Kalman filter explains the twist by a
-new payload, and the new estimate causes another torque step. On an elastic development twin without a low-pass,
-torque steps of 30 Nm repeated at 25 Hz.
+at a new estimate. Without this low-pass, a torque step would twist elastic gears. The Kalman filter would then
+attribute the twist to a new payload, and the new estimate would cause the next torque step. On an elastic development
+twin without this low-pass, torque steps of 30 Nm occurred at 25 Hz.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ from r2s.physics.robot import SIM_DT
 
 
 class Feedforward:
-    """An `Adapter` that adds the estimated torque, reduced by a weight if the estimate is uncertain.
+    """An `Adapter` that adds the estimated torque times a weight; the weight is small if the estimate is uncertain.
 
     Args:
         arm: the corrected model. noise: uncertainty of the corrected model.
@@ -47,7 +47,7 @@ class Feedforward:
         n = self._n
         self.estimator = Estimator(self._arm, self._noise)
         self._payload, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))
-        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # estimated torque; its part not yet added
+        self._torque, self._remaining = np.zeros(n), np.zeros(n)  # estimated torque; its part that is not yet added
 
     @property
     def held(self) -> bool:
@@ -75,11 +75,11 @@ class Feedforward:
 
 @njit(cache=True, error_model="numpy")
 def plausible_payload(x, most, out):
-    """Write a payload's inertial parameters (10,) to `out`; mass and center are the estimate x, clipped to `most`.
+    """Write a payload's inertial parameters (10,) to `out`, with mass and center of the state x, clipped to `most`.
 
-    most: (2,), largest mass in kg, and largest distance in m from the payload frame to the center. The payload has
-    the tensor of a ball of water, because data hardly determine tensors, and a wrong tensor would act as acceleration
-    feedback.
+    most: (2,), largest mass in kg, and largest distance in m from the payload frame to the center. The tensor in
+    `out` is that of a ball of water of the same mass, because data hardly determine tensors, and a wrong tensor would
+    act as acceleration feedback.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0
@@ -96,7 +96,7 @@ def plausible_payload(x, most, out):
 
 @njit(cache=True, error_model="numpy")
 def shrinkage_weights(filter, residual, payload, declared, weight):
-    """At the end of a 20 ms span, write the shrinkage weight of each joint's torque to `weight` (n,)."""
+    """At the end of a 20 ms span, write each joint's weight w (see the module's docstring) to `weight` (n,)."""
     x, P, n = filter.x, filter.P, len(weight)
     h, at = np.empty(BODY + 2), np.empty(BODY + 2, dtype=np.int64)
     for j in range(n):
@@ -114,7 +114,7 @@ def shrinkage_weights(filter, residual, payload, declared, weight):
 
 @njit(cache=True, error_model="numpy")
 def _estimated_torque(x, state, payload, weight, slow, torque):
-    """Write the weighted torque of payload and state x to `torque` (n,) Nm; slow: (n, 10), low-passed `payload_p`."""
+    """Write w c for `payload` and state x to `torque` (n,) Nm; weight: w; slow (n, 10): low-passed `payload_p`."""
     terms, n, share = state.terms, len(torque), -np.expm1(-SIM_DT / ACCELERATION_S)
     for j in range(n):
         total = x[BODY + j] * state.friction[BEFORE, j] + x[BODY + n + j] - terms.declared[j]

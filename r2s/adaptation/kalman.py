@@ -1,13 +1,13 @@
 """Estimate payload, friction and offsets with a Kalman filter, in compiled code.
 
-The state of an arm with n joints has N = 10 + 4 n components:
+For an arm with n joints, the state has N = 10 + 4 n components:
 - the payload's mass, first moments and tensor about the payload frame: kg, kg m, kg m^2;
 - per joint the relative error of the friction model, a random walk;
-- per joint the error of the torque offset in Nm, a random walk;
+- per joint the error of the offset in Nm, a random walk;
 - per joint the model error in Nm, an Ornstein-Uhlenbeck process whose variance grows when friction changes;
 - per joint the relative error of the momentum rate, an Ornstein-Uhlenbeck process.
 
-The filter processes the momentum residual of one joint after the other. Breakaway or a vibrating gear causes large
+The filter processes the joints' momentum residuals one after the other. Breakaway or a vibrating gear causes large
 residuals for one or two spans of 20 ms. Huber's function (Robust Statistics, 1981) therefore reduces the weight of
 innovations beyond HUBER standard deviations. A payload change causes large innovations for longer, so the filter
 still follows the change.
@@ -41,17 +41,17 @@ class Noise(NamedTuple):
     momentum_share: np.ndarray  # (n,), relative error of the momentum rate
     model: np.ndarray  # (n,) Nm, model error
     correlation_s: float  # s, correlation time of the model error
-    reversal: np.ndarray  # (n,), added model error after a change of friction, relative to that change
+    reversal: np.ndarray  # (n,), model error that a change of friction adds, relative to this change
     level: np.ndarray  # (n,) Nm, friction level as in `ArmModel`
     breakaway: np.ndarray  # (n,) Nm, as in `ArmModel`
     inertia: np.ndarray  # (n, n) kg m^2, inertia missing in the model, mostly of rotors
     latency: np.ndarray  # (n, n) s, latency missing in the model
-    payload_friction: float  # model error relative to the payload's torque: load-dependent friction, noisy speeds
+    payload_friction: float  # model error / payload torque, from load-dependent friction and noisy speeds
     friction_drift: float  # 1/sqrt(s), random walk of relative friction
     offset_drift: np.ndarray  # (n,) Nm/sqrt(s), random walk of the offsets
     rest_drift: float  # kg^2/s, growth of the mass variance at rest, where payload changes are invisible
     payload_drift: float  # 1/sqrt(s), random walk of the payload, relative to its prior
-    adaptation: float  # growth of white noise per span while innovations exceed the prediction; 0: none
+    adaptation: float  # growth of white noise per span while innovations exceed the prediction; 0: no growth
     prior: np.ndarray  # (N,) standard deviations of the initial state
     mean: np.ndarray  # (N,), mean of the initial state
 
@@ -116,7 +116,7 @@ def predict(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def pause(filter, noise, seconds):
-    """Increase variances, at most to those of the prior, because a payload may change in a pause of `seconds`."""
+    """Increase variances, at most to the prior variances: the payload may change during a pause of `seconds` s."""
     P, prior, n = filter.P, noise.prior, len(noise.level)
     for i in range(BODY + 2 * n):
         if i < BODY:
@@ -152,7 +152,7 @@ def _predict_joint(filter, noise, residual, j):
         P[error, error] += model**2 * (1.0 - fade * fade)
     P[error, error] += noise.reversal[j] ** 2 * noise.level[j] * residual.friction_path[j]
     most = model**2 + (2.0 * noise.reversal[j] * noise.level[j]) ** 2
-    if P[error, error] > most:  # limit to the variance of an unknown model error; keep the correlations
+    if P[error, error] > most:  # limit the variance to that of an unknown model error; keep the correlations
         for i in range(N):
             if i != error:
                 P[error, i] *= np.sqrt(most / P[error, error])
@@ -173,7 +173,7 @@ def _predict_joint(filter, noise, residual, j):
 
 @njit(cache=True, error_model="numpy")
 def correct(filter, noise, residual):
-    """Correct the state's mean and covariance by the residual of one joint after the other."""
+    """Correct the state's mean and covariance by the joints' residuals, one after the other."""
     x, P, h, N = filter.x, filter.P, filter.work[0], len(filter.x)
     for j in range(len(residual.y)):
         v, S = _innovation(filter, noise, residual, j)
@@ -193,13 +193,13 @@ def correct(filter, noise, residual):
 
 @njit(cache=True, error_model="numpy")
 def _innovation(filter, noise, residual, j):
-    """Return joint j's innovation, Nm, and its variance; write its covariance with the state to filter.work[0]."""
+    """Return joint j's innovation (Nm) and its variance; write its covariance with the state to filter.work[0]."""
     x, P, h, n = filter.x, filter.P, filter.work[0], len(residual.y)
     friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
     of_friction, of_rate, payload = residual.friction[j], residual.rate[j], residual.payload
     R = noise.white[j] ** 2 + (noise.momentum_share[j] * of_rate) ** 2 + filter.work[1, j]
     R = filter.noise_scale[j] * R
-    if residual.sliding[j] == 0.0:  # stiction balances any torque up to breakaway: uniform distribution
+    if residual.sliding[j] == 0.0:  # stiction may be any torque up to breakaway: variance of a uniform distribution
         R += noise.breakaway[j] ** 2 / 3.0 * STICTION_S / T
     for i in range(len(x)):
         s = P[i, friction] * of_friction + P[i, offset] + P[i, error] + P[i, rate] * of_rate

@@ -2,13 +2,14 @@
 
 An identification omits model terms that hardly improve the fit. A payload estimate needs these terms, because a
 torque error of 0.1 Nm at a lever arm of 0.5 m looks like a mass of 20 g. The correction therefore fits the terms of
-every joint (`TERMS`), missing inertia and latency, mass and first moments of every link, and the compliance of every
-gear. Each parameter has a prior with mean zero and a typical standard deviation, so the fit is a ridge regression
-(Bishop 2006, 3.3). The fit uses momentum residuals (momentum_residual.py), which need no accelerations.
+every joint (`TERMS`), the mass and first moments of every link, the compliance of every gear, and inertia and latency
+that the model lacks. Each parameter has a prior with mean zero and a typical standard deviation, so the fit is a
+ridge regression (Bishop 2006, 3.3). The fit uses momentum residuals (momentum_residual.py), which need no
+accelerations.
 
 A compliant gear of stiffness K twists by torque / K. A residual that ignores the twist between motor and link has an
-error of M d2(torque)/dt2 / K, where M is the mass matrix. This error is 0.7 Nm on a Panda with K = 15 kNm/rad whose
-torque varies by 4 Nm at 7 Hz.
+error of M d2(torque)/dt2 / K, where M is the mass matrix. For example, on a Panda with K = 15 kNm/rad, a torque that
+varies by 4 Nm at 7 Hz causes an error of 0.7 Nm.
 """
 
 from typing import NamedTuple
@@ -22,7 +23,7 @@ from r2s.physics.newton_euler import COM, MASS
 from r2s.physics.rigid_body import regressor
 from r2s.physics.robot import Robot
 
-ROUNDS = 3  # fits, each followed by an estimate of the residuals' RMS
+ROUNDS = 3  # number of fits; an estimate of the residuals' RMS follows each fit
 # terms of a joint with speed v of sign s: share of its friction, offset, s |gravity|, s, s sqrt |v|,
 # s / (1 + |v| / STRIBECK_SPEED), v, s sin q, s cos q, sin q, cos q
 SHARE, OFFSET, LOAD, LAW, ANGLE, CABLE, TERMS = 0, 1, 2, 3, 7, 9, 11
@@ -99,7 +100,7 @@ def apply_correction(arm: ArmModel, correction: ModelCorrection) -> ArmModel:
 def corrected_residuals(
     robot: Robot, arm: ArmModel, correction: ModelCorrection, residuals: list[MomentumResidual]
 ) -> list[MomentumResidual]:
-    """Convert `residuals` of `arm` to those of the corrected arm, with corrected friction, inertia and latency."""
+    """Convert `residuals` of `arm` to residuals of the model with corrected links, friction, inertia and latency."""
     shared, own, y, _ = _columns(robot, arm, residuals)
     terms = own * np.concatenate([correction.joints, correction.inertia, correction.latency], 1)
     y = y - shared @ np.concatenate([correction.links.ravel(), correction.compliance]) - terms.sum(-1)
@@ -131,7 +132,7 @@ def _columns(
 
 
 def _link_prior(arm: ArmModel) -> np.ndarray:
-    """Return the prior standard deviations (n, 4), kg and kg m, of the links' masses and first moments."""
+    """Return the prior standard deviations (n, 4) of the links' masses (kg) and first moments (kg m)."""
     mass = np.maximum(arm.links[:, MASS, None], 1e-6)
     return np.concatenate([tuning.LINK_MASS_SHARE * mass, np.repeat(tuning.LINK_CENTRE_M * mass, 3, 1)], 1)
 

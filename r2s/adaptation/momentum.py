@@ -1,4 +1,4 @@
-"""Compute an arm's momentum and, as columns, its derivatives with respect to a payload's inertial parameters.
+"""Compute an arm's momentum and its derivatives (columns) with respect to the inertial parameters of a payload.
 
 The momentum p = M(q) dq obeys dp/dt = tau + C(q, dq)^T dq - g(q) (De Luca and Mattone, ICRA 2003). Let S_j be the
 screw axis of joint j about the base origin, and h_j the total momentum of all bodies that joint j moves. Then p_j is
@@ -13,8 +13,8 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.physics.newton_euler import AXIS, COM, FRAME, MASS, PLACE, TENSOR, product, rotate, rotate_about
 
-BODY = 10  # inertial parameters: mass, first moments, and xx, yy, zz, xy, xz, yz about the frame's origin
-MOMENTUM_WORK = 18  # columns of the workspace, per joint
+BODY = 10  # number of inertial parameters: mass, first moments, and xx, yy, zz, xy, xz, yz about the frame's origin
+MOMENTUM_WORK = 18  # columns of the workspace, which has a row per joint
 
 
 class MomentumTerms(NamedTuple):
@@ -22,11 +22,11 @@ class MomentumTerms(NamedTuple):
 
     p: np.ndarray  # (n,) Nm s
     coriolis: np.ndarray  # (n,) Nm, C^T dq
-    uncompensated: np.ndarray  # (n,) Nm, gravity torque of the links that gravity compensation does not cancel
+    uncompensated: np.ndarray  # (n,) Nm, part of the links' gravity torque that gravity compensation does not cancel
     compensated: np.ndarray  # (n,) Nm, gravity torque that gravity compensation cancels
     declared: np.ndarray  # (n,) Nm, the declared payload's part of `compensated`
     payload_p: np.ndarray  # (n, 10), derivative of p with respect to the payload's parameters
-    payload_torque: np.ndarray  # (n, 10), derivative of coriolis - uncompensated, likewise
+    payload_torque: np.ndarray  # (n, 10), derivative of `coriolis` - `uncompensated` with respect to these parameters
 
     @staticmethod
     def empty(n: int) -> "MomentumTerms":
@@ -84,7 +84,7 @@ def momentum(arm, q, dq, terms, work):
         ax, ay, az = _cross(m * cx - bx, m * cy - by, m * cz - bz, gx, gy, gz)
         bx, by, bz = _cross(bx, by, bz, gx, gy, gz)
         pull[i], weight[i] = 0.0, 0.0
-        for j in range(i + 1):  # a link's weight acts on all joints before it
+        for j in range(i + 1):  # a link's weight acts on all joints between base and link
             o = work[j]
             down = o[3] * gx + o[4] * gy + o[5] * gz
             pull[j] -= o[0] * ax + o[1] * ay + o[2] * az + (m - b[0]) * down
@@ -110,7 +110,7 @@ def momentum(arm, q, dq, terms, work):
 
 @njit(cache=True, error_model="numpy")
 def _payload_columns(arm, R, p, w, v, terms, work):
-    """Write the payload's columns to `terms`; (R, p): last link's pose, (w, v): its twist about the base origin."""
+    """Write a payload's columns to `terms`; (R, p), (w, v): pose and twist of the last link about the base origin."""
     frame, (px, py, pz), (wx, wy, wz), (vx, vy, vz) = arm.payload_frame, p, w, v
     rx, ry, rz = rotate(R, frame[0], frame[1], frame[2])
     px, py, pz = px + rx, py + ry, pz + rz

@@ -1,4 +1,4 @@
-"""Compute the momentum residual: 60 ms mean of the torque that command, friction and links do not explain.
+"""Compute the momentum residual: the mean over 60 ms of the torque that command, friction and links do not explain.
 
 The change of momentum equals the integral of all torques, so the residual needs no accelerations. Let I be the
 integral of the model torque, p the momentum, and m the moving average of I - p. The residual y = (m(t) - m(t - T)) /
@@ -27,10 +27,10 @@ CYCLE, COMMAND, ENDED = range(3)  # indices of `counts`: cycles of this span, al
 BEFORE, INTEGRAL = range(2)  # rows of `model`, `friction`, `payload`: value in the last cycle; integral over the span
 # rows of `sums`: residual Nm s, friction Nm s, momentum Nm s, q, dq, motor torque Nm
 RESIDUAL, FRICTION, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
-# first index of `sums`: falling, rising side of triangles in this span; rising side, whole triangle of the last span
+# first index of `sums`: this span's falling and rising side of a triangle; last span's rising side and whole triangle
 FALLING, RISING, LAST_RISING, LAST_WHOLE = range(4)
-RISING_SUM = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of a rising side; the falling side has SPAN - 1 to 0
-STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step that the spline passes in spans 1 and 2
+RISING_SUM = SPAN * (SPAN + 1) // 2  # sum of a rising side's weights 1 to SPAN; a falling side has SPAN - 1 to 0
+STEP_RESPONSE = np.array([1 / 6, 5 / 6])  # share of a torque step in the first and the second residual
 
 
 class ResidualState(NamedTuple):
@@ -108,7 +108,7 @@ def update_residual(arm, state, q, dq, tau, out):
 
 @njit(cache=True, error_model="numpy")
 def _integrate(arm, state, q, dq, out):
-    """Add one cycle to the integrals of model torque, friction and the payload's columns (momentum.py)."""
+    """Add one cycle to the integrals of model torque, friction and `payload_torque` (momentum.py)."""
     h, counts, terms = SIM_DT, state.counts, state.terms
     model, friction, payload, deflection = state.model, state.friction, state.payload, state.deflection
     path, sliding = out.friction_path, out.sliding
@@ -141,7 +141,7 @@ def _integrate(arm, state, q, dq, out):
 
 @njit(cache=True, error_model="numpy")
 def _add_to_sums(state, q, dq):
-    """Add this cycle to two sums with triangular weights, which peak at the start and the end of this 20 ms span."""
+    """Add this cycle to two sums with triangular weights: one peaks at the start of this span, one at the end."""
     rising, p, payload_p = state.counts[CYCLE] + 1, state.terms.p, state.terms.payload_p
     for k, weight in ((FALLING, SPAN - rising), (RISING, rising)):
         sums, payload_sums = state.sums[k], state.payload_sums[k]
@@ -160,11 +160,11 @@ def _add_to_sums(state, q, dq):
 def _close_span(arm, state, out):
     """Write the residual at the end of a 20 ms span; reset all integrals to zero, so that no integral grows large."""
     whole = SPAN * SPAN  # sum of the weights of a triangle
-    scale = 1.0 / (whole * SPAN * SIM_DT)  # converts sums to the change of means per second
+    scale = 1.0 / (whole * SPAN * SIM_DT)  # converts a difference of sums to the rate of change of a mean
     sums, slid, n = state.sums, state.slid, len(out.y)
     curvature = np.empty(n)  # Nm/s^2, second derivative of the motor torque
     for j in range(n):
-        motor = (sums[FALLING, MOTOR, j] + sums[RISING, MOTOR, j]) / whole  # a cycle's two weights add up to SPAN
+        motor = (sums[FALLING, MOTOR, j] + sums[RISING, MOTOR, j]) / whole  # a cycle's weights add up to SPAN
         spans = state.motor_spans
         curvature[j] = (motor - 2.0 * spans[0, j] + spans[1, j]) / (SPAN * SIM_DT) ** 2
         spans[1, j], spans[0, j] = spans[0, j], motor

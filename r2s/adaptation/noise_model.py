@@ -63,9 +63,9 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 
 
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
-    """Return the momentum residuals of a recording with commanded torque, from each trajectory's third span on."""
+    """Return the momentum residuals of a recording of commanded torque, from each trajectory's third span on."""
     n, out = recording.n_joints, []
-    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # arrays of an arm's type
+    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # writable, as on an arm
     for stretch in recording.stretches:
         state, r = ResidualState.fresh(n), MomentumResidual.empty(n)
         for k in range(stretch.start, stretch.stop):
@@ -80,11 +80,12 @@ def fit_noise(
     """Return the model correction from two motions without a payload, and the noise of the corrected model.
 
     The motion `train` yields a first model correction. The residuals of the corrected model in the motion `other`
-    determine the noise. Covariances of a joint's residuals at lags of 60 to 300 ms yield the joint's model error; the
-    remaining variance yields white noise that grows with the momentum rate. A factor for each joint then scales the
-    joint's noise, so that the joint's innovations have the predicted variance. Finally, a common factor scales the
-    noise of all joints until the odds of a false payload change are at most the number of residuals. `train` and
-    `other` together determine the returned correction and the prior means of friction and offsets.
+    determine the noise. Covariances of a joint's residuals at lags of 60 to 300 ms yield the joint's model error. The
+    remaining variance yields white noise, which grows with the momentum rate. A factor for each joint then scales the
+    joint's noise, so that the joint's innovations have the predicted variance. A common factor then scales the noise
+    of all joints until the odds of a payload change, which did not occur, are at most the number of residuals. The
+    factor SECOND_HALF finally reduces the noise. The returned correction is a fit to `train` and `other` together,
+    which also yield the prior means of friction and offsets.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)
@@ -103,7 +104,7 @@ def fit_noise(
 
 
 def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
-    """Fit the noise to residuals without a payload, scale it to the Kalman filter's innovations, and return it."""
+    """Return the noise, fitted to residuals without a payload and scaled to the Kalman filter's innovations."""
     n = len(noise.level)
     white, momentum, model = noise.white.copy(), noise.momentum_share.copy(), noise.model.copy()
     for j in range(n):
@@ -122,7 +123,7 @@ def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
 
 
 def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: float) -> tuple[float, float, float]:
-    """Return joint j's white noise, Nm, the growth of white noise with the momentum rate, and the model error, Nm.
+    """Return joint j's white noise (Nm), the growth of white noise with the momentum rate, and the model error (Nm).
 
     If the joint slides too rarely for covariances, the model error is `model`, clipped to plausible values.
     """
@@ -145,7 +146,7 @@ def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: f
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
-    """Return `noise` after multiplying each joint's white noise and errors by the joint's factor in `scale` (n,)."""
+    """Return `noise` with each joint's white noise and errors multiplied by the joint's factor in `scale` (n,)."""
     parts = {name: getattr(noise, name) * scale for name in ("white", "momentum_share", "model", "reversal")}
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["momentum_share"]))
 
@@ -165,7 +166,7 @@ def _without_payload(noise: Noise) -> Noise:
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Filter M residuals; return `Filter`, normalized innovations (M, n), nan at rest, and log odds (M,)."""
+    """Filter M residuals; return the `Filter`, normalized innovations (M, n; nan at rest) and log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)

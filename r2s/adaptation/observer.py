@@ -1,13 +1,14 @@
 """Disturbance observer: add the low-passed momentum residual to the policy's torque.
 
-The momentum p = M(q) dq obeys dp/dt = tau + C^T dq - g - friction - d, which yields the disturbance torque d without
-accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006). The
-observer uses the mean of d over 60 ms (momentum_residual.py); tau is the command after the identified delay and lag.
-A first-order low-pass with the time constant filter_s yields the estimate d^: filter_s dd^/dt = d - d^.
+The momentum p = M(q) dq obeys dp/dt = tau + C^T dq - g - friction - d. This equation yields the disturbance torque d
+without accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006).
+Here tau is the command after the identified delay and lag. The observer uses the mean of d over 60 ms
+(momentum_residual.py). A first-order low-pass with the time constant filter_s yields the estimate d^: filter_s dd^/dt
+= d - d^.
 
-If a joint does not slide throughout 60 ms, stiction may hold the joint, and the residual yields only bounds on the
-disturbance d. While stiction may hold a joint, the estimate d^ changes only as far as the bounds on d require,
-because stiction also supports the arm in training.
+Unless a joint slides during the whole 60 ms, stiction may hold the joint, and the residual yields only bounds on the
+disturbance d. An estimate d^ within these bounds then stays unchanged, because stiction also supports the arm in
+training.
 """
 
 import numpy as np
@@ -58,7 +59,7 @@ def _observe(arm, state, residual, q, dq, tau, share, disturbance):
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):
             measured[j] = residual.y[j]
-            if residual.sliding[j] == 0.0:  # stiction bounds the disturbance: take the value nearest to `filtered`
+            if residual.sliding[j] == 0.0:  # only bounds are known: take the allowed value nearest to `filtered`
                 total = residual.y[j] + residual.friction[j]
                 breakaway = max(arm.breakaway[j], abs(residual.friction[j]))
                 measured[j] = min(max(filtered[j], total - breakaway), total + breakaway)

@@ -17,7 +17,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
-LEAST_HZ = 200.0  # Hz, our choice: four rows per span of the estimator
+LEAST_HZ = 200.0  # Hz, r2s's choice: four rows per 20 ms span of the estimator
 UNKNOWN_PAUSE_S = 60.0  # s, assumed for a pause of unknown length: enough time to change the payload
 
 
@@ -75,7 +75,7 @@ def estimate_recording(
 
 
 def pauses(recording: Recording) -> list[float]:
-    """Return the pause, s, before each trajectory; if the clock restarts, the pause counts as UNKNOWN_PAUSE_S."""
+    """Return the pause (s) before each trajectory; if the clock restarts, assume a pause of UNKNOWN_PAUSE_S."""
     starts = [recording.t[s.start] for s in recording.stretches]
     ends = [recording.t[s.stop - 1] for s in recording.stretches]
     between = [float(b - a) for a, b in zip(ends[:-1], starts[1:], strict=True)]

@@ -5,7 +5,7 @@ of 20 ms as a possible onset of a jump. For each onset, the test stores the Kalm
 (signature) and computes the odds of a jump under a prior. If no jump occurs, the mean odds over all onsets have
 expectation 1, so they exceed x with a probability of at most 1 / x (Markov's inequality). A threshold equal to the
 number of tests in ten hours thus allows one false alarm in ten hours. Model errors have heavier tails than normal
-errors, so the aim is one false alarm per hour.
+errors and cause further alarms; the aim is one false alarm per hour.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from r2s.adaptation.tuning import NEW_PAYLOAD, ONSETS
 from r2s.compiled import njit
 
 JUMP = 4  # parameters of a jump: mass and first moments
-# indices of `Filter.counts`: onsets in use, index of the next onset, spans that the last jump still affects
+# indices of `Filter.counts`: onsets in use, index of the next onset, remaining spans that the last jump affects
 USED, NEXT, SINCE_JUMP = range(2, 5)
 MEAN, ONSET = range(2)  # indices of `Filter.log_odds`
 

@@ -6,13 +6,13 @@
 
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
 tool (wrench_filter.py). A contact begins when the squared force, in units of the force's covariance, exceeds a
-threshold for 15 ms while a joint moves. The force test is a chi-square test of the hypothesis that no force acts. An
-impact test detects impacts (contact_detection.py). The force test and the impact test together aim at one false alarm
-per hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors,
-`contact_thresholds` computes the thresholds from recordings without contact. The largest squared force of each half
-second has an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and Mikosch,
-Modelling Extremal Events, 1997, 3.3). `contact_thresholds` extrapolates this tail to one hour. Without recordings,
-the observer uses only the force test.
+threshold for 15 ms while a joint moves. The force test is a chi-square test of the hypothesis that no force acts. A
+second test, the impact test, detects sudden contacts (contact_detection.py). The force test and the impact test
+together aim at one false alarm per hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each
+cycle. For larger errors, `contact_thresholds` computes the thresholds from recordings without contact. The
+distribution of the largest squared force per half second has an exponential tail (extreme values of a chi-square
+variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, 3.3). `contact_thresholds`
+extrapolates this tail to one hour. Without recordings, the observer uses only the force test.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ from r2s.recordings.recording import Recording
 ALARMS_PER_TEST = tuning.ALARMS_PER_HOUR / 2  # per hour
 GAUSSIAN = float(chi2.isf(ALARMS_PER_TEST * SIM_DT / 3600.0, 3))  # threshold for independent normal errors
 SQUARES = ["square", "impact_square"]  # columns with the squared forces of the two contact tests
-BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; fewest blocks for a threshold
+BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows per block; least number of blocks for a threshold
 
 
 class WrenchObserver:
@@ -51,7 +51,7 @@ class WrenchObserver:
         tool: the robot's tool, or None if the robot has no tool.
 
     Args:
-        robot, dynamics: the identified arm. thresholds: see the attribute. If None, the threshold of the force test
+        robot, dynamics: the identified arm. thresholds: see the attribute; if None, the threshold of the force test
             is 2 GAUSSIAN, and the observer has no impact test.
     """
 
@@ -94,7 +94,7 @@ class WrenchObserver:
     def carry(self, payload: np.ndarray) -> None:
         """Set the inertial parameters (10,) of a payload that the model lacks, in the payload frame (momentum.py)."""
         n, state = len(self._arm.level), self._state
-        state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # momentum of the change of payload
+        state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # momentum that the payload change adds
         state.payload[:] = payload
 
     def undeclared(self) -> Self:
@@ -172,9 +172,10 @@ def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
 
 
 def _excess(robot: Robot, dynamics: Dynamics) -> np.ndarray:
-    """Return breakaway torques minus modeled friction at the onset of sliding at home, (n, 2) Nm, where larger.
+    """Return the excess (n, 2) Nm of breakaway torque over modeled friction at the onset of sliding, at q_home.
 
-    The excess is 0 for a friction family with bristles, with a Stribeck effect, or without a jump at standstill.
+    The excess is 0 if friction is larger, and for a friction family with bristles, with a Stribeck effect, or without
+    a jump of friction at zero speed.
     """
     family, edges = dynamics.family, np.array(dynamics.breakaway, dtype=float)
     if family.sharp is None or family.has_memory or "rise" in family.names:
@@ -191,11 +192,11 @@ def observe_recording(
     estimator: Estimator | None = None,
     report: Callable[[Estimate], None] | None = None,
 ) -> pd.DataFrame:
-    """Return a table with one row per millisecond: wrench, half widths of its 95 % intervals, contact, tip position.
+    """Return a table with one row per millisecond: wrench, half widths of 95 % intervals, contact, tip position.
 
     Args:
-        estimator: estimates a payload, whose effect on the wrench the observer subtracts. If the robot has a tool,
-            contact freezes the estimate. If None, the observer subtracts no payload.
+        estimator: payload estimator, which contact freezes if the robot has a tool. The observer subtracts the
+            payload's effect from the wrench. If `estimator` is None, the observer assumes no payload.
         report: called with each new estimate of the payload.
     """
     recording = at_rate(robot, recording)
@@ -228,7 +229,7 @@ def observe_recording(
 
 
 def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
-    """Return the start and end, s, and the largest force, N, of each contact in a table from `observe_recording`."""
+    """Return start and end (s) and the largest force (N) of each contact in a table from `observe_recording`."""
     touches = np.diff(np.concatenate([[0], table["in_contact"].to_numpy(), [0]]))
     force = np.linalg.norm(table[["force_x_N", "force_y_N", "force_z_N"]].to_numpy(), axis=1)
     t = table["t"].to_numpy()
@@ -269,7 +270,7 @@ def contact_thresholds(robot: Robot, observer: WrenchObserver, free: Sequence[Re
 
 
 def _exceeded_hourly(maxima: np.ndarray) -> float:
-    """Extrapolate `maxima` (N,) to the squared force that block maxima exceed ALARMS_PER_TEST times per hour."""
+    """Extrapolate the blocks' `maxima` (N,) to a squared force that blocks exceed ALARMS_PER_TEST times per hour."""
     level = np.quantile(maxima, 1.0 - tuning.TAIL)
     excess = np.mean(maxima[maxima >= level] - level)
     blocks_per_hour = 3600.0 / tuning.BLOCK_S

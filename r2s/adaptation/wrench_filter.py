@@ -1,19 +1,19 @@
 """Estimate external wrench, momentum and friction error with a Kalman filter, in compiled code.
 
-The state has N = w + 2 n components: the wrench at the tip in base axes, with w = 3 (force) or 6 (force and moment);
-each joint's error b of the friction f = f_model + b, Nm; and each joint's generalized momentum p, Nm s. The momentum
-is measured in every cycle (momentum.py) and obeys dp/dt = u - f + J^T wrench, where u is the known torque (De Luca
+The state has N = w + 2 n components: the wrench at the tip in base axes, with w = 3 (force) or 6 (force and moment),
+and for each joint a friction error b, Nm, and the generalized momentum p, Nm s. Friction is f = f_model + b. The
+filter measures p in every cycle (momentum.py); p obeys dp/dt = u - f + J^T wrench with the known torque u (De Luca
 and Mattone, ICRA 2003; in a Kalman filter: Hu and Xiong, IEEE Transactions on Industrial Electronics 65(2), 2018).
 
 The uncertainty of a joint's friction depends on whether the joint moves (wrench_friction.py).
 - The momentum of a joint in motion determines the wrench precisely, because the friction error b is small and has a
-  short correlation time. Near zero speed, b is larger, because sensor noise makes the direction of motion uncertain,
-  and because the model may lack a Stribeck effect (`excess_friction`).
+  short correlation time. Near zero speed, b is larger for two reasons: sensor noise makes the direction of motion
+  uncertain, and the model may lack a Stribeck effect (`excess_friction`).
 - A joint at rest yields only bounds on the wrench. Friction at rest balances all other torques, and may be any torque
   between the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of
   a uniform distribution between the edges. If the friction family has bristles, the joint angle determines the
-  bristle deflection and thereby the friction, with a smaller variance. The edges are uncertain (EDGE_ERROR):
-  a joint that breaks away at a larger torque than identified must not look like a force while other joints move.
+  bristle deflection and thereby the friction, with a smaller variance. The filter treats the edges as uncertain
+  (EDGE_ERROR); otherwise, a joint at rest with a larger breakaway torque than identified would look like a force.
 The filter assumes that the wrench changes when the tip moves against stiff surroundings. If all joints rest, the
 filter assumes that only a person's hand changes the force. Joint friction hides any force change that is too small to
 make a joint slide.
@@ -175,7 +175,7 @@ def _predict(noise, state):
 
 @njit(cache=True, error_model="numpy")
 def _hidden(noise, joints, j):
-    """Return mean, Nm, and variance, Nm^2, of the friction of joint j at rest, before a measurement.
+    """Return mean (Nm) and variance (Nm^2) of the friction of joint j at rest, before a measurement.
 
     With bristles, the angle determines friction; else friction may lie anywhere between the breakaway edges.
     """
@@ -187,7 +187,7 @@ def _hidden(noise, joints, j):
 
 @njit(cache=True, error_model="numpy")
 def _wrench_variance(noise, state):
-    """Return the growth, N^2, of the variance of each force component in this cycle (process noise)."""
+    """Return the process noise (N^2) of this cycle, by which the variance of each force component grows."""
     joints, J = state.joints, state.jacobian
     n = joints.shape[1]
     speed = creep = 0.0
@@ -232,7 +232,7 @@ def _measure(state):
 
 @njit(cache=True, error_model="numpy")
 def _keep_within_edges(noise, state):
-    """Keep friction at rest between the breakaway torques (edges), and limit its variance to that from `_hidden`."""
+    """Keep friction at rest between the breakaway torques (edges), and limit its variance to that of `_hidden`."""
     joints, P = state.joints, state.P
     n, N = joints.shape[1], len(state.x)
     gain = np.empty(N)

@@ -111,7 +111,7 @@ def known_torque(arm, noise, state, q):
 
 @njit(cache=True, error_model="numpy")
 def _model(arm, noise, state, j, angle, side, speed, moved):
-    """Return joint j's modeled friction, Nm, and bristle deflection (-1 to 1) after a motion by `moved` rad."""
+    """Return joint j's modeled friction (Nm) and bristle deflection (-1 to 1) after a motion by `moved` rad."""
     level = arm.load[j] * abs(state.terms.compensated[j])
     level += arm.angle_friction[j, 0] * np.sin(angle) + arm.angle_friction[j, 1] * np.cos(angle)
     z = side
@@ -123,10 +123,10 @@ def _model(arm, noise, state, j, angle, side, speed, moved):
 
 @njit(cache=True, error_model="numpy")
 def excess_friction(noise, j, side, speed):
-    """Return the largest friction, Nm, that joint j may have at `speed` (rad/s) beyond its model.
+    """Return the largest torque (Nm) by which joint j's friction at `speed` (rad/s) may exceed the modeled friction.
 
-    Fast motion does not show whether friction falls with speed (Stribeck effect). If the model has no such effect but
-    a larger breakaway torque, the friction of a slow joint lies between both.
+    An identification from fast motion may miss the Stribeck effect. If the breakaway torque then exceeds the modeled
+    friction, the friction of a slow joint lies between these two values.
     """
     return noise.excess[j, 1 if side > 0.0 else 0] * np.exp(-abs(speed) / noise.excess_speed[j])
 
@@ -135,8 +135,8 @@ def excess_friction(noise, j, side, speed):
 def _rest_or_motion(noise, joints, j, q):
     """Detect whether joint j rests.
 
-    A resting joint whose angle has crept by more than the noise becomes a moving joint. It can rest again in the next
-    cycle if its speed is low.
+    A resting joint whose angle has crept by more than the noise becomes a moving joint. A joint that has crept can
+    rest again in the next cycle if its speed is low.
     """
     crept, joints[CREEP, j] = joints[CREEP, j], 0.0
     if joints[REST, j] == 1.0:
@@ -158,13 +158,13 @@ def _rest_or_motion(noise, joints, j, q):
 
 @njit(cache=True, error_model="numpy")
 def _unlagged(joints, j):
-    """Return the speed of joint j, rad/s, corrected for the lag of its low-passes at constant acceleration."""
+    """Return joint j's speed (rad/s) without the lag that its low-passes have at constant acceleration."""
     return joints[FAST, j] + tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
 
 
 @njit(cache=True, error_model="numpy")
 def side_variance(noise, joints, j):
-    """Return the variance, Nm^2, of a moving joint's friction due to uncertain sign, presliding and Stribeck effect.
+    """Return the variance (Nm^2) of a moving joint's friction due to uncertain sign, presliding and Stribeck effect.
 
     If the sign of a friction f is wrong with probability p, the variance is 4 f^2 p (1 - p).
     """
@@ -179,7 +179,7 @@ def side_variance(noise, joints, j):
 
 @njit(cache=True, error_model="numpy")
 def holding_friction(state, j, gain):
-    """Return joint j's friction at rest, Nm; write its gradient with respect to the state to `gain` (N,)."""
+    """Return joint j's friction at rest (Nm); write its gradient with respect to the state to `gain` (N,)."""
     x, joints, J = state.x, state.joints, state.jacobian
     n = joints.shape[1]
     w = len(x) - 2 * n

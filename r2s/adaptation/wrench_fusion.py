@@ -32,7 +32,7 @@ LAW_K, LAW_EXPONENT, LAW_DAMPING, LAW_POINT, LAW_NORMAL, LAW = 0, 1, 2, 3, 6, 9 
 class SurfaceLaw(NamedTuple):
     """A surface's parameters as arrays for compiled code."""
 
-    law: np.ndarray  # (1 + S, LAW): the estimate, then S draws of its posterior
+    law: np.ndarray  # (1 + S, LAW): the estimate, then S posterior samples
     radius: float  # m, radius of the tip
     angle: float  # rad, noise of measured angles
 
@@ -70,7 +70,7 @@ class FusedWrench(WrenchObserver):
         super().__init__(robot, dynamics, thresholds)
 
     def begin(self) -> None:
-        """Start a motion from rest, and use the surface again, even if the innovation test rejected it before."""
+        """Start a motion from rest; trust the surface again, even after a rejection by the innovation test."""
         super().begin()
         self._memory = np.zeros(6)
         self._memory[TRUSTED] = 1.0
@@ -108,7 +108,7 @@ class FusedWrench(WrenchObserver):
 
 @njit(cache=True, error_model="numpy")
 def surface_force(law, k, tip, rate):
-    """Return force, N, and depth, m, for a tip at (3,) m that penetrates surface k of `law.law` at `rate` m/s."""
+    """Return force (N) and depth (m) of a tip at `tip` (3,) m in surface k of `law.law`; rate: m/s, of the depth."""
     row = law.law[k]
     depth = law.radius
     for c in range(3):
@@ -118,7 +118,7 @@ def surface_force(law, k, tip, rate):
 
 @njit(cache=True, error_model="numpy")
 def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the normal force's variance, N^2, due to posterior, encoder noise and errors of the contact law."""
+    """Return the normal force's variance (N^2) due to posterior, encoder noise and errors of the contact law."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count
@@ -140,7 +140,7 @@ def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance)
     if memory[SINCE] > 0.0:
         memory[RATE] += SIM_DT * tuning.DEPTH_RATE * ((depth - memory[DEPTH]) / SIM_DT - memory[RATE])
     memory[DEPTH], memory[SINCE] = depth, 1.0
-    if pressing <= 0.0:  # the tip does not touch the surface, but another part of the arm may
+    if pressing <= 0.0:  # the tip does not touch the surface; another part of the arm may touch something
         memory[DIFFERENCE] = 0.0
         return
     own = surface_variance(law, pressing, depth, tip, memory[RATE], jacobian)

@@ -11,7 +11,7 @@ from r2s.physics.newton_euler import WORK
 
 COMMAND, CYCLE = range(2)  # indices of `WrenchState.counts`
 # indices of `WrenchState.contact`
-# SURPRISE: low-passed mean of the joints' squared innovations, in variances. USUAL: its mean over the last second.
+# SURPRISE: low-passed mean of the joints' squared innovations, in variances. USUAL: mean of SURPRISE over 1 s.
 # SQUARE: squared force in units of its covariance, 0 if no joint moves. TOUCHES: 1 in contact.
 # ABOVE, BELOW: cycles of SQUARE above the contact threshold, below the release threshold.
 # HANGING: path of the tip, m, along which the force pointed down. SURPRISED: cycles with SURPRISE far above USUAL.
@@ -22,9 +22,9 @@ SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, U
 # ANCHOR, MOVED, CREEP: reference angle at rest, motion since rest began, creep of this cycle, rad.
 # FRICTION, FRICTION_BEFORE: modeled friction now, a cycle ago, Nm. DEFLECTION: presliding deflection.
 # TORQUE, KNOWN: known torque without motor and friction, mean known torque with both, Nm.
-# MOTOR, MOTOR_MEAN: motor torque, its mean in the coming cycle, Nm.
+# MOTOR, MOTOR_MEAN: motor torque now, mean motor torque in the coming cycle, Nm.
 # MOMENTUM_NOISE: variance of the measured momentum, (Nm s)^2. SLOW_P: low-passed momentum, Nm s.
-# FAST_P: low-passed remainder of the momentum, Nm s. SHAKE: mean square of the momentum's high-frequency part.
+# FAST_P: low-passed momentum minus SLOW_P, Nm s. SHAKE: mean square of the momentum's high-frequency part.
 ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
 MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)
 
@@ -33,7 +33,7 @@ class WrenchNoise(NamedTuple):
     """Uncertainties that the wrench filter assumes: friction of n joints, inertia, sensor noise, and force."""
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a joint in motion
-    edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway torque: at rest, friction stays between them
+    edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway torque: bounds of friction at rest
     excess: np.ndarray  # (n, 2) Nm, `edges` minus the model's friction at the onset of sliding, see `excess_friction`
     excess_speed: np.ndarray  # (n,) rad/s, speed over which `excess` decays
     presliding: np.ndarray  # (n,) rad, decay length of presliding; 0: a joint sticks until it breaks away

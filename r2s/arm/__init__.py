@@ -1,1 +1,1 @@
-"""Simulated and real arms behind one interface, and the code that drives them and records their motion."""
+"""Simulated and real arms with one common interface, and code that commands an arm and records its motion."""

@@ -21,11 +21,11 @@ from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT
 
 # Settings of `CommandLoop.rest`, which damps a moving arm; the values are our choice
-REST_S = 0.5  # s, longest duration
+REST_S = 0.5  # s, longest duration of `rest`
 REST_RATE = 15.0  # 1/s, decay rate of the joint speeds under damping
 REST_SHARE = 0.2  # share of tau_max, limit of the damping torque
-STILL = 0.02  # rad/s, a slower joint is treated as at rest
-SLIDING = 0.05  # rad/s, replaces STILL after SLIDES_S: damping cannot stop a joint that friction does not hold
+STILL = 0.02  # rad/s, speed below which a joint is treated as at rest
+SLIDING = 0.05  # rad/s, replaces STILL after SLIDES_S, as damping cannot stop a joint that friction does not hold
 SLIDES_S = 0.04  # s, see SLIDING
 
 
@@ -86,7 +86,7 @@ class CommandLoop:
 
         To hold the largest load while damping, the driver needs a torque limit of (ADDED + REST_SHARE) * tau_max.
         """
-        self._reset(hold)  # a low-pass that starts at zero would drop the load for 20 ms
+        self._reset(hold)  # start at `hold`: a low-pass that starts at zero would drop the load for 20 ms
         self.state = self.arm.read()
         self.rest(hold)
 
@@ -136,8 +136,8 @@ class CommandLoop:
     def rest(self, hold: np.ndarray | None = None) -> None:
         """Damp the motion until the arm rests under the command `hold` (n,) Nm, for at most 0.5 s.
 
-        Unless the arm is in contact, `resist` adjusts `hold` to brake the joints that continue to move.
-        If `hold` is None, as after a contact, the final command is zero.
+        Unless the arm is in contact, `resist` adjusts `hold` to brake the joints that continue to move. If `hold` is
+        None (see `halt`), the final command is zero.
         """
         inertia, robot = 1 / np.diag(self._inverse(self.state.q[None])[0]), self.arm.robot
         limit, step, most = REST_SHARE * robot.tau_max, robot.step_max, ADDED * robot.tau_max
@@ -162,7 +162,8 @@ class CommandLoop:
     def halt(self, reason: str) -> None:
         """Damp the arm to rest under zero command, and raise ArmStopped with `reason`.
 
-        Do nothing if the driver is already stopping the arm: then the stop itself causes the deviation from the plan.
+        Callers use `halt` when the arm deviates from its planned motion. If the driver is already stopping the arm,
+        the stop explains the deviation, so `halt` does nothing.
         """
         if self.driver.stopping is not None:
             return
@@ -172,7 +173,7 @@ class CommandLoop:
     def end(self) -> str | None:
         """Stop the arm; return the reason if the driver was stopping the arm or if the arm stops itself, else None.
 
-        A driver with a push limit first holds or ends a contact (r2s/physics/contact_stop.py).
+        With a push limit, the driver first holds or ends a contact (r2s/physics/contact_stop.py).
         """
         reason = None if self._ended else self.driver.stopping
         if reason is not None:

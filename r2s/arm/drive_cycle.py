@@ -1,4 +1,4 @@
-"""Compiled cycle of the driver for m arms; `DriverBatch` (r2s/arm/driver.py) runs one cycle per millisecond."""
+"""Compute one driver cycle for m arms (compiled); `DriverBatch` (r2s/arm/driver.py) does so every millisecond."""
 
 from typing import NamedTuple
 
@@ -26,31 +26,31 @@ from r2s.physics.safety_filter import (
     limit_rate,
 )
 
-STILL = 0.02  # rad/s, a slower joint is treated as at rest
+STILL = 0.02  # rad/s, speed below which a joint is treated as at rest
 # rad/s, natural frequency of the spring that `resist` adds to a joint that still slides during a stop
 # Our choice: half of RATE of the safety filter, because the filter damps this spring.
 SPRING = 15.0
-RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while it drives a moving joint; our choice
+RELEASE = 0.2  # 1/s, share of tau_max per s by which a held torque falls while it acts along the motion; our choice
 ADDED = 0.3  # share of tau_max that an adapter may add; enough for friction and 1.5 kg anywhere in a Panda's reach
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
-TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if pair k of `CollisionCheck` would come too near
+TOO_NEAR = 100  # `Memory.why` is TOO_NEAR + k if the bodies of pair k in `CollisionCheck` would come too near
 
 
 class Memory(NamedTuple):
-    """State of the driver of m arms; `drive_cycle` updates this state in place.
+    """State of the driver for m arms; `drive_cycle` updates this state in place.
 
     Attributes:
         command: (m, c), the last finite commands (no NaN, no infinity). law: (m, k), memory of the control law.
         target: (m, n) Nm, torque of the control law or of a stop. filtered, effort: (m, n) Nm, see `condition_joint`.
         sent: (m, n) Nm, the last torque command.
         held: (m, n) Nm, last sum of adapter torque and `Given.hold`; a stop without contact still applies this sum.
-        share: (m,), factor on the allowed speeds, which is 1 in a motion and decreases in a stop (`_brake`).
-        cycle, silent, damped: (m,) each, cycles since the motion began, since the last finite command, and since the
-            stop began.
+        share: (m,), factor on the allowed speeds; it is 1 in a motion and decreases during a stop (`_brake`).
+        cycle, silent, damped: (m,) each, number of cycles since the motion began, since the last finite command, and
+            since the stop began.
         why: (m,), reason code of a stop; RUNS: no stop.
         limited: (m,), number of cycles in which the safety filter changed the torque.
         rests: (m,), whether each arm is at rest. commanded: (m,), whether each arm has received a command.
-        least: (m, K) m, smallest allowed distance between the bodies of each pair (fence.py); K: number of pairs.
+        least: (m, K) m, required distance between the two bodies of each of K pairs (fence.py).
         push: (m, COLUMNS), parameters and state of the push limit (push_limit.py); (m, 0): no push limit.
     """
 
@@ -74,7 +74,7 @@ class Memory(NamedTuple):
 
     @staticmethod
     def fresh(m: int, n: int, command: int, law: int, pairs: int, push: np.ndarray) -> "Memory":
-        """Return the state of m arms with n joints each before the first cycle: all torques are zero."""
+        """Return the driver's state before the first cycle, for m arms with n joints each: all torques are zero."""
         own = np.zeros((m, command)), np.zeros((m, law))
         count, flags = np.zeros((5, m), dtype=np.int64), np.zeros((2, m), dtype=bool)
         least = np.full((m, pairs), -np.inf)
@@ -86,7 +86,7 @@ class Given(NamedTuple):
     """Inputs of the driver of m arms in one cycle.
 
     command: (m, c), commands, used if `new` is True. added: (m, n) Nm, adapter torques, used if `adds` is True.
-    hold: (m, n) Nm, part of the target torque that a stop still applies. contact: (m,), whether arms are in contact.
+    hold: (m, n) Nm, part of the target torque that a stop still applies. contact: (m,), whether each arm has contact.
     """
 
     command: np.ndarray
@@ -98,10 +98,11 @@ class Given(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Settings of the driver: `torque` and `added`, (n,) Nm, bound the target torque and the adapter's torque.
+    """Settings of the driver.
 
-    The driver stops an arm beyond q_low, q_high or dq_max, (n,) rad, rad/s, or `deadline` s after its last finite
-    command.
+    torque, added: (n,) Nm, largest target torque, and largest torque of an adapter.
+    q_low, q_high, dq_max: (n,) rad, rad/s, limits beyond which the driver stops an arm.
+    deadline: s, longest time without a finite command; after this time, the driver stops an arm.
     spring: (n,) Nm/rad, stiffness for `resist`. factor: gain of the low-pass. fade: number of soft-start cycles.
     """
 
@@ -128,7 +129,7 @@ class Model(NamedTuple):
 
 @njit(cache=True)
 def _watch(i, q, dq, given, bounds, memory):
-    """Check the inputs of arm i; return whether q and dq contain neither NaN nor infinity.
+    """Check the inputs of arm i; return whether all elements of q and dq are finite.
 
     Store a new command unless the command or the adapter's torque contains NaN or infinity. Set `why` if the arm must
     stop.
@@ -176,7 +177,7 @@ def _compensate(i, dq, stopping, given, bounds, memory, target):
         resist(dq, bounds.spring, bounds.added, memory.held[i])
     for j in range(len(target)):
         most = bounds.added[j]
-        if given.contact[i]:  # compensation must not keep pushing on an obstacle
+        if given.contact[i]:  # compensation must not continue to push on an obstacle
             memory.held[i, j] = 0.0
         elif not stopping:
             held = faded * min(max(given.added[i, j], -most), most) if adds else 0.0
@@ -200,8 +201,8 @@ def _kinematics(model, q):
 def _brake(i, seen, arm, bounds, model, memory):
     """Set the target torque of arm i in a stop, and lower the allowed speeds from the present speed toward zero.
 
-    If the driver has a push limit and the stop code is SILENT, LAW_NOT_FINITE or REQUESTED, `stop_torque` holds or
-    ends a contact.
+    If the driver has a push limit and the stop code is SILENT, LAW_NOT_FINITE or REQUESTED, `stop_torque` computes
+    the torque that holds or ends a contact.
     """
     needs, why = 0.0, memory.why[i]
     memory.target[i] = 0.0
@@ -231,7 +232,7 @@ def drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     limits = model.limits
     work, effort = np.empty((2 * n + WORK, n)), np.empty((1, 1, n))
     inertia, bias, desk, weightless = np.empty((n, n)), np.zeros(n), np.empty((n, DESK)), np.zeros(3)
-    mass, law_torque = np.empty(n * (n + 1) // 2), np.empty(n)  # mass: the lower triangle, row by row
+    mass, law_torque = np.empty(n * (n + 1) // 2), np.empty(n)  # mass: lower triangle of the mass matrix, by rows
     for i in range(m):
         seen = _watch(i, q[i], dq[i], given, bounds, memory)
         if seen and memory.why[i] == RUNS:

@@ -3,7 +3,7 @@
 In each cycle, the driver checks that the command is finite and recent (watchdog). The control law
 (r2s/physics/control_laws.py) computes a target torque, which passes soft start and low-pass. The driver adds the
 torque of an adapter (r2s/adaptation/adapter.py). The safety filter, which training also uses
-(r2s/physics/safety_filter.py), limits the sum of target and adapter torque. Finally, the driver limits the change
+(r2s/physics/safety_filter.py), limits the sum of target and adapter torque. Finally, the driver limits the difference
 from the torque that the arm applied in the last cycle. The driver has no clock and no connection to an arm: its only
 inputs are states and commands. Tests can therefore run the driver on a million adversarial inputs.
 
@@ -40,8 +40,8 @@ from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.safety_filter import filter_limits
 
-DEADLINE_S = 0.05  # s; the driver stops an arm after this time (or, if longer, PERIODS) without a new finite command
-PERIODS = 2.5  # control periods of the policy
+DEADLINE_S = 0.05  # s; without a finite command, the driver stops an arm after this time, or after PERIODS if longer
+PERIODS = 2.5  # control periods of the policy, see DEADLINE_S
 DAMP_S = 0.5  # s, longest time to bring an arm to rest
 Q_INSIDE = 0.02  # rad; the driver stops an arm that comes this close to a position limit
 DQ_INSIDE = 0.95  # the driver stops an arm above this share of a velocity limit
@@ -53,7 +53,7 @@ def spring(robot: Robot) -> np.ndarray:
 
 
 class DriverBatch:
-    """The driver of m arms, which computes every torque command that r2s sends to the arms.
+    """The driver for m arms: it computes every torque command that r2s sends to these arms.
 
     Attributes:
         stopping: for each of the m arms, the reason why the driver is bringing this arm to rest; None: no stop.
@@ -67,7 +67,7 @@ class DriverBatch:
         control: control law that maps commands to torques; if None, commands are torques (n,) Nm.
         fence: pairs of bodies; the driver stops an arm before the bodies of a pair touch; None: no fence.
         speed_share: factor on all allowed speeds, in (0, 1].
-        push_limit: limits the contact force and the approach speed of the robot's tool; None: no limit.
+        push_limit: limits of the tool's contact force and approach speed; None: no limit.
     """
 
     def __init__(
@@ -114,11 +114,11 @@ class DriverBatch:
         self._nothing, self._free = np.zeros(self._shape), np.zeros(m, dtype=bool)
         self.reset()
         still = np.zeros(self._shape)
-        self(np.tile(robot.q_home, (m, 1)), still, still, None)  # compile now, while no arm waits
+        self(np.tile(robot.q_home, (m, 1)), still, still, None)  # this call compiles the code now, while no arm waits
         self.reset()
 
     def reset(self, torque: np.ndarray | None = None) -> None:
-        """Reset the driver for a new motion, which starts from `torque` (n,) Nm, by default zero."""
+        """Reset the driver for a new motion; the low-pass starts at `torque` (n,) Nm, by default zero."""
         self._memory = Memory.fresh(*self._shape, *self._sizes, self._push)
         if torque is not None:
             self._memory.filtered[:], self._memory.effort[:] = torque, torque
@@ -131,7 +131,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, torque of a stop: adapter torque plus `hold`, plus contact torque if a stop holds a contact."""
+        """(m, n) Nm, torque of a stop: adapter torque, `hold`, and contact torque if the stop holds a contact."""
         m = self._memory
         if not self.decides_contact:
             return m.held
@@ -139,7 +139,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether the driver has a `push_limit`, so that a stop can hold a contact, release the tip, or retreat."""
+        """Whether the driver has a `push_limit`; a stop then holds the contact force, or moves the tip outward."""
         return bool(len(self._push))
 
     @property
@@ -221,7 +221,7 @@ class Driver:
         self._drivers = DriverBatch(robot, torque, 1, friction=friction, **settings)
 
     def reset(self, torque: np.ndarray | None = None) -> None:
-        """Reset the driver for a new motion, which starts from `torque` (n,) Nm, by default zero."""
+        """Reset the driver for a new motion; the low-pass starts at `torque` (n,) Nm, by default zero."""
         self._drivers.reset(torque)
 
     @property
@@ -241,7 +241,7 @@ class Driver:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop can hold a contact, release the tip, or retreat; see `DriverBatch.decides_contact`."""
+        """Whether the driver has a `push_limit`; see `DriverBatch.decides_contact`."""
         return self._drivers.decides_contact
 
     @property

@@ -33,7 +33,7 @@ def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
 def record_gear_motions(
     arm: Arm, *, progress: Callable[[int, int], None] | None = None, timing: Timing | None = None
 ) -> Recording:
-    """Run `gear_motion` with `multisine` for each joint; return the slides at steady speed, one trajectory each.
+    """Run `gear_motion` with `multisine` for each joint; return one trajectory per slide at steady speed.
 
     The rows have the format of `r2s.arm.recorder.record` with commanded torque.
 
@@ -64,7 +64,7 @@ def record_gear_motions(
 
 
 def _recording(parts: list[tuple[np.ndarray, ...]], name: str) -> Recording:
-    """Return the recording of slides, each with q, dq, tau and t."""
+    """Join slides, each given as (q, dq, tau, t), into one recording."""
     q, dq, tau, t = (np.concatenate(x) for x in zip(*parts, strict=True))
     index = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     starts = np.repeat([part[3][0] for part in parts], [len(part[0]) for part in parts])

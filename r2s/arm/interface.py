@@ -36,7 +36,7 @@ class StopRequested(ArmStopped):
 
 @dataclass(frozen=True, slots=True)
 class ArmState:
-    """One 1 kHz sample of an arm with n joints.
+    """State of an arm with n joints in one 1 kHz cycle.
 
     Attributes:
         t: s, time since the motion began.
@@ -51,7 +51,8 @@ class ArmState:
         control_command_success_rate: share of the last 100 commands that reached the arm; 0 while no motion runs.
         O_T_EE: (16,), pose matrix of the end effector in the base frame, column by column.
         m_ee, m_load: kg, masses of end effector and load that the arm's gravity compensation assumes.
-        box: (6,), pose of a box in the base frame, measured by a camera: center, m, and direction of its first axis.
+        box: (6,), pose of a box in the base frame, measured by a camera: center (m), and direction of the box's first
+            axis.
     """
 
     t: float

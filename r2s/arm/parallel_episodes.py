@@ -1,7 +1,8 @@
 """Run episodes on a twin in parallel: each chunk of goals runs on a new twin with the same seed.
 
-Every chunk except the last has CHUNK goals on any computer, so the results do not depend on the number of cores. Each
-chunk has its own stream of sensor noise. A twin with temperature-dependent friction is cold at the start of a chunk.
+On any computer, every chunk except the last has CHUNK goals, so the results do not depend on the number of cores.
+Each chunk has its own stream of sensor noise. A twin with temperature-dependent friction is cold at the start of a
+chunk.
 """
 
 import multiprocessing
@@ -50,7 +51,8 @@ def run_parallel_episodes(
         policy, task: see `rollout`.
         starts: (E, n) rad, first postures of the episodes. goals: (E, ...), see `Task`.
         workers: largest number of processes.
-        progress: called with (goals done, total) after every goal; with several processes, at least every REPORT_S.
+        progress: called with (goals done, total) after every goal; with several processes, at least once per
+            REPORT_S.
 
     Raises:
         UserError: a process was killed.
@@ -67,7 +69,7 @@ def run_parallel_episodes(
             done[chunk] = _run_chunk(job, chunk, after(chunk * CHUNK))
     else:
         context = multiprocessing.get_context("fork")
-        finished = context.Value("l", 0)  # number of goals that all processes together have finished
+        finished = context.Value("l", 0)  # number of goals finished by all processes together
         given = job, finished, os.getpid()
         with ProcessPoolExecutor(min(workers, len(chunks)), context, _initialize, given) as pool:
             waiting = {pool.submit(_run_as_process, chunk): chunk for chunk in chunks}
@@ -107,7 +109,7 @@ def _initialize(job: Any, finished: Any, parent: int) -> None:
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not a handler inherited from the parent process
-    # a parent that is killed cannot end this process, and the pool's queue never reports the parent's end
+    # a thread watches the parent: a killed parent cannot end this process, and the pool's queue reports no end
     threading.Thread(target=follow, args=(parent, threading.Event()), daemon=True, name="follow").start()
 
 

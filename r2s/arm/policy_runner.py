@@ -25,7 +25,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import State, Task
 
 LOGGED_S = 1.0  # s of motion before a stop that are logged, at 1 kHz
-SMOOTHING_CYCLES = 20  # cycles, half window of `smooth_speeds`: encoder noise causes a speed error of 2e-4 rad/s
+SMOOTHING_CYCLES = 20  # cycles, half window of `smooth_speeds`; encoder noise then causes speed errors of 2e-4 rad/s
 ATTEMPTS = 3  # most attempts to bring an `Operated` arm to its start; the operator must agree to each new attempt
 
 
@@ -69,7 +69,7 @@ class PolicyRunner:
 
     Attributes:
         stops: stops that ended episodes early. timing: see `Timing`.
-        done: number of episodes that began, which are the `place` calls after which `halted` was None.
+        done: number of episodes that began, that is, calls of `place` after which `halted` was None.
         speeds: (1, T, n) rad/s, joint speeds after each control step of the last episode, see `smooth_speeds`.
         halted: reason why no further episode will run (a stop request, the operator's refusal after a stop, or too
             many failed attempts to reach a start); None: further episodes may run.
@@ -77,7 +77,7 @@ class PolicyRunner:
 
     Args:
         arm: an arm whose clock waits for commands.
-        task: rates, torque limits and controller.
+        task: provides rates, torque limits and controller.
         friction: (n,) Nm, friction level of each joint: `Dynamics.level` of the training dynamics.
         soft_start_s: s over which an episode's torque fades in; recommended on hardware, 0 for twins.
         rotors: (n,) kg m^2, `Dynamics.armature` of the training dynamics; None: rotors of `arm.robot`.
@@ -112,9 +112,9 @@ class PolicyRunner:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move the arm to starts (1, n) rad, and begin the episode with the index `first`.
 
-        If the arm stops on the way to the start, the episode ends. An `Operated` arm makes up to ATTEMPTS attempts to
-        reach the start, if the operator agrees to each new attempt. If the operator refuses or all attempts fail, no
-        further episode will run.
+        If an arm without operator stops on the way to the start, the episode ends. An `Operated` arm makes up to
+        ATTEMPTS attempts to reach the start, if the operator agrees to each new attempt. If the operator refuses or
+        all attempts fail, no further episode will run.
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []

@@ -27,7 +27,7 @@ from r2s.recordings.recording import Recording
 from r2s.tasks.wipe import WipeTask
 
 LOADS = 0.25, 0.9  # lowest and highest force of a path, as shares of the controller's largest force
-PAUSE_S = 2.0  # s, gap in the recorded time between two paths, which identification/contact treats as two presses
+PAUSE_S = 2.0  # s, recorded gap between paths, so that identification/contact treats each path as a separate press
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def press_plan(
 ) -> PressPlan:
     """Return the plan for a plane whose point (3,) m and normal (3,) are known within 5 mm and 5 degrees.
 
-    With `force_max`, N, and `speed_near`, m/s (see `PushLimit`), the driver limits force and closing speed. The
-    plan's forces are then low enough to respect `force_max`, however much force joint friction hides.
+    If `force_max` (N) and `speed_near` (m/s) are given, the driver limits push and closing speed, see `PushLimit`.
+    The plan's forces are then low enough to respect `force_max`, however much force joint friction hides.
 
     Raises:
         UserError: the robot has no tool, the plane is invalid, or a limit is out of range or too low to press.

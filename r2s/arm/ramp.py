@@ -24,25 +24,25 @@ from r2s.recordings.recording import Recording
 
 # The ramp
 SLOW_TAU_MAX = 40.0  # Nm: joints with at least this tau_max have a large inertia and get a slower ramp
-SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; at 4 Nm/s light links move visibly within ms
+SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; at 4 Nm/s light links move visibly within milliseconds
 MAX_SHARE = 0.2  # share of tau_max, default of a ramp's largest torque
 AFTER_MOTION = 5  # cycles recorded after the joint has moved
 STRAY = DEVIATION  # rad: a ramp ends if any joint moves this far; an arm this far off its pose returns to the pose
-POSE_MARGIN = 0.15  # rad from a pose to the position limits; more than any joint moves in one ramp
+POSE_MARGIN = 0.15  # rad, least distance of a pose from the position limits; more than any joint moves in one ramp
 UNFILTERED_HZ = 1e30  # disables the driver's low-pass, because a ramp has no steps to smooth
 # The stop after a ramp: a PID controller with three equal real poles brakes each joint, then the torque fades out
-BANDWIDTH = 20.0  # rad/s, of the three poles: well damped with 5 ms of delay and 3 ms of lag
+BANDWIDTH = 20.0  # rad/s, frequency of the poles: the loop is well damped with 5 ms of delay and 3 ms of lag
 DAMPED_CYCLES = 20  # cycles of damping only, because a spring would slowly pull a joint back to where braking began
 BRAKE_SHARE = 0.1  # largest braking torque / tau_max: so small that the rate limit adds no delay
-BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; stop attempts after which the next ramp starts anyway
-RELEASE_CYCLES = 10  # cycles of the torque's fade, of the rest before a ramp, and of each mean angle in braking
-# rad/s, mean speeds: braking ends when all joints are below SLOW and the next joint is below STILL
+BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # s, longest braking; attempts to stop, after which the next ramp starts anyway
+RELEASE_CYCLES = 10  # number of cycles of the fade, of the rest before a ramp, and of each mean angle in braking
+# rad/s, mean speeds: braking ends when all joints are below SLOW and the joint of the next ramp is below STILL
 # A joint below SLIDING is at rest.
 SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return postures (count, n) rad: the k-th is home +-0.3 k rad per joint, clipped 0.2 rad inside limits."""
+    """Return postures (count, n) rad: posture k is home +-0.3 k rad; all are at least 0.2 rad inside limits."""
     change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
     poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
@@ -190,7 +190,7 @@ class _Drive:
         return self.rows
 
     def stop(self, next_joint: int) -> None:
-        """Brake all joints (`next_joint` to below STILL), then fade to the command `base`; repeat on motion."""
+        """Brake all joints (`next_joint` below STILL), then fade to the command `base`; repeat if a joint moves."""
         for attempt in range(STOP_ATTEMPTS):
             self._brake(next_joint)
             last = self.state.tau_J_d
@@ -234,7 +234,7 @@ class _Drive:
 
 
 def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.ndarray:
-    """Return the poses (P, n) rad; raise UserError unless each lies POSE_MARGIN inside the position limits."""
+    """Return the poses (P, n) rad; raise UserError unless each is at least POSE_MARGIN inside the limits."""
     try:
         places = np.atleast_2d(np.array(poses, dtype=float))
     except (TypeError, ValueError):
@@ -252,7 +252,7 @@ def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.nd
 
 
 def _positive(name: str, value, default: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Return `value`, or if None `default`, as an array (n,); raise UserError unless all are in (0, `most`]."""
+    """Return `value` (if None, `default`) as an array (n,); raise UserError unless 0 < element <= `most`."""
     n = len(default)
     array = per_joint(f"ramp.{name}", default if value is None else value, n, f"{n} joints")
     good = (array > 0) & (array <= most)

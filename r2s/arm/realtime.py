@@ -100,7 +100,7 @@ class Timing:
     success: list[float] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Begin a new motion: forget the last cycle's times, store the index in `success` where its rates begin."""
+        """Begin a new motion: forget the last cycle's times, and store the motion's first index in `success`."""
         self._begun, self._last = len(self.success), (0.0, 0.0)
 
     def cycle(self, clock: tuple[float, float, float], state: ArmState, adapts: bool = False) -> None:
@@ -112,7 +112,7 @@ class Timing:
         self.driver.append(driven - began)
         if adapts:
             self.adapter.append(adapted - driven)
-        if state.t > t:  # not the first cycle of another motion, and not one in which the arm stopped
+        if state.t > t:  # false in the first cycle of a new motion, and in a cycle in which the arm stopped
             self.robot.append(state.t - t)
             if sent_at:
                 self.period.append(driven - sent_at)
@@ -121,7 +121,7 @@ class Timing:
             self.success.append(float(rate))
 
     def refusal(self, arm: Arm) -> str | None:
-        """Return a reason to reject the motion if a real-time arm got under 99 % of commands in time, else None."""
+        """Return a reason to reject a real-time motion if under 99 % of its commands came in time, else None."""
         rates = self.success[self._begun :]
         if not getattr(arm, "realtime", False) or not rates or (rate := float(np.mean(rates))) >= LEAST_SUCCESS:
             return None

@@ -4,9 +4,9 @@ The arm's process does not depend on the policy's process: if no new command arr
 driver damps and stops the arm. A thread would not suffice, because a policy that holds Python's global lock blocks
 all threads. The processes share memory without a lock, because a killed process would not release a lock.
 
-The arm's process runs in its own session, so signals from the terminal do not reach it. If the policy's or the arm's
-process receives a signal, or the policy's process ends, the arm's process damps and ends every motion, including the
-motion to a start (r2s/arm/stop_request.py).
+The arm's process runs in its own session, so signals from the terminal do not reach it. After a signal to either
+process, or when the policy's process ends, the arm's process damps and ends every motion, also the motion to a start
+(r2s/arm/stop_request.py).
 """
 
 import multiprocessing
@@ -68,7 +68,7 @@ class Channel(NamedTuple):
     """Memory that the policy's process and the arm's process share.
 
     Attributes:
-        command: (c,), newest command of the policy's process. state: arm state of the arm's process (`_publish`).
+        command: (c,), newest command of the policy's process. state: newest state of the arm (`_publish`).
         end: 1 after the policy's process has ended the episode, else 0.
         signal: number of a signal that the policy's process received. lifeline: mutex locked by the policy's process.
     """
@@ -101,7 +101,8 @@ class RealtimeRunner:
         robot: the arm's model. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
-        open_arm: picklable function that the arm's process calls; it returns the opened arm or its context manager.
+        open_arm: picklable function that the arm's process calls; it returns the opened arm, or a context manager
+            that opens the arm.
         robot: a model with the arm's number of joints. task, friction: see `PolicyRunner`.
         settings: further arguments of `PolicyRunner`; an adapter runs in the arm's process.
 
@@ -265,7 +266,7 @@ def _serve(
             stack.callback(arm.stop)
             operator = None
             if isinstance(arm, Operated):
-                operator, arm.operator = arm.operator, forward  # the policy's process has the terminal
+                operator, arm.operator = arm.operator, forward  # only the policy's process can ask at the terminal
             runner = PolicyRunner(arm, task, **settings)
             line.send(("ready", (arm.robot, operator)))
             while True:

@@ -1,4 +1,4 @@
-"""Record an excitation on an arm; a simulated and a real arm share all code and safety checks."""
+"""Record an excitation on an arm; code and safety checks are the same for simulated and real arms."""
 
 from collections.abc import Callable
 from dataclasses import replace

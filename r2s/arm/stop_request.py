@@ -14,7 +14,7 @@ from types import FrameType
 
 from r2s.errors import Stopped
 
-# signals of a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; no process can handle SIGKILL and SIGSTOP
+# signals of a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; no process can handle SIGKILL or SIGSTOP
 SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP)
 PARENT = "R2S_PARENT"  # environment variable: pid of the process whose end stops every motion of this process
 FOLLOW_S = 0.1  # s between two checks whether the parent process still runs
@@ -55,7 +55,7 @@ def serve() -> None:
 
 @contextmanager
 def watched(source: Callable[[], str | None]) -> Iterator[None]:
-    """Let `requested` call `source` in this context; `source` must return a reason or None within microseconds."""
+    """In this context, `requested` also calls `source`, which must return a reason or None within microseconds."""
     _request.sources.append(source)
     try:
         yield
@@ -69,12 +69,12 @@ def parent_ended(parent: int) -> Callable[[], str | None]:
 
 
 def pipeline() -> int | None:
-    """Return the pid in the environment variable PARENT (parent or grandparent process); None if PARENT is unset."""
+    """Return the pid of the pipeline that started this process (environment variable PARENT), or None if unset."""
     return int(os.environ[PARENT]) if PARENT in os.environ else None
 
 
 def follow(parent: int, over: threading.Event) -> None:
-    """Send SIGTERM to this process when `parent` is no longer its parent; check until the event `over` is set."""
+    """Send SIGTERM to this process when its parent is no longer `parent`; check until the event `over` is set."""
     while not over.wait(FOLLOW_S):
         if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGTERM)

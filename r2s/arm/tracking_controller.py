@@ -12,10 +12,10 @@ from r2s.physics.rigid_body import mass_matrix, nominal_torque
 from r2s.physics.robot import SIM_DT, Robot
 
 CUTOFF_HZ = 100.0  # low-pass of the driver during tracking, libfranka's default
-# Gains: chosen for stability margins under a few ms of delay
-BANDWIDTH = 20.0  # rad/s, of the critically damped tracking loop
-ADAPTATION_RATE = 0.8  # 1/s, adaptation gain over proportional gain; leaves half of the loop's stability margin
-FRICTION_DQ = 0.03  # rad/s, width of the sign change of the friction estimate
+# Gains, chosen so that the loop has stability margins at a delay of a few ms
+BANDWIDTH = 20.0  # rad/s, natural frequency of the critically damped tracking loop
+ADAPTATION_RATE = 0.8  # 1/s, ratio of adaptation to proportional gain; leaves half of the loop's stability margin
+FRICTION_DQ = 0.03  # rad/s, scale of the tanh that replaces the sign of the speed in the friction estimate
 MASS_EVERY = 10  # cycles between two updates of the mass matrix
 # Limits
 OFFSET_SHARE = 0.1  # share of tau_max, limit of the estimated offset: balances an undeclared 1 kg at a Panda's reach
@@ -29,11 +29,12 @@ LOADED_DEVIATION = 0.5  # rad
 class TrackingController:
     """PD control with the nominal model's feedforward torque and an adaptive estimate of friction and offset.
 
-    The estimate of each joint is theta^T (1, tanh(dq_ref / 0.03), dq_ref / dq_max), where the vector theta contains
-    offset, Coulomb friction and viscous friction. The controller adapts theta during the motion, within limits, as in
-    Slotine and Li (IJRR 6(3), 1987). Light wrist joints need the estimate, because their small PD gains may not
-    overcome friction. The PD gains are BANDWIDTH^2 M and 2 BANDWIDTH M with the nominal mass matrix M. Gains
-    proportional to M suit any arm; separate gains per joint would be unstable if joint axes are nearly parallel.
+    At the reference speed dq_ref, each joint's friction and offset estimate is theta^T (1, tanh(dq_ref / 0.03),
+    dq_ref / dq_max). The vector theta contains offset, Coulomb friction and viscous friction. The controller adapts
+    theta during the motion, within limits, as in Slotine and Li (IJRR 6(3), 1987). Light wrist joints need the
+    estimate, because their small PD gains may not overcome friction. The PD gains are BANDWIDTH^2 M and 2 BANDWIDTH M
+    with the nominal mass matrix M. Gains proportional to M suit any arm; separate gains per joint would be unstable
+    if joint axes are nearly parallel.
 
     Args:
         robot: the nominal model. excitation: the motion to track.

@@ -17,7 +17,7 @@ from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import Task
 
-CYCLES = 200  # cycles at rest and cycles in motion: ten spans of the momentum residual
+CYCLES = 200  # number of cycles at rest, and then in motion: ten spans of the momentum residual
 SWING_RAD, SWING_HZ = 0.05, 1.0  # up to 0.3 rad/s: every joint slides
 RAMP_NM = 0.02  # Nm, largest torque of the ramps; it is so low that each ramp ends at once
 
@@ -52,7 +52,7 @@ def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = No
     """Run the code of the 1 kHz loop on a mock arm, so that numba compiles the code.
 
     Call this function in the process that will drive the arm, before opening the arm. The mock arm runs recordings
-    and ramps and, if there is a task, an episode with a copy of the adapter.
+    and ramps. If there is a task, the mock arm also runs an episode with a copy of the adapter.
 
     Raises:
         Exception: any exception that the adapter raises.

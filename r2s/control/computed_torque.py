@@ -77,7 +77,7 @@ def computed_torque(
         bandwidth: natural frequency w of the critically damped feedback, rad/s; the loop has the bandwidth 2 w. If
             None, w is BANDWIDTH_LATENCY / (2 latency), with latency = control period + low-pass time constant +
             LATENCY.
-        feedback_hz: Hz, update rate of the feedback, at most 1000. If None, the feedback has the policy's rate.
+        feedback_hz: Hz, update rate of the feedback, at most 1000; None: the policy's rate.
 
     Raises:
         UserError: the task has no trajectory, or a setting is out of its range.

@@ -29,7 +29,7 @@ class ControlledTask(Protocol):
 
 @dataclass(frozen=True)
 class Controller:
-    """An action space and a control law for all arms of one robot; `control=` selects the kind of controller.
+    """Action space and control law of a robot, for one arm or a batch; `control=` selects the kind of controller.
 
     A policy's action lies in [-1, 1]. The controller scales the action to SI units: action_offset + action_scale *
     action. A command consists of the scaled action and of the setpoint, which the controller computes from the task.
@@ -39,8 +39,8 @@ class Controller:
         law: the compiled law; see r2s/physics/control_laws.py.
         action_scale, action_offset: (a,) in `unit`. action: name of the quantity that an action sets.
         parameters: (p,), the law's parameters. memory_size: number of values that the law stores between cycles.
-        torque_limit: (n,) Nm, the largest target torque. If None, the task's limit applies.
-        cpp: C++17 body of the law for contract.hpp. If empty, bundles with this controller have no contract.hpp.
+        torque_limit: (n,) Nm, the largest target torque; None: the task's limit.
+        cpp: C++17 body of the law for contract.hpp; empty: bundles with this controller have no contract.hpp.
     """
 
     name: str
@@ -79,9 +79,9 @@ class Controller:
         return np.empty((len(t), 0))
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that holds the control law's arm model, and its payload, at rest at q (n,) rad.
+        """Return the torque (n,) Nm that holds the control law's model of the arm with payload at rest at q (n,) rad.
 
-        While the driver brings the arm to rest, the driver continues to apply this torque.
+        While the driver brings the arm to rest, the driver applies this holding torque.
         """
         return np.zeros(len(q))
 

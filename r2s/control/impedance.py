@@ -2,8 +2,8 @@
 
 r2s/physics/impedance_laws.py contains the control laws; this module computes the laws' parameters from arm, task and
 model. Default values scale with the arm: a spring's largest force is CLIP times the force that the torque limit
-allows in all directions in the home posture. A spring's default stiffness is its largest force divided by a distance,
-or less if the control loop's latency requires a softer spring.
+allows in all directions in the home posture. A spring's default stiffness is its largest force divided by CLIP_M or
+by `displacement`, or less if the control loop's latency requires a softer spring.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class Impedance(Controller):
 
     Attributes:
         model: the identified arm. target_size: number of values in a target. hybrid: whether hybrid control is used.
-        contact: (4,), surface normal and contact force, N, for hybrid control. If None, the task's contact applies.
+        contact: (4,), surface normal and contact force, N, for hybrid control; None: the task's contact.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -49,12 +49,12 @@ class Impedance(Controller):
     @property
     def setpoint_size(self) -> int:
         """Number of values in a setpoint: `target_size`, and 6 more if `hybrid`, and 3 more if `slides`."""
-        # target; if hybrid: normal (3), force, measured force, flag for a measured force; if it slides: pull (3)
+        # target; if `hybrid`: normal (3), force, measured force, flag for a measured force; if `slides`: pull (3)
         return self.target_size + 6 * self.hybrid + 3 * self.slides
 
     @property
     def slides(self) -> bool:
-        """Whether the task moves its target along a surface; the setpoint then ends with `task.pull` (3,) N."""
+        """Whether the task moves its target along a surface; setpoints then end with the force `task.pull` (3,) N."""
         return bool(self.hybrid and self.parameters[law.APPROACH] == law.SLIDES)
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
@@ -63,7 +63,7 @@ class Impedance(Controller):
         return self.model(q[None], still, still, still)[0]
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the setpoints (m, s): the target and, for hybrid control, the contact without a measured force."""
+        """Return the setpoints (m, s): target and, for hybrid control, contact (measured force: 0) and pull."""
         if not self.target_size:
             return np.empty((len(t), 0))
         if self.law is joint_impedance_law:
@@ -101,8 +101,8 @@ def joint_impedance(
         robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
         action: what a policy's action sets: "target", "stiffness" or "both".
         torque_fraction: torque limit / tau_max. displacement: rad, shift of the target by an action of 1.
-        stiffness: Nm/rad, largest stiffness of each joint. If None, CLIP * torque limit / displacement, or less if
-            the spring's natural frequency would exceed `fastest_spring`. damping: damping ratio of all modes.
+        stiffness: Nm/rad, largest stiffness of each joint; None: CLIP * torque limit / displacement, or less if the
+            spring's natural frequency would exceed `fastest_spring`. damping: damping ratio of all modes.
         softest: ratio of the smallest to the largest stiffness that an action sets.
         tank: J, initial level and capacity of the energy tank.
 
@@ -169,20 +169,20 @@ def cartesian_impedance(
     Args:
         robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
         displacement, rotation: m and rad, shift and rotation of the target by an action of 1.
-        stiffness: N/m, largest stiffness. If None, force_clip / CLIP_M, or less if `fastest_spring` requires less.
-        rotational_stiffness: Nm/rad, largest stiffness. If 0, only the null-space springs act on the orientation.
+        stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less if `fastest_spring` requires less.
+        rotational_stiffness: Nm/rad, largest stiffness; 0: only the null-space springs act on the orientation.
         force_clip: N, largest spring force at the largest stiffness. The torque limit allows a force F in all
             directions in the home posture; force_clip may be at most F. If None, force_clip is CLIP F.
-        moment_clip: Nm, largest spring moment, at most the moment that the torque limit allows in all directions. If
-            None, CLIP times the allowed moment.
+        moment_clip: Nm, largest spring moment, at most the moment that the torque limit allows in all directions;
+            None: CLIP times this moment.
         null_stiffness: 1/rad; this factor times a joint's torque limit is the stiffness, Nm/rad, of the joint's
             null-space spring to q_home.
-        hybrid: whether to control the force along a surface normal, and the impedance only along the surface. An
-            action that displaces the target against the normal adds the force stiffness * displacement. If
-            `task.approaches`, the target moves into the surface, and the force is at most stiffness times the depth
-            of the target below the tip, so that the tip is no faster than the target.
-        normal, force: normal (3,) out of the surface, in the base frame; contact force against the normal, N. If both
-            are None, the task's values apply.
+        hybrid: whether to control the force along a surface normal; impedance control then acts only along the
+            surface. An action that displaces the target against the normal adds the force stiffness * displacement.
+            If `task.approaches`, the target moves into the surface, and the force is at most stiffness times the
+            depth of the target below the tip, so that the tip is no faster than the target.
+        normal, force: normal (3,) out of the surface, in the base frame; contact force against the normal, N; both
+            None: the task's values.
         integral_rate: 1/s, integral gain on a measured force error. integral_max: integral limit / force_clip.
 
     Raises:
@@ -298,7 +298,7 @@ def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _action(
     action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return an action's scale and offset; write the indices of the action in a command to `parameters`."""
+    """Return an action's scale and offset; write the indices of the action's values in a command to `parameters`."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
     parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]

@@ -1,7 +1,8 @@
 """Simulate an arm in DART with the settings of Gazebo's physics plugin, for Sim2Sim transfer and the rigid twin.
 
 DART has semi-implicit Euler steps, implicit joint damping, hard position limits and exact Coulomb friction. With the
-settings of Gazebo's plugin, DART agrees with the plugin to round-off, and with MuJoCo to 1e-15 rad over 0.1 s.
+plugin's settings, joint angles in DART agree with the plugin's to round-off, and with MuJoCo's to 1e-15 rad over 0.1
+s.
 """
 
 from collections.abc import Callable
@@ -24,11 +25,11 @@ class DartEngine:
         robot: the arm; its MJCF defines kinematics, inertia and limits.
         gravity: whether gravity acts; False for an arm that compensates gravity itself, as in libfranka.
         masses, coms, inertias: mass (n,) kg, center of mass (n, 3) m, and tensor (n, 3, 3) kg m^2 about the center of
-            mass, of the n moving links, in link axes. If None, the MJCF's values.
-        armature: (n,) kg m^2, armature of the joints. If None, the values of `robot`.
+            mass, of the n moving links, in link axes; None: the MJCF's values.
+        armature: (n,) kg m^2, armature of the joints; None: the values of `robot`.
         stop_margin: rad, distance of the hard stops beyond the position limits.
 
-    Like MuJoCo, this engine has no velocity limits, because velocity limits would hide a policy's violations.
+    Like MuJoCo, this engine has no velocity limits: they would hide that a policy violates the arm's limits.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Run episodes one by one in an engine other than MuJoCo, with the goals, starts and random arms used in MuJoCo."""
+"""Run episodes one by one in an engine other than MuJoCo, with the goals, starts and random arms of MuJoCo."""
 
 from collections.abc import Callable
 

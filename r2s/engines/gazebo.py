@@ -33,7 +33,7 @@ class GazeboEngine:
 
     Args:
         robot: the arm. dynamics: masses, centers, tensors and armatures of the arm; `FrictionTorque` adds friction.
-        sim: the Python bindings. If None, the engine imports the installed bindings.
+        sim: the Python bindings; None: the installed bindings.
 
     Raises:
         UserError: the bindings are not installed, or cannot load the world.

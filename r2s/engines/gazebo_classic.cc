@@ -42,7 +42,7 @@ class R2sLockstep : public WorldPlugin {
       state[i] = this->joints[i]->Position(0);
       state[n + i] = this->joints[i]->GetVelocity(0);
     }
-    // a pipe passes up to 4096 bytes at once, enough for 170 joints
+    // a pipe transfers up to 4096 bytes at once, enough for 170 joints
     const ssize_t out = state.size() * sizeof(double), in = command.size() * sizeof(double);
     if (write(this->states, state.data(), out) != out || read(this->commands, command.data(), in) != in)
       std::_Exit(0);  // r2s has closed the pipes; an orderly end takes more than 10 s

@@ -141,8 +141,8 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
 def gzserver() -> list[str]:
     """Return the command that starts `gzserver`.
 
-    If R2S_GAZEBO_ROOT is set, the dynamic loader in this directory starts `gzserver`: chroot would need administrator
-    rights.
+    If R2S_GAZEBO_ROOT is set, the dynamic loader in that root directory starts `gzserver`, because chroot would need
+    administrator rights.
 
     Raises:
         UserError: `gzserver` or the plugin is missing.

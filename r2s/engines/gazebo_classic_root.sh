@@ -2,7 +2,7 @@
 # Make a root directory with Gazebo Classic 11 and its headers: Debian 11 (bullseye) in FOLDER, about 2.7 GB.
 # Needs debootstrap and root (sudo). Nothing outside FOLDER changes, and nothing is mounted.
 #     sudo sh r2s/engines/gazebo_classic_root.sh FOLDER
-# MIRROR=URL takes the packages from another mirror of Debian than debootstrap's own.
+# MIRROR=URL replaces debootstrap's default mirror of Debian.
 set -eu
 
 fail() {
@@ -18,7 +18,7 @@ root=$1
 
 debootstrap --variant=minbase bullseye "$root" ${MIRROR:+"$MIRROR"}
 cp /etc/resolv.conf "$root/etc/resolv.conf"
-echo force-unsafe-io > "$root/etc/dpkg/dpkg.cfg.d/r2s"  # a third of the time: nothing in the folder can be lost
+echo force-unsafe-io > "$root/etc/dpkg/dpkg.cfg.d/r2s"  # a third of the time; only the new folder is at risk
 # no service may start in the root directory
 printf '#!/bin/sh\nexit 101\n' > "$root/usr/sbin/policy-rc.d"
 chmod +x "$root/usr/sbin/policy-rc.d"

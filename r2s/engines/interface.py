@@ -1,7 +1,7 @@
 """The interface of a physics engine: set the joint state, apply a torque for 1 ms, return the new joint state.
 
 An engine simulates rigid bodies only. `FrictionTorque` computes friction, breakaway, offsets and the contact with a
-surface as an additional joint torque in each step, so that friction and contact are the same in every engine.
+surface as an additional joint torque in each step. Friction and contact are therefore the same in every engine.
 """
 
 from typing import Protocol

@@ -1,1 +1,1 @@
-"""Exciting trajectories for identification, and safety checks of a motion."""
+"""Plan motions for identification, and check a motion's limits, torque and clearances before an arm runs it."""

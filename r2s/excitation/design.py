@@ -1,4 +1,4 @@
-"""Design a motion of up to ten minutes, segment by segment, from which chosen parameters can be identified well.
+"""Design, segment by segment, a motion of up to ten minutes that makes chosen parameters well identifiable.
 
 A segment is the Fourier series (fourier.py) that best complements the earlier segments (sequential design: Chernoff,
 Ann. Math. Stat. 30(3), 1959). Between two segments the arm follows a checked path with minimum jerk.
@@ -22,7 +22,7 @@ from r2s.physics.robot import SIM_DT, Robot
 SEGMENT_S = 60.0  # s, longest segment: two minutes of a series need 1 GB
 LONGEST_S = 600.0
 PEAKS = 1.875, 5.7735  # peak velocity and acceleration of a minimum-jerk motion of 1 rad in 1 s
-# s, shortest leg; factor on its duration if torque is too high; most trials
+# s, shortest leg; factor on a leg's duration if the torque is too high; largest number of trials
 SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8
 EVERY = round(1 / (COARSE_HZ * SIM_DT))  # ms between two samples that a design evaluates
 
@@ -111,7 +111,7 @@ def joined(parts: list[Excitation]) -> Excitation:
 
 
 def trajectory_yaml(motion: Excitation, joints: list[str], rate_hz: float) -> str:
-    """Return YAML of a motion as trajectory_msgs/msg/JointTrajectory (ROS 2): samples at `rate_hz` and the last one.
+    """Return YAML of a motion as trajectory_msgs/msg/JointTrajectory (ROS 2): samples at `rate_hz`, and the last row.
 
     ROS 2 controllers interpolate by quintic polynomials between points with position, velocity and acceleration.
     """

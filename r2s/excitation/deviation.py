@@ -27,7 +27,7 @@ class DeviationLimits:
 
     @classmethod
     def along(cls, space: Space, motion: Motion, most: float) -> "DeviationLimits":
-        """Return limits along a motion; in an interval, the larger weights of its first and last posture apply."""
+        """Return limits along a motion; each time interval has the larger of the weights at its two end postures."""
         rows = geometry_rows(motion)
         weights = deviation_weights(space, motion.q[rows], most)
         return cls(np.maximum(weights[:-1], weights[1:]), int(rows[1] - rows[0]))

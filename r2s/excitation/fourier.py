@@ -1,10 +1,10 @@
 """Design an excitation: a finite Fourier series that the arm follows at several speeds.
 
-The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
-T-RA 13(5), 1997. The information matrix includes a prior, so that unidentifiable quantities do not dominate the
-determinant. Only motion at several speeds determines friction curves and delay, so the motion consists of rungs:
-sections of the series at 10 % to 100 % of full speed, separated by rests. Slow rungs also run backwards, so that
-joints reverse at low speed.
+The series, and the criterion (determinant of the information matrix, D-optimality), follow Swevers et al., IEEE T-RA
+13(5), 1997. The information matrix includes a prior, so that unidentifiable quantities do not dominate the
+determinant. Only motion at several speeds determines friction curves and delay. The motion therefore consists of
+rungs: sections of the series at 10 % to 100 % of full speed, with a rest after each rung. Slow rungs also run
+backwards, so that joints reverse at low speed.
 """
 
 from collections.abc import Callable
@@ -28,9 +28,9 @@ from r2s.physics.robot import SIM_DT, Robot
 
 # Ladders, sequences of rungs from slow to fast; a pace is a speed relative to full speed.
 SLOWEST = 0.1
-REVERSES_BELOW = 0.4  # pace below which a rung also runs backwards for a part of its length
-RUNG_S = 4.0  # s, approximate duration of a rung with its rest
-SHORT = 0.3, 0.8  # paces if the duration allows one rung only
+REVERSES_BELOW = 0.4  # pace below which a part of a rung runs backwards
+RUNG_S = 4.0  # s, approximate duration of a rung and a rest
+SHORT = 0.3, 0.8  # paces if the motion has time for only one rung
 LADDER = 6  # maximum number of rungs per ladder
 BLEND_S = 0.4  # s, transition between two paces
 HOLD_S = 0.4  # s, rest between two rungs
@@ -44,7 +44,7 @@ SHORTEST_S = 4.0  # s, minimum fundamental period
 RANGE = 0.8  # share of min(distance from the center to the nearer position limit, pi rad)
 SPEED = 0.65  # share of dq_max
 ACCELERATION = 0.7  # share of ddq_max
-STUCK_S = 0.12  # s for which a light joint may stick at a reversal; then the joint catches up at a higher speed
+STUCK_S = 0.12  # s for which a light joint may stick at a reversal, before it catches up at a higher speed
 # Search.
 DRAWS = 12  # random series
 KEPT = 3  # number of safe random series; the search starts from the best of these
@@ -81,8 +81,8 @@ def fourier(
         duration: s, including the rests at both ends.
         seed: random seed.
         gravity: whether the recorded torque is link-side torque, with gravity; see `information`.
-        effort: number of motions that the local search tries. If 0, the motion is the first safe random series.
-        q_center: (n,) rad, center posture. If None, the middle of the position range.
+        effort: number of motions that the local search tries; 0: return the first safe random series.
+        q_center: (n,) rad, center posture; None: the middle of the position range.
         table: m, height of the table in the base frame; -inf means no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
 
@@ -114,7 +114,7 @@ def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> n
 
 
 class Candidates:
-    """Candidate motions (x, a): x (2 H, n) are coefficients of a series, a (n,) are amplitudes / largest amplitudes.
+    """Candidate motions (x, a); x (2 H, n): coefficients of a series; a (n,): amplitude / largest amplitude.
 
     A joint's limits determine the joint's largest amplitude; the coefficients x determine only the motion's shape.
 
@@ -258,8 +258,8 @@ class Candidates:
     ) -> np.ndarray | None:
         """Reduce the amplitudes `a` until `_safety` is at least `margin`, and return the reduced amplitudes.
 
-        Each round reduces the amplitude of the joint whose reduction most improves the least safe sample. If an
-        amplitude falls below `least`, or if the safety stays too low, return None.
+        Each round reduces the amplitude of the joint whose reduction most improves the least safe sample. Return None
+        if an amplitude falls below `least`, if no reduction helps, or if the way from q_home is unsafe.
         """
         a = a.copy()
         for every in (5, 1):  # first every fifth sample, so that most rounds are fast
@@ -281,7 +281,7 @@ class Candidates:
 def _clock(duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the time t, the argument s of the series, ds/dt and d2s/dt2, each (T,).
 
-    Where the pace changes, the rate ds/dt follows a raised cosine.
+    Between two paces, the rate ds/dt follows a raised cosine.
     """
     t = SIM_DT * np.arange(round(duration / SIM_DT) + 1)
     levels, shares, fixed = [0.0], [0.0], [ENDS_S]  # a level lasts `fixed` s plus its share of the remaining time

@@ -7,7 +7,7 @@ from r2s.physics.rigid_body import LinkInertia, regressor, tensor_elements
 from r2s.physics.robot import Robot
 
 COARSE_HZ = 10  # rate of the samples for information and safety
-# Standard deviations of noise and priors, rough values of torque-controlled arms.
+# Standard deviations of noise and priors: rough values for torque-controlled arms.
 NOISE = 0.002  # share of tau_max, per sample
 FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
 DRAG_PRIOR = 0.01  # share of tau_max, coefficients of sine and cosine of the angle, for example of a cable's torque
@@ -25,10 +25,10 @@ def information(
 
     Information is log(det posterior precision / det prior precision) / 2, with independent normal priors. The
     unknowns of each joint are offset, Coulomb friction (a tanh with unknown width and shift), viscous friction and
-    drag. The unknowns of each link are mass and center of mass; gravity compensation does not remove their errors.
-    For commanded torque (`gravity` false), each tensor's scale and one delay are also unknown; for link-side torque,
-    each tensor element is unknown. Samples at 10 Hz have a noise of 0.2 % of tau_max; a resting joint's samples are
-    ignored.
+    drag. The unknowns of each link are mass and center of mass, whose errors gravity compensation does not remove.
+    For commanded torque (`gravity` false), each tensor's scale and a common delay are also unknown; for link-side
+    torque, each tensor element is unknown. Samples at 10 Hz have a noise of 0.2 % of tau_max; a resting joint's
+    samples are ignored.
     """
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)

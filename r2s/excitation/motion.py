@@ -34,7 +34,7 @@ class Excitation:
 
 
 def load(path: str | os.PathLike, robot: Robot, *, table: float = TABLE_M, z_min: float = TOOL_M) -> Excitation:
-    """Read an excitation in the format of `Excitation.save` and check it for this robot.
+    """Read an excitation in the format of `Excitation.save`, and check the motion for this robot.
 
     Raises:
         UserError: the file is missing or has another format, or the motion fails `motion_checks.check_motion`.

@@ -50,7 +50,7 @@ def check_motion(
         motion: the motion, sampled at 1 kHz.
         table: m, height of the table in the base frame; -inf means no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
-        space: a `Space`, for example with obstacles, that replaces table and z_min. If None, table and z_min apply.
+        space: a `Space`, for example with obstacles, that replaces table and z_min; if None, table and z_min apply.
     """
     check_shape(robot, motion)
     check_limits(robot, motion)
@@ -124,7 +124,7 @@ def check_derivatives(robot: Robot, motion: Motion) -> None:
 
 
 def check_torque(robot: Robot, motion: Motion) -> None:
-    """Raise UserError if |gravity| + |dynamics| + `friction_margin`, see `torque_share`, exceeds 80 % of tau_max."""
+    """Raise UserError if the torque |gravity| + |dynamics| + `friction_margin` exceeds 80 % of tau_max."""
     rows = geometry_rows(motion)
     share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
     bad = np.argwhere(~(share <= TORQUE_SHARE))
@@ -150,9 +150,8 @@ def check_space(
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
     """Return (|gravity| + |dynamics| + `friction_margin`) / tau_max (T, n) of the nominal model.
 
-    The sum adds magnitudes as a reserve, because a real arm differs from the nominal model. Some arms' torque limits
-    include the torque of gravity compensation and some do not; the sum of magnitudes is an upper bound for both
-    kinds.
+    The sum of magnitudes contains a reserve, because a real arm differs from the nominal model. The sum is an upper
+    bound for arms whose torque limit includes gravity compensation and for arms whose limit does not.
     """
     gravity = gravity_torque(robot, q)
     dynamics = nominal_torque(robot, q, dq, ddq) - gravity
@@ -180,7 +179,7 @@ class Space:
     Attributes:
         clearance: (K,) m, smallest required distances: of the end effector above z_min (element 0), of geoms above
             the table, and between the two geoms of each pair. Element 0 is an exception: the end effector may come
-            down to z_min, and element 0 only scales its height above z_min in fourier.py.
+            down to z_min; element 0 only scales the end effector's height above z_min in fourier.py.
         reach: m, upper bound of the distance between a point of the arm and a joint.
 
     Args:
@@ -291,7 +290,7 @@ class Space:
         return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
 
     def _apart(self) -> np.ndarray:
-        """Return the distance, m, between the geoms of each pair, or above FAR_M between their bounding spheres."""
+        """Return the distance (m) between the geoms of each pair; above FAR_M, between their bounding spheres."""
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         radius, place = self.model.geom_rbound, self.data.geom_xpos
         out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]

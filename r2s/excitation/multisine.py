@@ -26,21 +26,21 @@ SLOW_SHARE = 0.3  # largest sliding speed as a share of a reduced speed limit
 LINES_HZ = np.unique(np.round(np.geomspace(6.0, 120.0, 24) * PERIOD_S)) / PERIOD_S
 RIPPLE = 0.05  # velocity of each line / sliding speed; the sum of 24 lines then rarely reaches the sliding speed
 RATE_SHARE, TORQUE_SHARE = 0.4, 0.05  # largest torque rate / dtau_max and torque / tau_max of the multisine
-DRAWS = 200  # random phases tried; those with the lowest peak torque rate are used
+DRAWS = 200  # number of random sets of phases; r2s uses the set with the lowest peak torque rate
 MARGIN = 0.15  # rad, distance kept to the position limits
 
 
 def slide_speed(robot: Robot, joint: int, speed_share: float = 1.0) -> float:
     """Return the sliding speed, rad/s; `speed_share` scales the arm's speed limits, see `arm.speed_share`.
 
-    The sliding speed is SPEED * dq_max, or SLOW_SHARE of the scaled speed limit if this is lower. It is not
-    proportional to `speed_share`, because a joint that slides too slowly sticks.
+    The sliding speed is SPEED * dq_max, or SLOW_SHARE of the scaled speed limit if this product is lower. The sliding
+    speed is not proportional to `speed_share`, because a joint that slides too slowly sticks.
     """
     return float(min(SPEED, SLOW_SHARE * speed_share) * robot.dq_max[joint])
 
 
 def gear_motion(robot: Robot, joint: int, speed_share: float = 1.0) -> Excitation:
-    """Return a motion of one joint: LEGS slides to and fro at `slide_speed` about home; the other joints rest."""
+    """Return a motion of one joint: LEGS slides to and fro at `slide_speed` about home; other joints rest."""
     speed, t = slide_speed(robot, joint, speed_share), np.arange(round(LEG_S / SIM_DT)) * SIM_DT
     rise = minimum_jerk(np.zeros(1), np.full(1, speed), RAMP_S, t[:, None])  # speed, acceleration, jerk
     fall = minimum_jerk(np.zeros(1), np.full(1, speed), RAMP_S, t[:, None] - (LEG_S - RAMP_S))
@@ -59,13 +59,13 @@ def gear_motion(robot: Robot, joint: int, speed_share: float = 1.0) -> Excitatio
 
 
 def slides() -> list[slice]:
-    """Return the rows of each leg's steady slide, one period and its end point."""
+    """Return the rows of each leg's steady slide: one period of the multisine, including the end point."""
     first, rows = round((RAMP_S + SETTLE_S) / SIM_DT), round(PERIOD_S / SIM_DT)
     return [slice(k, k + rows + 1) for k in (leg * round(LEG_S / SIM_DT) + first for leg in range(LEGS))]
 
 
 def multisine(robot: Robot, joint: int, motion: Excitation) -> np.ndarray:
-    """Return the multisine torque (T,) Nm for all rows of a `gear_motion`; it fades in and out with the speed.
+    """Return the multisine torque (T,) Nm for all rows of a `gear_motion`; the torque fades in and out with speed.
 
     All lines have the same velocity amplitude in light joints, and the same torque rate in heavy joints.
     """

@@ -1,4 +1,4 @@
-"""Find a joint-space path to a posture, and check its limits and clearance before an arm moves along the path.
+"""Find a joint-space path to a posture, and check limits and clearances along the path before an arm moves.
 
 A path is an array of postures (k, n) rad without speeds; straight lines in joint space connect the postures.
 motion_checks.py computes distances and clearances.
@@ -13,14 +13,14 @@ from r2s.excitation.motion_checks import CLEARANCE_M, Space
 from r2s.physics.robot import Robot
 
 CLOSER_M = 1e-3  # m; an arm that starts too near to an obstacle may come closer by CLOSER_M before it moves away
-SAME = 1e-3  # rad, a joint this close to its target need not move
+SAME = 1e-3  # rad; a joint closer than this to the target angle need not move
 
 
 def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, space: Space) -> np.ndarray:
     """Return the first candidate path (k, n) rad from q_from to q_to without `path_violation`.
 
     The candidates are, in this order: the straight line; two lines through q_home; two paths that move one joint at a
-    time, starting with the last or the first joint; two such paths through q_home.
+    time, starting with the last or the first joint; two paths through q_home that also move one joint at a time.
 
     Args:
         robot: limits and links.
@@ -62,7 +62,7 @@ def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
 def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
     """Return a description of the first violation of limits or clearances on a path (k, n) rad, or "".
 
-    If a distance is already too small at the first posture, the present one, it may decrease by at most CLOSER_M.
+    A distance that is already too small at the first posture (the present posture) may decrease by CLOSER_M at most.
     """
     if path.ndim != 2 or len(path) < 2 or path.shape[1] != robot.n:
         return f"expected postures of shape (2 or more, {robot.n}), got {path.shape}"

@@ -1,1 +1,1 @@
-"""Export a trained policy as a bundle, with which another program can run the policy without r2s."""
+"""Export a trained policy as a bundle, so that other programs can run the policy without r2s."""

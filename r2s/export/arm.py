@@ -18,7 +18,7 @@ class Arm:
         torque: "without gravity" if the arm itself compensates gravity, as a Franka arm does.
         q_min, q_max, dq_max, tau_max, dtau_max: the limits of each joint, in rad, rad, rad/s, Nm, Nm/s.
         slows: (decelerations rad/s^2, offsets rad/s) of an arm such as the FR3, which limits each joint's speed to
-            sqrt(2 deceleration d) - offset at d rad before a position limit. If None, the arm has no such limits.
+            sqrt(2 deceleration d) - offset at d rad before a position limit; None: no limits of this kind.
     """
 
     joints: Sequence[str]
@@ -33,7 +33,7 @@ class Arm:
 
 
 def fits(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle was made for an arm other than `arm`, or exceeds a limit of `arm`."""
+    """Raise BundleError if a bundle was made for an arm other than `arm`, or if its limits exceed those of `arm`."""
     own, n = contract["joints"], len(contract["joints"])
     if len(arm.joints) != n:
         raise BundleError(f"expected {n} joints, got {len(arm.joints)} of the arm")

@@ -39,7 +39,7 @@ from r2s.tasks.surface_task import SurfaceTask
 from r2s.tasks.task import Task
 
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
-# modules that r2s_runtime.py of a bundle contains in addition to runtime.py, in this order
+# modules whose code r2s_runtime.py of a bundle contains in this order, in addition to the code of runtime.py
 HERE, PARTS = "r2s.export.", ("law", "arm", "push", "control", "inverse_dynamics", "plan", "surface", "fences")
 EXAMPLES = 4  # number of example plans in a bundle
 PLAN = "plan.npy"  # first example plan, which the C++ control loop reads; only for plans on a surface
@@ -145,7 +145,7 @@ def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str,
         off = np.abs(actions - expected).max(0) / np.array(contract["control"]["action_scale"])
     except BundleError:
         raise
-    except Exception as error:  # a damaged file may fail in any way
+    except Exception as error:  # a damaged file may raise any error
         seen_ = " ".join(str(error).split())[:100]
         raise UserError(f"export: {source / 'policy.onnx'} is damaged ({seen_})") from None
     if not off.max() < SAME:

@@ -106,7 +106,7 @@ def not_tried(measured: Mapping[str, Any], places: Sequence[str]) -> list[Item]:
 
 
 def plans(contract: Mapping[str, Any]) -> list[Item]:
-    """Return the text that explains the format of a plan and how to make one."""
+    """Return the text that explains the format of a plan, and ways to make a plan."""
     goal, n = contract["goal"], len(contract["joints"])
     rows, columns = goal["shape"]
     if goal["kind"] == "surface":
@@ -150,7 +150,7 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return {"simulator or arm (run)": measures} of the policy's transfers that are done or stopped.
+    """Return {"simulator or arm (run)": measures} for each finished or stopped transfer of the policy.
 
     Leave out rows in which `measure` is missing or not finite.
     """

@@ -66,7 +66,7 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
     Args:
         robot, task: robot and task of the training. friction: (n,) Nm, Coulomb friction, see
             `safety_filter.filter_torque`.
-        rotors: armatures (n,) kg m^2 for the safety filter. If None, the armatures of `robot`.
+        rotors: armatures (n,) kg m^2 for the safety filter; if None, the armatures of `robot`.
 
     Raises:
         UserError: the task has no `observation_terms`, or the runtime of a bundle does not support the task.
@@ -231,7 +231,7 @@ def width(of: str, joints: int, preview: int) -> int:
 
 
 def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the entry `goal` for point goals: their format, and the region of the training's goals."""
+    """Return the entry `goal` for goals that are points: format of a goal, and region of the training's goals."""
     out: dict[str, Any] = {"kind": "point", "shape": [3], "unit": "m", "frame": "the arm's base"}
     if hasattr(task, "region"):
         low, high = task.region(robot)
@@ -242,7 +242,7 @@ def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
 
 
 def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, Any]:
-    """Return the entry `goal` for plans as goals: the format of a plan, and the ranges of the training's plans."""
+    """Return the entry `goal` for goals that are plans: format of a plan, and ranges of the training's plans."""
     ends = np.cumsum([0, 3, 3, robot.n, robot.n, robot.n]).tolist()
     low, high = task.region(robot)
     trained = {"kinds": list(task.kinds), "size_m": list(task.size), "fastest_m_per_s": list(task.speed)}

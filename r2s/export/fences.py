@@ -70,7 +70,7 @@ def check_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None
             raise BundleError(f"row {row} of the plan is {1e3 * off:.1f} mm from where its joint angles take the arm")
 
 
-BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # limits in the law: the value for null
+BOUNDS = {"q_stop_low": -np.inf, "q_stop_high": np.inf, "dq_stop": np.inf}  # limit in the contract: value if null
 
 
 class PolicyThread:

@@ -52,7 +52,7 @@ class InverseDynamics:
         out = np.empty((rows, 3 * n + n * n))
         whole, last = int(self._ahead * hz), len(q) - 1
         h = self._ahead - whole / hz
-        for row in range(rows):  # evaluate the plan when the torque acts; acceleration is linear between rows
+        for row in range(rows):  # evaluate the plan at the time at which torque acts; interpolate acceleration
             a, b = min(row + whole, last), min(row + whole + 1, last)
             jerk = (ddq[b] - ddq[a]) * hz
             to = q[a] + h * (dq[a] + h * (ddq[a] / 2 + h * jerk / 6))

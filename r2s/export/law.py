@@ -10,7 +10,7 @@ import numpy as np
 
 LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
 
-OVER = 3  # last phase of a stop in contact, which needs no further action, see push.py
+OVER = 3  # last phase of a stop in contact; it needs no further action, see push.py
 
 
 class BundleError(ValueError):
@@ -45,7 +45,7 @@ class Model:
         self._constant, self._odd, self._even = frame @ along, frame @ skew, frame @ (np.eye(3) - along)
         self._hand = np.array(model["hand_m"], dtype=float)
         self._rotors = np.diag(np.array(model["rotors"], dtype=float))
-        self._before = np.tril(np.ones((self.n, self.n)))[:, :, None]  # whether joint j moves link k: j <= k
+        self._before = np.tril(np.ones((self.n, self.n)))[:, :, None]  # 1 if joint j moves link k: j <= k
 
     def place(self, q: np.ndarray) -> None:
         """Move the model to the joint angles q (n,) rad."""
@@ -70,8 +70,8 @@ class Model:
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
 
-        Newton-Euler recursion yields the torque. The mass matrix is diag(armatures) + sum_k J_k^T M_k J_k, where M_k
-        contains mass and tensor of link k.
+        Newton-Euler recursion yields the Coriolis torque. The mass matrix is diag(armatures) + sum_k J_k^T M_k J_k,
+        where M_k contains mass and tensor of link k.
         """
         R, p, z, n = self.frame, self.origin, self.axis, self.n
         spin = z * dq[:, None]
@@ -117,8 +117,8 @@ class Driver:
 
     Args:
         law: a contract's entry `law`. model: the arm's `Model`. soft_start_s: s, time over which torque fades in.
-        control: the contract's `Control`. If None, commands are torques.
-        push: the contract's `PushLimit`. If None, nothing limits the contact force.
+        control: the contract's `Control`; if None, commands are torques.
+        push: the contract's `PushLimit`; if None, nothing limits the contact force.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class Driver:
 
     @property
     def done(self) -> bool:
-        """Whether a stop has ended, because the arm is at rest or the longest duration of a stop is over."""
+        """Whether a stop has ended: the arm is at rest, or the stop has reached its longest duration."""
         over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
         return self.stopping is not None and self._damped > 0 and (self._rests or over)
 
@@ -156,8 +156,8 @@ class Driver:
 
         Args:
             q, dq: joint state (n,) rad, rad/s, in this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            command: (c,), new command. If None, the previous command applies.
-            placed: whether `model` is already at q.
+            command: (c,), new command; if None, the previous command applies.
+            placed: whether the caller has already called `model.place(q)`.
         """
         j, c = self._j, self._number
         seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
@@ -231,7 +231,7 @@ class Driver:
     def _guard(
         self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
     ) -> tuple[np.ndarray, bool]:
-        """Return the allowed torque (n,) Nm nearest to effort + holding torque, and whether the two differ."""
+        """Return the allowed torque (n,) Nm nearest to effort + holding torque, and whether both differ."""
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
@@ -254,8 +254,8 @@ class Driver:
     ) -> tuple[np.ndarray, bool]:
         """Return the torque (n,) Nm nearest to tau that keeps ddq in `bounds`, and whether it differs from tau.
 
-        ddq: (n,) rad/s^2, acceleration that tau causes. bounds: inverse mass matrix, lowest and highest ddq (n,). In
-        light joints, the certain part of the friction widens the range of ddq.
+        ddq: (n,) rad/s^2, acceleration that tau causes. bounds: inverse mass matrix, lowest and highest ddq (n,). For
+        light joints, the share of friction that certainly acts widens the range of ddq.
         """
         j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():
@@ -296,7 +296,7 @@ class Driver:
             push[at] = np.linalg.solve(mobility[np.ix_(at, at)], np.where(side > 0, high, low)[at] - ddq[at])
             reached = ddq + mobility @ push
             free = np.where(reached > high + c["exact"], 1, np.where(reached < low - c["exact"], -1, 0))
-            other = np.where(side == 0, free, np.where(side * push > 0.0, 0, side))  # a bound only pushes inwards
+            other = np.where(side == 0, free, np.where(side * push > 0.0, 0, side))  # a bound only pushes ddq inwards
             changed = np.flatnonzero(other != side)
             if not len(changed):
                 break

@@ -63,7 +63,8 @@ class Follower:
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
         """Return {name: values} for a control step: the values for the observation, and the controller's `setpoint`.
 
-        `goal` is the reference position. After the last step, the reference remains at the end of the path.
+        The value `goal` is the reference position of the end effector. After the last step, this reference remains at
+        the end of the path.
 
         Args:
             step: number of the control step, from 0. seen: measured q, dq (n,) rad, rad/s; end-effector position `ee`

@@ -1,6 +1,6 @@
 """Limit contact force and closing speed, and stop an arm whose tip presses on a surface, in NumPy.
 
-r2s itself uses two compiled modules instead, r2s/physics/push_limit.py, which contains the derivation, and
+r2s itself uses compiled modules instead: r2s/physics/push_limit.py, with the derivation, and
 r2s/physics/contact_stop.py. `r2s export` copies this module into r2s_runtime.py of a bundle.
 """
 
@@ -62,7 +62,7 @@ class PushLimit:
         self._dq, self._mass, self._bias = dq, mass, bias
 
     def _bound(self, last: np.ndarray) -> float:
-        """Return the largest tip acceleration into the surface, m/s^2, that torque may cause; `last`: last torque."""
+        """Return the largest tip acceleration (m/s^2) into the surface that torque may cause; `last`: last torque."""
         p, c, mobility = self._p, self._c, self._mobility
         if self._height > p["near_m"]:
             self._resisted, self._before = 0.0, None
@@ -83,9 +83,10 @@ class PushLimit:
         return most - own
 
     def limit(self, effort: np.ndarray, last: np.ndarray, bounded: Callable[..., Any]) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm within all bounds nearest to `effort` (n,) Nm, and whether the two differ.
+        """Return the torque (n,) Nm within all bounds that is nearest to `effort` (n,) Nm; also, whether they differ.
 
-        bounded: function that limits a torque (n,) Nm to the joint bounds, given the bias torque (n,) Nm in contact.
+        bounded: function of torque and bias torque in contact, (n,) Nm each, that limits the torque to the joint
+        bounds.
         """
         bound, p, row = self._bound(last), self._p, self._row
         bias = self._bias + max(self._resisted, 0.0) * row
@@ -111,7 +112,7 @@ class PushLimit:
         return out, True
 
     def stop(self, held: np.ndarray, cycles: int) -> tuple[np.ndarray, float]:
-        """Return a stop's target torque (n,) Nm, and the fraction of the allowed joint speeds that the stop needs.
+        """Return a stop's target torque (n,) Nm, and the fraction of the allowed joint speeds that the stop uses.
 
         Args:
             held: (n,) Nm, torque that the driver adds to the target torque. cycles: cycles since the stop began.

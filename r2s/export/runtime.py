@@ -73,7 +73,7 @@ def load(folder: str | Path) -> dict[str, Any]:
 
 
 class Runtime:
-    """Run a policy with its controller and driver: in every cycle, map the joint state to the torque command.
+    """Run a policy with controller and driver; one call per cycle maps the joint state to the torque command.
 
     Attributes:
         contract: content of contract.json. driver: the `Driver`, which makes the torque obey the arm's limits.
@@ -92,7 +92,7 @@ class Runtime:
         self.contract = contract = load(folder)
         fits(contract, arm)
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # do not wait for other threads
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # one thread: no waiting for others
         try:
             self._policy = onnxruntime.InferenceSession(Path(folder) / "policy.onnx", options)
         except Exception as error:  # ONNX Runtime raises many types of exceptions
@@ -119,8 +119,8 @@ class Runtime:
                 must be at the joint angles of the plan's first row. Computed-torque setpoints take 0.1 s to compute.
 
         Raises:
-            BundleError: the plan is missing, has a wrong shape, is not finite, exceeds the arm's limits or is outside
-                the region of the training's plans; or `plan` is not None although the policy's goals are points.
+            BundleError: the plan is missing, not finite, of a wrong shape, beyond the arm's limits or outside the
+                training's region; or the policy's goals are points, but `plan` is not None.
         """
         if self._follower is not None:
             self._follower.take(plan)
@@ -149,7 +149,7 @@ class Runtime:
 
         Args:
             q, dq: measured joint state (n,) rad, rad/s. tau_J_d: (n,) Nm, the torque that the arm applied last.
-            goal: finite point (3,) m in the base frame; None if the policy follows a plan, which starts at the first
+            goal: finite point (3,) m in the base frame; None if the policy follows a plan, which begins in the first
                 cycle after `reset`.
 
         If a goal during a motion is outside the region of the training's goals, the runtime brings the arm to rest.

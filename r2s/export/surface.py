@@ -14,10 +14,10 @@ from r2s.export.inverse_dynamics import InverseDynamics
 from r2s.export.law import BundleError, Model
 from r2s.export.plan import NO_PLAN, finite_plan
 
-WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # number of columns, before q and setpoint
+WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # number of columns; q and setpoint follow
 NEAR_M = 1e-3  # m, allowed distance between the tip at the start posture and the target in the plan's first row
-# in a setpoint: velocity of the target m/s; for control=hybrid: normal, force N, measured force N, whether measured;
-# for a target that slides: feedforward force N
+# setpoint columns: target velocity, m/s; for control=hybrid: normal, force N, measured force N, whether measured;
+# for a sliding target: feedforward force, N
 VELOCITY, CONTACT, PULL = slice(3, 6), slice(6, 12), slice(12, 15)
 ROUNDING = 1e-6  # m and N, tolerance with which a plan is compared with the training's ranges
 
@@ -73,11 +73,10 @@ def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray)
 
 
 def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
-    """Raise BundleError if the setpoint, which commands the controller, differs from target, normal or force.
+    """Raise BundleError if the setpoint of the controller contradicts the plan's target, normal or force.
 
-    The setpoint's target must lie between the targets of its row and of the next row, because the setpoint of a
-    sliding target is valid for the middle of the control period. The contract limits target velocity and
-    feedforward force.
+    The target in a row's setpoint must lie between the targets of this row and the next: for a sliding target, the
+    setpoint is valid for the middle of the control period. The contract limits target velocity and feedforward force.
 
     Args:
         goal: entry `goal` of the contract. plan: (rows, columns), a plan on a surface.
@@ -120,7 +119,7 @@ def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
         )
 
 
-LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # limits in the law: the value for null
+LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # limit in the contract: value if null
 
 
 class SurfaceFollower:

@@ -16,8 +16,8 @@ from r2s.physics.tip import Tip
 from r2s.tasks.surface_task import LAG_M, REGULAR, START, SurfaceTask
 from r2s.tasks.task import Task
 
-EXAMPLES = 64  # random goals, whose largest target velocity and feedforward force determine the allowed values
-SPARE = 2.0  # allowed value / largest value of the examples; the force of 1,158 wipes was up to 1.5 times that of 64
+EXAMPLES = 64  # number of random goals; their largest target velocity and feedforward force set the allowed values
+SPARE = 2.0  # allowed value / largest value of the examples; 1,158 wipes had up to 1.5 times the largest force of 64
 
 
 def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
@@ -34,7 +34,7 @@ def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndar
 
 
 def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
-    """Return the contract's entry `goal` for plans on a surface: their format, and their ranges during training."""
+    """Return the contract's entry `goal` for plans on a surface: format and training ranges of a plan."""
     control, tool = task.control(robot), robot.tool
     columns = columns_of(robot.n, control.setpoint_size)
     point, normal = task.plane(robot)
@@ -43,7 +43,7 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
     trained = {"point_m": point.tolist(), "normal": normal.tolist(), "spread_m": task.spread}
     trained |= {"place_m": task.place, "tilt_rad": float(np.radians(task.tilt)), "force_N": list(task.force)}
     trained |= {"depth_m": [-float(task.clearance + radius), deepest]}
-    trained |= {"contact": None if contact is None else contact.tolist()}  # normal, force N instead of the plan's
+    trained |= {"contact": None if contact is None else contact.tolist()}  # replaces the plan's normal and force, N
     trained |= _largest_setpoints(robot, task)
     site, axes = ee_pose(robot)
     return {
@@ -62,7 +62,7 @@ def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
 
 
 def _largest_setpoints(robot: Robot, task: SurfaceTask) -> dict[str, float]:
-    """Return the largest allowed target velocity, m/s, and feedforward force, N, of a setpoint; 0 if it has none."""
+    """Return the largest allowed target velocity (m/s) and feedforward force (N) of a setpoint; 0 if it has none."""
     control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
     goals = task.goals(robot, np.random.default_rng(0), EXAMPLES)
     rows = np.vstack([control.setpoint(task, t, np.broadcast_to(goal, (len(t), len(goal)))) for goal in goals])

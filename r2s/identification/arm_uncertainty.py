@@ -1,4 +1,4 @@
-"""Compute how the uncertainty of an identified arm changes a torque residual."""
+"""Compute how errors in the model of an identified arm change a torque residual."""
 
 from dataclasses import dataclass
 
@@ -11,8 +11,8 @@ from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.robot import Robot
 
-GAIN = 0.05  # standard deviation of a sensor's gain, the prior of conf/identify
-MASSES = 0.1  # standard deviation of the relative error that all masses in a robot's file have in common
+GAIN = 0.05  # standard deviation of a torque sensor's gain error, the prior of conf/identify
+MASSES = 0.1  # standard deviation of a relative error that is the same for all masses in a robot's file
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +34,9 @@ def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 
     The torque of an unloaded arm determines only the product of sensor gain and masses. If every true mass is 1 + e
     times the mass in the robot's file, the identified gains contain the factor 1 + e. A payload's computed torque is
-    then 1 + e times too large. Each joint's gain has an independent error with standard deviation GAIN; all masses
-    share one relative error with standard deviation MASSES. The most likely mass error minimizes the sum of squares
-    of gain errors and mass error, each divided by its standard deviation.
+    then 1 + e times too large. Each joint's gain has an independent error with standard deviation GAIN. All masses
+    share one relative error, with standard deviation MASSES. With every error divided by its standard deviation, the
+    most likely mass error minimizes the sum of squares of all errors.
     """
     space, n = arm.space, arm.robot.n
     if "gain" not in space.blocks or LINK[0] in space.blocks:
@@ -65,7 +65,7 @@ def arm_directions(
     Args:
         torque: residual of the joint torque. x: (P,) parameters of the arm.
         samples: (S, P), posterior draws of x; if None, only friction and offsets have errors. offset_drift: (n,) Nm,
-            standard deviation of offset drift.
+            standard deviation of the offsets' drift since the calibration.
         friction_drift: standard deviation of the friction's drift since the calibration, relative to the friction.
     """
     d, n = torque.space.dynamics(x), torque.space.n

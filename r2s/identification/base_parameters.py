@@ -2,8 +2,8 @@
 
 Torque is linear in ten standard parameters per link and one per rotor, but many parameters act only in combination. A
 QR decomposition (without pivoting) of the regressor at random states selects each column that is independent of the
-columns before it. Each selected column yields a base parameter, into which the parameters of dependent columns are
-regrouped (Gautier, J. Robotic Systems 8(4), 1991).
+columns before it. Each selected column yields one base parameter, which also contains the parameters of dependent
+columns (Gautier, J. Robotic Systems 8(4), 1991).
 """
 
 from typing import NamedTuple
@@ -18,9 +18,9 @@ from r2s.physics.robot import Robot
 
 STANDARD = ("mass", "mx", "my", "mz", "xx", "yy", "zz", "xy", "xz", "yz")  # of a link, about its origin
 UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
-# a link's columns; the mass is last, because QR regroups later columns into earlier ones
+# order of a link's columns; the mass is last, because QR regroups later columns into earlier ones
 ORDER = (*range(4, 10), 1, 2, 3, 0)
-# relative sizes below which a column is dependent; below which a coefficient is set to 0
+# relative tolerances: a column with a smaller remainder is dependent; a smaller coefficient is set to 0
 DEPENDENT, NONE = 1e-9, 1e-9
 
 
@@ -40,7 +40,7 @@ class BaseParameters(NamedTuple):
         """Return the values (..., K) of the base parameters for the dynamics of one or many arms."""
         links = LinkInertia(d.mass, d.com, d.inertia).standard()
         links = links.reshape(*links.shape[:-2], -1)
-        count = links.shape[-1]  # `d` may have many sets of rotors but one set of links, so add the two products
+        count = links.shape[-1]  # add two products: `d` may have many sets of rotors but one of links
         return links @ self.matrix[:, :count].T + d.armature @ self.matrix[:, count:].T
 
 

@@ -8,8 +8,9 @@ motion repeats, a block contains the same interval of all repetitions.
 import numpy as np
 
 BLOCK_S = 0.5  # s, shortest block
-BLOCKS = 20, 400  # fewest and most blocks; few blocks make the scatter uncertain, many blocks cost time
-LENGTH = 5.0  # correlation times per block: the variance of a block's sum, per length, is then 90 % of its limit
+BLOCKS = 20, 400  # fewest and most blocks; few blocks make the covariance uncertain, many blocks cost time
+# correlation times per block; (variance of a block's sum) / (block length) is then 90 % of its limit for long blocks
+LENGTH = 5.0
 WINDOW = 5.0  # lag in correlation times beyond which autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
 LONGEST_S = 60.0  # s, longest lag of the autocorrelation
 REPEATED = 0.3  # blocks join repetitions if repetition raises the variance by more than this share
@@ -28,10 +29,10 @@ def blocks_of(
     Args:
         t: (T,) s, times, increasing within a trajectory. q: (T, n) rad, joint angles. period: s, period of the
             motion, or None.
-        residual: (T, n), residual of a fit. Without a residual, blocks last at least `shortest_s` s and do not join
-            repetitions of the motion.
+        residual: (T, n), residual of a fit. If None, blocks last at least `shortest_s` s and do not join repetitions
+            of the motion.
     """
-    # number of the trajectory; each trajectory restarts the clock
+    # number of the trajectory; t starts anew in each trajectory
     run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])
     steps = np.diff(t)[np.diff(run) == 0]
     step = float(np.median(steps)) if len(steps) else shortest_s
@@ -50,7 +51,7 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Join blocks (T,) of repetitions `visit` (T,) with similar angles q (T, n) rad; return block numbers (T,)."""
+    """Join `block` (T,) over repetitions `visit` (T,) with similar angles q (T, n) rad; return block numbers (T,)."""
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -60,10 +61,10 @@ def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
-    """Return the longest correlation time, in rows, among the joints of a residual (T, n) at t (T,) s.
+    """Return the correlation time, in rows, of a residual (T, n) at times t (T,) s: the longest of all joints.
 
-    The correlation time is the integral of the squared autocorrelation. This integral is also an upper bound of the
-    correlation time of residual times Jacobian.
+    The correlation time is the integral of the squared autocorrelation. The product of residual and Jacobian has at
+    most this correlation time.
     """
     lags = min(len(t), round(LONGEST_S / step) + 1)
     total = np.zeros((lags, residual.shape[1]))
@@ -79,7 +80,7 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether some joint's residual (T, n) repeats. at, visit: (T,) numbers of phase and repetition."""
+    """Return whether a joint's residual (T, n) repeats. at, visit: (T,) phase and repetition of each row."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]
@@ -89,8 +90,8 @@ def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
     for x in (residual - residual.mean(0)).T:
         mean = np.bincount(cell, x) / count
         square = np.bincount(phase, mean**2)[more > 1]
-        between = np.bincount(phase, mean)[more > 1] ** 2 - square  # twice the sum of the products of two repetitions
-        growth = between.sum() / max(square.sum(), 1e-300)  # (often - 1) times the correlation of two repetitions
+        between = np.bincount(phase, mean)[more > 1] ** 2 - square  # twice the sum of products of all pairs
+        growth = between.sum() / max(square.sum(), 1e-300)  # (often - 1) times the mean correlation of pairs
         if growth > max(REPEATED, 2.0 / np.sqrt(len(square) / often)):
             return True
     return False

@@ -9,9 +9,9 @@ from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-SPIKE = 5.0  # times the limits of speed and torque: beyond any sensor noise
-NONSENSE = 1e9  # times the limits of speed and torque: beyond any wrong unit; larger values may overflow
-JUMP = 0.05  # rad, accepted jump of an encoder
+SPIKE = 5.0  # factor on the limits of speed and torque that no sensor noise exceeds
+NONSENSE = 1e9  # factor on the limits of speed and torque that no wrong unit exceeds; larger values may overflow
+JUMP = 0.05  # rad, largest accepted jump of an encoder
 MARGIN = 0.05  # rad by which a log may exceed the position limits, as can happen when an arm is at a limit
 LEAST_S = 1.0  # s, least duration of a recording
 
@@ -31,7 +31,7 @@ def check_recording(robot: Robot, recording: Recording) -> Judged | None:
 
 def check_rate(cutoff_hz: float, recording: Recording) -> None:
     """Raise UserError unless a cutoff is below the recording's Nyquist frequency."""
-    if cutoff_hz >= 0.499 * recording.rate_hz:  # not 0.5: a log's clock jitters
+    if cutoff_hz >= 0.499 * recording.rate_hz:  # less than 0.5, because a log's clock jitters
         raise UserError(
             f"identify.cutoff_hz: expected less than {0.5 * recording.rate_hz:.4g} Hz, half the rate of "
             f"{recording.name or 'the recording'} ({recording.rate_hz:.4g} Hz), got {cutoff_hz:g}"
@@ -50,14 +50,14 @@ def check_motion(robot: Robot, recording: Recording) -> None:
 
 
 def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
-    """Raise UserError if a row exceeds `most` times the arm's limits, as in a damaged file."""
+    """Raise UserError if a row exceeds `most` times the arm's limits, because the file is then damaged."""
     r = recording
     steps = np.diff(r.t)
     steps[np.diff(r.trajectory) != 0] = np.inf
     limits = {"q": robot.dq_max, "dq": robot.dq_max, "tau": robot.tau_max}
     for field, unit in {"q": "rad after a jump", "dq": "rad/s", "tau": "Nm"}.items():
         x, worst = getattr(r, field), (0.0, 0, 0)
-        for j, limit in enumerate(most * limits[field]):  # one joint at a time: an hour of a log is large
+        for j, limit in enumerate(most * limits[field]):  # one joint at a time, to save memory for long logs
             if field == "q":
                 share = np.append(0.0, (np.abs(np.diff(x[:, j])) - JUMP) / (steps * limit))
             else:

@@ -1,8 +1,9 @@
 """Assess what each of several recordings adds to an identification, and whether one contradicts the others.
 
 Two further fits assess each recording: a fit without the recording, and a fit to the recording alone. Every further
-fit starts from the fit to all recordings, so that few least-squares steps on torque suffice. A recording's weights
-come from the fit to this recording alone, because a contradiction would increase the residual of a common fit.
+fit starts at the solution for all recordings, so few least-squares steps on torque suffice. A recording's weights
+come from the fit to this recording alone, because contradictory recordings would increase the residual of a common
+fit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,13 +20,16 @@ from r2s.identification.search.levenberg_marquardt import minimize, normal_equat
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-CONTRADICTS = 2.0  # least ratio of sums of squares: fit to all / (fit without one recording + fit to it alone + P)
-WORSE = 4.0  # least ratio of the RMSE of one recording's own fit to the median RMSE of the others' own fits
-CARRIED = 0.5  # a body on the last link is reported if it explains this share of the squares of `left_out`
+# a recording contradicts the others if the sums of squares of fits have at least this ratio:
+# fit to all / (fit without this recording + fit to this recording alone + number of parameters)
+CONTRADICTS = 2.0
+# a recording is reported if the RMSE of a fit to it alone is at least this multiple of the others' median
+WORSE = 4.0
+CARRIED = 0.5  # a body on the last link is reported if it explains more than this share of the squared torque error
 LEAST_MASS = 0.01  # least reported mass of a body on the last link, relative to the arm's mass
-ROUNDS = 3  # reweighted fits of each recording alone
+ROUNDS = 3  # number of reweighted fits to each recording alone
 STEPS, FTOL = 10, 1e-3  # most Jacobians in a fit; a fit ends when a step reduces the cost by less than this share
-USED_S, RATE_HZ = 120.0, 50.0  # s, longest part of a recording that is compared; rows per second
+USED_S, RATE_HZ = 120.0, 50.0  # s, longest compared part of a recording; residual rows per second
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +65,7 @@ def contributions(
     """Return each recording's contribution to the fit `found`; all recordings have the same kind of torque."""
     space, u = found.space, found.space.to_unit(found.x)
     r0, slope = found.prior_rows
-    flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # the prior residual lacks rows for flat priors
+    flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # flat priors have no rows in the prior residual
     prior = np.concatenate([r0, np.zeros(len(u))]), np.concatenate([slope, flat])
     parts = [_torque(space, spread(r, USED_S), cutoff_hz) for r in recordings.values()]
     parts = [p.reweighted(found.x, fitted=True) for p in parts]
@@ -113,7 +117,7 @@ def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
 
 
 def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the fit (P,) to the residuals `parts` from start u (P,). prior: residual (B,) of the prior, Jacobian."""
+    """Fit the residuals `parts` from start u (P,); return the solution (P,). prior: residual (B,) and Jacobian."""
     offset, root = prior
 
     def residual(v: np.ndarray) -> np.ndarray:

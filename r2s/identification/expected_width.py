@@ -1,9 +1,8 @@
 """Predict the widths of the 95 % intervals of an identification before it runs.
 
 A few least-squares steps on torque, with all model terms, estimate the parameters and the noise. `posterior`
-linearizes the model at the estimated parameters and computes the widths. The prediction omits slow parts of an
-identification, namely the choice of friction family and terms, iteration to convergence, replays and breakaway
-torques.
+linearizes the model at the estimated parameters and computes the widths. The prediction omits the slow parts of an
+identification: choice of friction family and terms, iteration to convergence, replays and breakaway torques.
 """
 
 from dataclasses import dataclass
@@ -50,7 +49,7 @@ class ExpectedWidths:
 def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> Problem:
     """Return the torque problem that an identification with `settings` solves, with all model terms in `settings`.
 
-    If the setting `family` is "auto", use the friction family of the nominal arm.
+    If `settings.family` is "auto", the problem uses the friction family of the nominal arm.
     """
     if settings.family != "auto":
         nominal = with_family(nominal, settings.family)
@@ -63,7 +62,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
     """Return the expected interval widths of an identification from `recording`.
 
     Raises:
-        UserError: each trajectory in the recording is too short, or a setting does not fit the arm.
+        UserError: all trajectories in the recording are too short, or a setting does not fit the arm.
     """
     used = spread(recording, USED_S)
     problem = torque_problem(robot, nominal, used, settings)

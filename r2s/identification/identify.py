@@ -1,7 +1,7 @@
 """Real2Sim: estimate the parameters with which the simulated arm reproduces a recording.
 
-`identify` runs STEPS in order. Each step computes a new `State` from the previous `State`. The paper's algorithm
-corresponds to search=ga on the replay residual, eq. (8) of the paper.
+`identify` runs STEPS in order. Each step computes a new `State` from the previous `State`. search=ga on the replay
+residual corresponds to the paper's algorithm, eq. (8).
 """
 
 import json
@@ -97,7 +97,7 @@ class State:
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
         edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
             sliding, only for friction families with a Stribeck effect.
-        refused: whether `fit` discarded the replay fit. dynamics: the fitted arm with its breakaway torques.
+        refused: whether `fit` discarded the replay fit. dynamics: of the fitted arm, with breakaway torques.
     """
 
     robot: Robot
@@ -140,7 +140,7 @@ class State:
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Predict motion after breakaway in ramps; None without ramps or Stribeck effect, or for bristle friction."""
+        """Predict motion after breakaway; None without ramps, without Stribeck effect, or for bristle friction."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)
@@ -196,7 +196,7 @@ def select_family(s: State) -> State:
 
 
 def settle_lateness(s: State) -> State:
-    """Decide whether to correct late link-side torque and dq; if torque stays as logged, set `signal_delay` to 0."""
+    """Decide whether to correct late link-side torque and dq; for uncorrected torque, set `signal_delay` to 0."""
     nominal = replace(s.nominal, late_alike=False)
     if s.recording.torque != "measured" or DELAY in s.settings.stated:
         return replace(s, nominal=nominal)
@@ -234,8 +234,8 @@ def draw_full_model(s: State) -> dict[str, np.ndarray]:
 
     Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
     compensates for a removed one, for example a payload for the error of a link's mass. The main fit's priors serve
-    prediction; if they are narrower than the scatter among arms, they narrow intervals further. For the result's
-    intervals, draws of the full and the selected model have equal weight (Hoeting et al., Stat. Sci. 14(4), 1999).
+    prediction; priors narrower than the scatter among arms narrow the intervals further. For the result's intervals,
+    draws of the full and the selected model have equal weight (Hoeting et al., Stat. Sci. 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
     u, problem = fit_torque(full.problem.with_usual_prior())
@@ -248,7 +248,7 @@ def formulate(s: State) -> State:
     how, memory = s.settings, s.nominal.family.has_memory
     settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # DELAY stays 0, see `settle_lateness`
     space = search_space(s.robot, s.nominal, how.bounds, [*s.terms, *settled], s.recording, how.stated)
-    s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # blocks need the period
+    s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # `blocks_of` needs the period
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
     edges = estimate_breakaway(s.ramps) if s.commanded and s.ramps is not None else None
@@ -293,7 +293,7 @@ def fit(s: State) -> State:
         if k and fits_torque(s.searches[0]) and problem.uses_replays and worse_on_torque(problem, u, v):
             return replace(s, problem=replace(problem, data=problem.torque_data), u=u, refused=True)
         u = v
-        # fitted=True only after a torque search or the last search: earlier replay residuals contain model error
+        # fitted=True only after a torque search or the last search: residuals of earlier replays contain model error
         problem = problem.reweighted(u, fitted=k == len(s.searches) - 1 or fits_torque(search))
     return replace(s, problem=problem, u=u)
 
@@ -333,7 +333,7 @@ def fit_presliding(s: State) -> State:
 
 
 def reweight(s: State) -> State:
-    """Repeat the last search, if it is local, with weights from the residual; decide whether to estimate a lag."""
+    """If the last search is local, repeat it with weights from the residual; decide whether to estimate a lag."""
     search = s.searches[-1]
     if not search.local:
         return s
@@ -358,7 +358,7 @@ def fit_breakaway(s: State) -> State:
     if not s.commanded or s.ramps is None:
         return replace(s, dynamics=arm)
     edges = estimate_breakaway(s.ramps, delay=float(arm.delay), lag=float(arm.lag), slide=s.slide(arm))
-    # if no ramp moved a joint, its breakaway torque is at least the largest command of its ramps plus the offset
+    # if no ramp moved a joint, the joint's breakaway torque is at least its largest ramp command plus the offset
     beyond = np.abs(edges.held + arm.offset[:, None]) > np.abs(arm.breakaway)
     command = np.where(np.isnan(edges.command) & beyond & (edges.held != 0), edges.held, edges.command)
     arm = replace(space, breakaway_command=command).dynamics(space.from_unit(s.u))

@@ -3,7 +3,7 @@
 Prior knowledge comes from an earlier identification, with any kind of torque, or from the user (stated.py). After the
 earlier identification, friction and offsets x drift by w ~ N(0, drift^2): x_now = x_then + w. The prior covariance is
 the earlier posterior covariance plus diag(drift^2), as in the prediction step of a Kalman filter (Kalman 1960). r2s
-also estimates the drift w, from the earlier posterior and the present recording.
+also estimates w from the earlier posterior and the present recording.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -16,10 +16,10 @@ from r2s.identification.link_inertia import PAYLOAD
 from r2s.identification.parameters import OF_LINKS, ParameterSpace, logarithmic, units
 from r2s.identification.posterior import Z_95
 
-BODY = (*OF_LINKS, *PAYLOAD)  # the same for all kinds of torque; friction, offsets and gains differ between kinds
+BODY = (*OF_LINKS, *PAYLOAD)  # independent of the kind of torque, unlike friction, offsets and gains
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # parameters that drift besides those of the friction law
-FLOOR = 1e-4  # least standard deviation, relative to `ParameterSpace.usual`, in case all draws lie at a bound
-# prior and data disagree if they differ by more standard deviations in the worst of about thirty directions
+FLOOR = 1e-4  # least standard deviation, relative to `ParameterSpace.usual`; needed if all draws lie at a bound
+# prior and data disagree if they differ by more standard deviations along one of about thirty axes
 FAR = 5.0
 
 
@@ -41,7 +41,7 @@ class Known:
     def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
         """Convert the values x (P,) and posterior draws (S, P) of an earlier identification into a prior.
 
-        drift: standard deviation of the change of friction, offsets and drag since the earlier identification. It is
+        drift: standard deviation of the change of friction, offsets and drag since the earlier identification,
         relative to the value or, if larger, to the standard deviation among arms (`ParameterSpace.usual`).
         """
         names, usual = space.names, space.usual
@@ -55,13 +55,13 @@ class Known:
         return Known(tuple(names), mean, covariance + np.diag(change**2), change)
 
     def where(self, kept: Callable[[str], bool]) -> "Known":
-        """Return the marginal distribution of the values for whose names `kept` returns True."""
+        """Return the marginal distribution of all values whose names satisfy `kept`."""
         at = [k for k, name in enumerate(self.names) if kept(name)]
         covariance = self.covariance[np.ix_(at, at)]
         return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
 
     def beside(self, other: "Known | None") -> "Known":
-        """Return the joint distribution with the independent prior `other`, which alone determines common values."""
+        """Return the joint distribution with the independent prior `other`; values in both follow `other` alone."""
         if other is None:
             return self
         own, k = self.where(lambda name: name not in other.names), len(other.names)
@@ -79,7 +79,7 @@ class Known:
 
 
 def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[float, str]:
-    """Return the largest deviation of x (P,) from the prior, in standard deviations, and the worst value's name.
+    """Return the largest deviation of x (P,) from the prior, in standard deviations, and the name of the worst value.
 
     Deviations are measured along the principal axes of the prior's correlation matrix.
     """

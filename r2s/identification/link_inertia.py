@@ -1,6 +1,6 @@
 """Describe a link's mass, center of mass and inertia tensor by ten parameters that are always physically consistent.
 
-Log-Cholesky parameters describe the pseudo-inertia J relative to the nominal link (Rucker and Wensing, RA-L 7(2),
+Log-Cholesky parameters describe the pseudo-inertia J relative to the nominal U0 U0^T (Rucker and Wensing, RA-L 7(2),
 2022): J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
 """
 
@@ -18,8 +18,8 @@ def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np
     """Return the pseudo-inertia [[Sigma, h], [h^T, m]] (..., 4, 4) of links about their origins.
 
     Sigma, h and m are second moment, first moment and mass (Wensing, Kim and Slotine, RA-L 3(1), 2018). The second
-    moment about the center of mass is positive definite if principal moments are positive and satisfy the triangle
-    inequality; otherwise the function increases eigenvalues that are too small.
+    moment about the center of mass is positive definite if the principal moments satisfy the triangle inequality.
+    Otherwise, the function raises its smallest eigenvalues.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)

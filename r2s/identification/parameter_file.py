@@ -65,10 +65,10 @@ def save_parameters(
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in FIXED}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
-    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; r2s does not load them
+    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for human readers only
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
-    with atomic_write(path.with_name("posterior.npz")) as part:  # before parameters.yaml, which needs it
+    with atomic_write(path.with_name("posterior.npz")) as part:  # first, as parameters.yaml needs it
         np.savez_compressed(part, names=np.array(space.names), samples=found.samples)
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
@@ -79,8 +79,8 @@ def load_parameters(
 ) -> tuple[ParameterSpace, np.ndarray]:
     """Return the parameter space and its values x (P,) from a run folder or a parameters.yaml.
 
-    trust: modules that r2s may import for a friction family, besides modules that are imported already. option: the
-    user's option that names the folder, for error messages.
+    trust: modules that r2s may import to find a friction family, besides already imported modules. option: the user's
+    option that names the folder, for error messages.
 
     Raises:
         UserError: the file is missing or damaged, belongs to another robot, or names an untrusted friction family.

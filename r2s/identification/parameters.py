@@ -25,7 +25,7 @@ OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s", "signal_delay": "s"}
 OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
 TIMING = ("delay", "lag", "signal_delay")
-# standard deviation of a parameter among arms, by unit; of torque-like ones, per Nm of tau_max; of logarithms, 1
+# standard deviation of parameters among arms, by unit. Torque-like parameters: per Nm of tau_max. Logarithms: 1
 USUAL = {"Nm": 0.02, "Nm s/rad": 0.02, "kg m^2": 0.002, "kg": 0.02, "1": 0.1, "rad/s": 0.03, "m": 0.1, "s": 2e-3}
 WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
@@ -212,8 +212,8 @@ def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequen
     """Return the space of the parameters in `bounds`, {"phi1": [low, high], ...}; a bound is a number or (n,).
 
     Raises:
-        UserError: `bounds` is empty, or names an unknown parameter, a parameter of a different friction family, or
-            both parametrizations of inertia; or low is not less than high.
+        UserError: `bounds` is empty, has low >= high, names both parametrizations of inertia, or names a parameter
+            that is unknown or of a different friction family.
     """
     family = nominal.family
     if clash := [name for name in family.names if name in OTHER_UNITS]:

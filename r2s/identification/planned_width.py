@@ -36,7 +36,7 @@ class PlannedWidths:
         robot, nominal: the arm, and the dynamics at which the identification will start.
         settings: settings of the identification; family=auto means the nominal arm's friction family.
         torque: kind of torque that will be recorded.
-        noise: standard deviation of torque noise at COARSE_HZ (independent samples), relative to tau_max.
+        noise: standard deviation of torque noise / tau_max, for independent samples at COARSE_HZ.
         chosen: names of the parameters, such as "offset" or "offset[3]", that `score` considers; an empty sequence
             means all parameters.
 
@@ -102,7 +102,7 @@ class PlannedWidths:
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return scores (B,) of candidates for the next motion: minus mean log interval width of chosen values."""
+        """Return scores (B,) of candidates for the next motion: -mean(log(interval width)) of the chosen values."""
         some = slice(None, None, 1 + len(t) // MOST_ROWS)
         information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
         return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)

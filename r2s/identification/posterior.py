@@ -43,9 +43,9 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     blocks. The mean is not 0 if the fit is at a bound. If there are few blocks, the fit makes each block's residual
     too small; a factor from the block's share of the information corrects the score (CR2 of Bell and McCaffrey,
     Survey Methodology 28(2), 2002). For few blocks, Student's t widens the draws. If one block alone determines a
-    direction, the scatter of the scores underestimates the variance in this direction, so the covariance is at least
-    that for independent rows. A bootstrap over blocks would yield unrealistic tails if few blocks determine a value,
-    because many bootstrap samples would lack these blocks.
+    direction, the scatter of the scores underestimates the variance in this direction. The returned covariance is
+    therefore at least that of independent rows. A bootstrap over blocks would yield unrealistic tails if few blocks
+    determine a value, because many bootstrap samples would lack these blocks.
     """
     gram, score, prior, factor = _sums(problem, u)
     information, few = gram.sum(0), max(len(gram) - 1, 1)
@@ -58,7 +58,7 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     least, robust = (covariance @ _root(m + prior) for m in (factor**2 * information, score.T @ score))
     normal = np.random.default_rng(seed).standard_normal((DRAWS, len(u)))
     normal -= normal.mean(0)
-    normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / DRAWS), normal.T).T  # sample covariance exactly 1
+    normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / DRAWS), normal.T).T  # its covariance is exactly I
     steps = normal @ _at_least(least, robust).T
     return Posterior(u, inside_cube(u, steps, information + prior), information)
 
@@ -66,8 +66,8 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
 def _root(matrix: np.ndarray) -> np.ndarray:
     """Return a square root (P, P) of a positive matrix, also if rounding made it indefinite.
 
-    Rounding matters for noise-free recordings: their information exceeds that of a wide prior by more than floats
-    resolve.
+    Rounding matters for noise-free recordings, whose information exceeds that of a wide prior by more than float
+    precision.
     """
     try:
         return np.linalg.cholesky(matrix)
@@ -114,16 +114,17 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
             some = np.flatnonzero(own == block)
             gram[block] += j[some].T @ j[some]
             score[block] += j[some].T @ r[some]
-        counts = j.any(1)  # without padding rows, whose residual and slope are 0
+        counts = j.any(1)  # padding rows, with residual and slope 0, do not count
         square, seen = square + float((r[counts] ** 2).sum()), seen + int(counts.sum())
     prior += np.diag(np.where(prior.any(0), 0.0, FLAT))  # flat priors have no rows
     return gram, score, prior, float(np.sqrt(max(1.0, square / max(seen, 1))))
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Return a square root (P, P) of the larger of root root^T and least least^T in every direction.
+    """Return a square root (P, P) of root root^T, increased in all directions in which least least^T is larger.
 
-    Comparing single values would fail, because data can determine the sum of two values far better than each value.
+    Comparing variances of single values would not suffice, because data can determine the sum of two values far
+    better than each value.
     """
     axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
     return least @ (axes * np.maximum(seen, 1.0))
@@ -132,9 +133,9 @@ def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
 def inside_cube(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return `steps` (S, P) with values changed so that u + steps lies in the unit cube.
 
-    Values outside the cube are clipped. Values inside the cube are adapted to minimize the sum of squares with
-    Hessian 2 h (P, P). Without this adaptation, sums of correlated values would be biased, for example an offset plus
-    an asymmetry at its bound. The value farthest outside is clipped first, because the adaptation often moves
+    The function clips values outside the cube, and changes values inside the cube to minimize the sum of squares,
+    whose Hessian is 2 h (P, P). Without this change, sums of correlated values would be biased, for example an offset
+    plus an asymmetry at its bound. The value farthest outside is clipped first, because the change often moves
     correlated values into the cube.
     """
     steps = steps.copy()

@@ -12,8 +12,8 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 HORIZONS = (0.1, 0.5, 2.0)  # s, horizons of open-loop prediction
-SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording used to compare torque: in total; in each part
-REPLAYED_S = 240.0  # s of a longer recording that are replayed
+SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s, most that is compared in torque: in total; in each part of a recording
+REPLAYED_S = 240.0  # s, most that is replayed of a recording
 MAX_WINDOWS = 100  # per horizon
 
 
@@ -30,9 +30,8 @@ def prediction_errors(
     """Return the errors of the identified and the nominal arm on a recording, as an entry of summary.json.
 
     The entry of summary.json contains the torque RMSE of each joint. For commanded torque, the entry also contains
-    position_rmse_mrad from replays of `window_s` s, and ee_error_mm from `open_loop_error` for each of the HORIZONS
-    that is shorter than the longest trajectory. Of a long recording, r2s evaluates parts spread over the whole
-    length.
+    position_rmse_mrad from replays of `window_s` s, and ee_error_mm from `open_loop_error`. HORIZONS longer than all
+    trajectories are omitted. Of a long recording, r2s evaluates parts spread over the whole length.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}

@@ -22,10 +22,10 @@ FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bound
 # to 36 in wrong minima. On a physical Panda, where the fit from narrow priors predicts better, it is 1.0 to 1.2.
 CLEARLY = 2.0
 TAIL = 25.0  # Student's t, the prior for link-side torque, has TAIL - 1 degrees of freedom
-# implicit friction: least significance of its effect in standard deviations; range of actual over expected size
+# effect of implicit friction: least size in standard deviations; range of actual size / expected size
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
 ALIKE = 0.2  # relative uncertainty of the number of independent rows, and therefore of a sum of squares
-ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; motor torque needs more: nominal friction may be off by tens of Nm
+ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; more for motor torque, as nominal friction may err by tens of Nm
 FIT_STEPS, FIT_FTOL = 12, 1e-3  # most Jacobians in a fit; relative decrease of cost per step below which a fit ends
 Report = Callable[[dict], None]
 
@@ -113,7 +113,7 @@ class Problem:
 
     @property
     def is_fixed(self) -> np.ndarray:
-        """(P,) whether `fixed` set a value's prior, tested by equality, because users' priors may be narrower."""
+        """(P,) whether `fixed` set a value's prior; tested by equality, because a user may set narrower priors."""
         return self.sigma == FIXED * self.space.width
 
     def fixed(self, at: np.ndarray) -> "Problem":
@@ -133,7 +133,7 @@ class Problem:
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
-        """Return the problem with a new torque residual; it also replaces `data` unless that is a replay residual."""
+        """Return the problem with a new torque residual, which also replaces `data` unless `data` is from replays."""
         return replace(self, data=self.data if self.uses_replays else torque_data, torque_data=torque_data)
 
     def torque_reweighted(self, u: np.ndarray) -> "Problem":
@@ -181,8 +181,8 @@ class Problem:
     def _prior(self, u: np.ndarray) -> np.ndarray:
         prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
         if self.at_link:
-            # heavy tails as in Student's t (Lange et al., J. Am. Stat. Assoc. 84(408), 1989): data that clearly
-            # contradict a narrow prior outweigh it, while the prior is normal near the nominal value
+            # heavy tails as in Student's t (Lange et al., J. Am. Stat. Assoc. 84(408), 1989): near the nominal value,
+            # the prior is normal; far from the nominal value, data outweigh a narrow prior
             heavy = np.sign(prior) * np.sqrt(TAIL * np.log1p(prior**2 / TAIL))
             prior = np.where(self.is_fixed, prior, heavy)
         return np.concatenate([prior, *(extra.residual(self.space, x) for extra in self.extra)], axis=1)
@@ -234,7 +234,8 @@ def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solv
     weights, which come from the nominal arm, a fit may keep cable torque near zero and distort friction. If `start`
     is nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
     problem's priors. r2s uses the second fit if it is more likely than the first and clearly lowers the error of a
-    joint. Unmodeled effects may also make the second fit more likely, but hardly lower its error.
+    joint. Both conditions are necessary: unmodeled effects may make the second fit more likely, but hardly lower its
+    error.
     """
     u, last = _rounds(problem, start, rounds, solve)
     wide = problem.with_usual_prior() if problem.at_link and np.array_equal(start, problem.start) else problem
@@ -259,8 +260,8 @@ def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray
     """Return whether u (P,) has a larger posterior density than v (P,), and a clearly smaller error in some joint.
 
     The two solutions u and v have different torque noise sigma. A joint's log likelihood is -N log sigma, with N
-    independent rows and torque noise sigma. A wrong model lengthens the correlation of errors. The shorter
-    correlation length of the two solutions therefore determines the number of independent rows.
+    independent rows and torque noise sigma. Because a wrong model lengthens the correlation of errors, the shorter
+    correlation length of the two solutions determines N.
     """
     (length, sigma), (longer, larger) = (
         p.torque_data.noise_at(p.space.from_unit(x)) for p, x in ((one, u), (other, v))
@@ -273,9 +274,8 @@ def _clearly_likelier(one: Problem, u: np.ndarray, other: Problem, v: np.ndarray
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     """Return whether values v (P,) explain the torque clearly worse than values u (P,) that were fitted to torque.
 
-    Even if the values v are correct, their estimation error raises the sum of squares by about P, the number of
-    values. The sum of squares has the relative uncertainty ALIKE, because the number of independent rows is
-    uncertain.
+    Even if v is correct, its estimation error raises the sum of squares by about P, the number of values. The sum of
+    squares has the relative uncertainty ALIKE, because the number of independent rows is uncertain.
     """
     fitted = problem.on_torque.cost(u)
     rise = problem.on_torque.cost(v) - fitted
@@ -295,7 +295,7 @@ def search_lag(at: np.ndarray, search: Search, problem: Problem, start: np.ndarr
     u = search(fixed, u, report)
     if fits_torque(search):
         fixed = fixed.torque_reweighted(u)
-    u[at] = problem.start[at]  # exactly the start value: `reweight` recognizes a fixed lag by this equality
+    u[at] = problem.start[at]  # `reweight` recognizes a fixed lag by equality with the start value
     fixed_squares, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
     most = np.bincount(problem.clusters, (fixed_squares - having)[:rows]).max()
     needed = fixed_squares.sum() - having.sum() - most > np.log(rows)
@@ -305,10 +305,10 @@ def search_lag(at: np.ndarray, search: Search, problem: Problem, start: np.ndarr
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
     """Return whether the recording comes from a simulator with implicit friction, given a torque fit u (P,).
 
-    If friction rises with speed, implicit integration evaluates friction at the velocity half a step ahead; a
+    Where friction rises with speed, implicit integration uses the friction at the velocity half a step later; a
     physical arm does not. The effect of implicit friction must exceed `significant` standard deviations and have
-    about the expected size, because a rotor inertia missing in the model has a similar effect that is a hundred times
-    larger.
+    about the expected size. The test of size is necessary, because a rotor inertia missing in the model has a similar
+    but a hundred times larger effect.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]
@@ -320,6 +320,6 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
         row, products, hessian = row + len(own), products + j.T @ both, hessian + j.T @ j
     gradient, slope = np.asarray(products).T
     best = np.linalg.lstsq(hessian, slope, rcond=None)[0]
-    size = moved @ moved - best @ slope  # square of the part of the effect that no parameter explains
+    size = moved @ moved - best @ slope  # squared effect of implicit friction that no parameter explains
     share = -(moved @ r - best @ gradient) / size
     return bool(EXPECTED[0] < share < EXPECTED[1] and share * np.sqrt(size) > significant)

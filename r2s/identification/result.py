@@ -15,9 +15,9 @@ from r2s.identification.problem import Problem
 from r2s.physics.dynamics import Dynamics
 
 EDGE = 5e-4  # a value closer to a bound than this share of its range is at the bound
-RIDGE = 1e-6  # information added to every value on the unit cube, as some values have a flat prior and no data
+RIDGE = 1e-6  # information added to every value on the unit cube, because some values have neither prior nor data
 UNSEEN = 0.9  # ratio of posterior to prior sigma, above which the data hardly determine a value
-SHARPER = 4.0  # a value is identifiable if half its 95 % interval is less than its prior's sigma divided by this
+SHARPER = 4.0  # a value is identifiable if half its 95 % interval is less than the prior's sigma / SHARPER
 NULL_SHARE = 0.5  # ratio of posterior to prior sigma, above which the prior determines a direction
 LISTED_PARTS, LEAST_PART = 6, 0.2  # most values listed per null direction; least component of a listed value
 
@@ -61,7 +61,7 @@ class IdentificationResult:
 
     @property
     def at_bounds(self) -> list[str]:
-        """One message for each value that lies at a nonzero search bound, which may be too narrow."""
+        """One message for each value at a nonzero search bound, because the bound may be too narrow."""
         s, u, unit, lines = self.space, self.space.to_unit(self.found.x), units(), []
         for block in s.blocks:
             for k, at in enumerate(s.where(block)):
@@ -91,8 +91,8 @@ class IdentificationResult:
         """Parameter space and estimate for parameters.yaml, with breakaway torques if ramps were recorded.
 
         The interval of a breakaway torque combines Student's t (friction/repeatability.py) with the uncertainty of
-        the offset. If no ramp moved a joint, the breakaway torque is not identifiable: the interval extends from the
-        largest torque without motion to the bound, and all posterior draws equal the estimate.
+        the offset. If no ramp moved a joint, the breakaway torque is not identifiable. Its interval then extends from
+        the largest torque without motion to the bound, and all posterior draws equal the estimate.
         """
         if self.edges is None:
             return self.space, self.found
@@ -113,7 +113,7 @@ class IdentificationResult:
         limit = np.maximum(self.space.robot.tau_max, np.abs([x, low, high]).max((0, 2)))
         low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -limit), np.minimum(high[:, 0], 0.0)
         high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], limit), np.maximum(low[:, 1], 0.0)
-        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # breakaway has no prior; half the dead zone replaces its sigma
+        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone, in place of a prior's sigma
         columns = [[a[..., 0], a[..., 1]] for a in (x, low, high, got & (half < zone / SHARPER), edges)]
         own = f.x, f.low, f.high, f.identifiable, f.samples
         space = replace(
@@ -154,7 +154,7 @@ def conclude(
     seen = inside & (-0.5 * (low + high) < prior / SHARPER)
     ends = space.from_unit(u + low), space.from_unit(u - high)
     found = ParameterEstimate(space.from_unit(u), *ends, seen, space.from_unit(u + steps))
-    # in units of the prior's sigma, a direction without information from the data has an eigenvalue of 1
+    # in units of the prior's sigma, the information along a direction without data has the eigenvalue 1
     h = h + np.diag(np.where(np.isinf(problem.sigma), prior**-2.0, 0.0))
     free = [k for k, name in enumerate(space.names) if name not in space.fixed]
     searched = [space.names[k] for k in free]

@@ -27,7 +27,8 @@ class Settings:
         stride: ms, averaging time of angles in the replay residual; used only with commanded torque.
         cutoff_hz: cutoff of the zero-phase filter for torque.
         breakaway: largest breakaway torque, relative to the identified friction, in the scan that replaces missing
-            ramps for commanded torque. If None, r2s does not scan, and breakaway torques stay nominal without ramps.
+            ramps for commanded torque. If None, r2s does not scan; without ramps, breakaway torques then stay
+            nominal.
         folds: number of folds of the cross-validation within the recording.
         candidate_terms: terms to add if they improve prediction of held-out torque; `link` replaces `inertia_scale`.
         prunable_terms: terms to remove if the model predicts held-out torque equally well without them.

@@ -41,7 +41,7 @@ def check_stated(stated: Stated, n: int | None = None) -> None:
 
 
 def check_family(stated: Stated, name: str) -> None:
-    """Raise UserError if the user gives a friction parameter that family `name` lacks or, for auto, might lack."""
+    """Raise UserError for a friction parameter that family `name` lacks; for auto, for any friction parameter."""
     known = {own for f in known_families() for own in f.names}
     for parameter in stated:
         if parameter not in known or (name != "auto" and parameter in family(name).names):

@@ -12,11 +12,11 @@ from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia, nominal_torque, regressor
 from r2s.physics.robot import Robot
 
-# least factor of a reported mass error; largest share of the misfit that a correction leaves
+# least factor by which a reported mass is wrong; largest share of the misfit after a valid correction
 MASS, MASS_LEFT = 3.0, 0.1
 CARRIED = 3  # number of last links whose mass is not judged, because a payload may be undeclared
 TILTED = np.radians(20)  # least reported angle of a mounting; uncertain masses can cause smaller fitted angles
-INERTIA = 0.3, 4.0  # allowed factor of the nominal torque: errors of tensors, payloads, sensor gains
+INERTIA = 0.3, 4.0  # range of the factor on nominal torque, for errors of tensors, payloads and gains
 FRICTION, OFFSET = 0.5, 0.1  # largest fitted friction and offset, relative to tau_max
 MAX_LEFT = 2.0  # upper limit of a joint's unexplained share
 # Only joints in which gravity changes are judged. CHANGES: least RMS change, relative to tau_max. CORRELATED: factor
@@ -69,7 +69,7 @@ class Unexplained:
         return np.array(factors), left / whole
 
     def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return K torques / tau_max (T, K) of each judged joint, minus fitted friction and offset."""
+        """Return, for each judged joint, K torques / tau_max (T, K) minus fitted friction and offset."""
         out = []
         for j in self.seen.tolist():
             own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
@@ -78,7 +78,7 @@ class Unexplained:
         return out
 
     def gravity_shares(self) -> np.ndarray | None:
-        """Return gravity in tau / nominal gravity for joints whose motion determines this ratio; None without any."""
+        """Return tau's gravity torque / nominal gravity torque of joints whose motion determines it, else None."""
         inertial = self.inverse_dynamics(False)
         weight, shares = self.inverse_dynamics(True) - inertial, []
         for j in self.seen:
@@ -114,7 +114,7 @@ class Unexplained:
 
 
 def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
-    """Return (misfit, message) of tau or all signals in other joint orders: by name, rotated, reversed, swapped."""
+    """Return (misfit, message) for joint orders of tau or of all signals: by name, rotated, reversed, swapped."""
     robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}

@@ -1,9 +1,9 @@
 """Check a recording's units, signs, joint order, gravity and clock against the arm's model.
 
 r2s compares dq with the slope of q, the integral of dq with q (r2s/recordings/clock.py), and tau with nominal torque.
-The checks accept nominal torque that is wrong by a factor of 3, an undeclared payload, any friction, and sensor
-offsets. The checks refuse a signal that is wrong by a factor of 1000, 57.3 or -1, and a wrong joint order or
-mounting. Most checks refuse a recording only if correcting one error removes at least three quarters of the misfit.
+The checks accept errors of nominal torque by a factor of 3, undeclared payloads, any friction, and sensor offsets.
+The checks refuse signals that are wrong by a factor of 1000, 57.3 or -1, and a wrong joint order or mounting. Most
+checks refuse a recording only if correcting one error removes at least three quarters of the misfit.
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,22 @@ from r2s.recordings.clock import check_clock
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
-# low-pass cutoff; rate, most and fewest of the compared rows
+# low-pass cutoff; rows per second, largest and least number of compared rows
 CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15
 EDGE = 100  # ms, removed from both ends of a trajectory, where the filter has transients
-# s examined in a long recording: for units; for the clock, total and per part
+# s, longest examined part of a recording: for units; for the clock, in total and per part
 JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0
 SLOWEST_HZ = 5.0  # sampling rate below which only the clock is judged
 MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
 STILL = 0.02  # rad, range of a joint up to which the joint is treated as at rest
-# largest accepted unexplained share; largest fraction of this share that a valid correction leaves
+# a signal is refused above this unexplained share; a valid correction leaves at most this fraction of the share
 REFUSED, CORRECTED = 0.5, 0.25
 SUSPECT = 0.3  # misfit above which other joint orders are tested; correct recordings had 0.006 to 0.21
 TURNED = 0.05  # misfit above which other mountings are tested; a valid mounting leaves at most MASS_LEFT of it
 HELD = 0.05  # a joint whose RMS nominal torque exceeds this share of tau_max is judged even at rest
-HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # share of nominal gravity in tau: range if tau has gravity; limit if not
-CURRENT = 0.005  # A/Nm, least ratio of a current to torque: no arm's joint has 200 Nm/A
+# tau's gravity torque / nominal gravity torque: range for tau with gravity; largest value for tau without gravity
+HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3
+CURRENT = 0.005  # A/Nm, least current / torque, because no joint of an arm yields 200 Nm/A
 OVER_LIMIT = 3.0  # largest allowed torque over tau_max
 RATIO = 4.0  # dq is refused if its ratio to the slope of q is above RATIO or below 1 / RATIO
 UNITS = {"tau": {1e3: "mNm", 1e-3: "kNm"}, "dq": {np.degrees(1): "deg/s", 1e3: "mrad/s", np.radians(1): "", 1e-3: ""}}
@@ -150,7 +151,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return joints that other columns fit far better, and the columns; else None. pairs: misfit [joint, column]."""
+    """Return joints that other columns fit far better, with the columns, or None. pairs: misfit [joint, column]."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():
@@ -219,7 +220,7 @@ def _check_torque(
                 "data.torque=motor and data.torque_constant=[Nm/A of each joint, gear included]",
             )
         raise DataError(GRAVITY, f"{tau} hardly contains gravity {mean}: is it data.torque=commanded?")
-    # with an undeclared payload, shares would differ between joints
+    # an undeclared payload would make shares differ between joints
     if not gravity and shares.min() > HAS_GRAVITY[0] and shares.max() < HAS_GRAVITY[1]:
         raise DataError(GRAVITY, f"{tau} contains gravity {mean}: is it data.torque=measured?")
     return misfit, shares

@@ -26,21 +26,22 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 PASS, WARN, FAIL, OPEN = "pass", "warn", "fail", "-"  # OPEN: not judged
-# least deviation of an uneven step, relative to the median; allowed share of uneven steps
+# a step that deviates from the median by more than this share is uneven; allowed share of uneven steps
 UNEVEN, UNEVEN_SHARE = 0.5, 0.05
 OFF_CLOCK = 0.03  # largest error of dq's scale; filters and elastic gears cause 1 to 2 % (recordings/clock.py)
 LATE_S = 1e-3  # s; lateness below this or, if longer, half a row period causes no warning
-SURE = 2.0  # standard deviations, half-width of the shown interval of lateness
-LOADED = 0.7, 1.4  # range of gravity's share without an undeclared load: masses in files are accurate to a third
-SPEEDS_S = 600.0  # s, length of the part of a longer recording whose speeds are examined
+SURE = 2.0  # half-width of the displayed interval of lateness, in standard deviations
+# tau's gravity torque / nominal gravity torque without undeclared load; masses in files err by up to a third
+LOADED = 0.7, 1.4
+SPEEDS_S = 600.0  # s, longest part of a recording whose speeds are examined
 FAST, SLOW = 0.2, 0.05  # relative to dq_max; a friction curve needs speeds from below SLOW to above FAST
-# least shares of a joint's moving rows: rows slower than SLOW; rows in each direction
+# of the rows in which a joint moves: least share slower than SLOW; least share in each direction
 LEAST_SLOW, LEAST_WAY = 0.01, 0.1
 
 
 @dataclass(frozen=True)
 class Line:
-    """Result of a check: verdict, finding, advice, and the measured values by name (arrays: one value per joint)."""
+    """Result of a check: verdict, finding, advice, and measured values by name (an array has one value per joint)."""
 
     check: str
     verdict: str

@@ -1,1 +1,1 @@
-"""Train and evaluate policies: environment, domain randomization, algorithms (one per file) and training loop."""
+"""Train and evaluate policies: simulate tasks, randomize dynamics, update networks (one algorithm per file)."""

@@ -18,14 +18,13 @@ RANGES = "mass", "table", "friction", "damping", "bristle"
 class BoxRandomization(UniformRandomization):
     """Draw random arms from `UniformRandomization` and a random box for each arm.
 
-    Mass and stiffness of the box are log-uniform; its other parameters are uniform. The initial pose of the box
-    deviates from the nominal pose by x, y ~ U(-spread, spread) and a rotation of U(-yaw, yaw) about the table's
-    normal.
+    Mass and stiffness of the box are log-uniform; its other parameters are uniform. The box's initial pose deviates
+    from the nominal pose by U(-spread, spread) in x and in y, and by U(-yaw, yaw) in yaw.
 
     Attributes:
-        table, friction: ranges [least, most] of the friction coefficient between box and table, and between box and
-            tip. mass (kg), stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`. size:
-            (3,) m, edges of the box.
+        table, friction: ranges [least, most] of the friction coefficients box on table, and tip on box. mass (kg),
+            stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`. size: (3,) m, edges of
+            the box.
         spread, yaw: m and degrees, largest deviation of the box from its nominal pose.
         point, normal: point (3,) m and normal (3,) of the table; if None, see `table_frame`.
 
@@ -51,7 +50,7 @@ class BoxRandomization(UniformRandomization):
 
     def __post_init__(self):
         super().__post_init__()
-        _ = self._frame  # raises for wrong settings
+        _ = self._frame  # raises UserError for wrong settings
         for name in ("stiffness", *RANGES):
             check_pair(name, getattr(self, name), "(0, inf)" if name in ("mass", "stiffness") else "[0, inf)")
         check_size("dr.size", self.size, self.table[1])

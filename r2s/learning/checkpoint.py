@@ -1,9 +1,10 @@
 """Checkpoints of a training: the state in one file, and the transitions of the replay buffer in files called chunks.
 
 Each checkpoint writes one chunk: the transitions added since the previous checkpoint. The state file lists the chunks
-of the checkpoint, so an interrupted write does not damage the previous checkpoint. r2s deletes a chunk once the
-replay buffer has overwritten all its transitions, so the oldest chunk can contain some overwritten transitions. All
-files contain only tensors, numbers and names, so torch.load(weights_only=True) can read the files.
+of the checkpoint and is replaced last, so an interrupted write does not damage the previous checkpoint. r2s deletes a
+chunk when the replay buffer has overwritten all transitions of the chunk. The oldest chunk can therefore contain some
+overwritten transitions. All files contain only tensors, numbers and names, so torch.load(weights_only=True) can read
+the files.
 """
 
 import errno
@@ -47,7 +48,7 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill the empty buffer `replay` with the saved transitions; return the state, or None without a checkpoint.
 
-        Each transition returns to its row of the buffer, so a resumed training draws the same batches as an
+        Each transition gets its previous row of the buffer, so a resumed training draws the same batches as an
         uninterrupted training.
 
         Raises:

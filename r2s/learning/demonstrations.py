@@ -1,7 +1,8 @@
 """Demonstrations: a model-based controller with noise fills the replay buffer before the first update.
 
 Off-policy learners can learn from any good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random
-torques hardly ever stop an arm at the goal. A controller reaches the goal, and noise varies the motion.
+torques hardly ever stop an arm at the goal. A controller reaches the goal, and noise on its actions varies the
+motion.
 """
 
 import math
@@ -16,12 +17,12 @@ from r2s.physics.robot import Robot
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.task import Task
 
-NOISE = 0.3  # standard deviation of the last arm's noise; the first value tried, on development seeds 0 to 2 of reach
+NOISE = 0.3  # standard deviation of the last arm's noise; the first value tried, with seeds 0 to 2 of task=reach
 KEPT = 0.9  # correlation of the noise between successive steps; white noise hardly moves an arm
 
 
 class Demonstrator:
-    """A model-based controller with action noise of standard deviation 0 (first arm) to NOISE (last arm).
+    """A model-based controller with action noise; the standard deviation rises from 0 (first arm) to NOISE (last).
 
     Attributes:
         at_zero: whether all actions of `reference` are zero, so that a policy with zero actions acts like

@@ -1,4 +1,4 @@
-"""A task as a batch-locked TorchRL environment on simulated arms.
+"""A task as a TorchRL environment with a fixed number of simulated arms.
 
 In a step, the task's controller converts actions to commands, and the arms run one control period (vector_arms.py).
 Episodes are truncated and never terminate, so critics bootstrap from the last observation of an episode.
@@ -21,7 +21,7 @@ from r2s.physics.robot import Robot
 from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State, Task, observation_scale, observe
 
-GROUPS = 8  # number of groups of arms that reset together; a reset of four arms hardly takes longer than of one
+GROUPS = 8  # number of groups of arms that reset together; four arms reset almost as fast as one
 
 
 class TaskEnv(EnvBase):
@@ -35,7 +35,7 @@ class TaskEnv(EnvBase):
         draw: domain randomization, called at every reset; a `Pushes` object also applies joint torques at every step.
         nsim: number of arms. nthread: number of threads; 0: all cores.
         seed: seed of goals, start postures and dynamics.
-        stagger: whether the first episodes end at a different time in each of GROUPS groups of arms.
+        stagger: whether the first episodes end at GROUPS different times, one for each group of arms.
         reward: reward terms and weights; None selects the terms and `paper_weights` of the task.
     """
 
@@ -61,12 +61,12 @@ class TaskEnv(EnvBase):
         first = self._drawn(nsim)
         self.arms = self.arms_type(robot, task, first, nsim, nthread, seed=of_noise)
         self.reward, self.control = reward or Reward(), task.control(robot)
-        self.reward.terms(task)  # raises if the reward does not fit the task
+        self.reward.terms(task)  # raises UserError if the reward does not fit the task
         self.weights = self.reward.weights(task, 0.0)
         self._factor = self.reward.factor  # `set_progress` changes this factor
         self._seen, self._seen_steps = np.zeros_like(self.weights), 0
         self._torque = task.torque_limit(robot)
-        self._staggered = self._stagger = stagger  # the argument; whether the next reset staggers episodes
+        self._staggered = self._stagger = stagger  # argument `stagger`; whether the next reset staggers
         self._pool = task.goals(robot, np.random.default_rng(of_goals), task.pool)
         self.goal = np.zeros((nsim, *self._pool.shape[1:]))
         self._dq, self._count = np.zeros((nsim, robot.n)), np.zeros(nsim, dtype=np.int64)
@@ -84,7 +84,7 @@ class TaskEnv(EnvBase):
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
 
     def set_progress(self, progress: float) -> None:
-        """Set the reward weights for `progress`: the used share (0 to 1) of the budget of an external training loop.
+        """Set the reward weights for an external training loop; progress: used share (0 to 1) of its budget.
 
         As in r2s's `train`, `Reward.adapt` adapts the weights to the mean reward terms since the last call.
         """
@@ -132,8 +132,7 @@ class TaskEnv(EnvBase):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Run one step, reset truncated episodes, and return the step and the initial state of the next step.
 
-        `EnvBase.step_and_maybe_reset` also checks and copies tensors, which takes a fifth of a step's time with 32
-        arms.
+        The method of `EnvBase` also checks and copies tensors; with 32 arms, this takes a fifth of a step's time.
         """
         after = self._step(tensordict)
         tensordict.set("next", after)

@@ -1,8 +1,8 @@
-"""Evaluation in simulation: 200 deterministic episodes, the same for every policy.
+"""Evaluation in simulation: 200 episodes without exploration noise, the same for every policy.
 
-A seed determines goals, start postures and dynamics of the episodes. Episodes of the seed SELECTION determine the
-best policy of a training run. Episodes of the seed REPORT yield the reported results and select no policy. REPORT was
-used to choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
+A seed determines goals, start postures and dynamics of the episodes. Episodes of the seed SELECTION select the best
+policy of a training run. Episodes of the seed REPORT yield the reported results and select no policy. REPORT was used
+to choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def fixed_draws(draw: Draw, count: int, seed: int = REPORT) -> Dynamics:
 def make_evaluation(
     robot: Robot, task: Task, draw: Draw, *, episodes: int = 200, nthread: int = 0, seed: int = REPORT
 ) -> Callable[[PolicyLike], Episodes]:
-    """Return a function policy -> Episodes, which runs the fixed episodes in parallel on arms with random dynamics.
+    """Return a function that runs a policy in the fixed episodes, in parallel, and returns the `Episodes`.
 
     The function raises FloatingPointError if an action or a reward is not finite.
     """

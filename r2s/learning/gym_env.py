@@ -1,7 +1,7 @@
 """A task as Gymnasium environments: `ArmVectorEnv` for a batch of simulated arms, `ArmEnv` for a single arm.
 
 Each arm of a batch has its own random generator, so arm i runs the same episodes as an `ArmEnv` with arm i's seed.
-Observations are normalized with the scales of the task, as in r2s's policies.
+Observations are normalized with the task's fixed mean and standard deviation, as in r2s's policies.
 """
 
 from typing import Any
@@ -26,7 +26,7 @@ SEEDS = 2**63  # all episode seeds are below this number
 
 
 class SeparateArms(VectorArms):
-    """`VectorArms` with one random generator per arm, in `streams`, for sensor noise and the torques of `Pushes`."""
+    """`VectorArms` with a random generator for each arm (`streams`), for sensor noise and the torques of `Pushes`."""
 
     def seed(self, seed: int | np.random.SeedSequence) -> None:
         """Restart the random generators of all arms from `seed`."""
@@ -70,8 +70,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
         num_envs: number of arms. nthread: number of threads; 0: all cores.
-        reward: reward terms and weights, see `TaskEnv`; weights keep their initial values until the first call of
-            `set_progress`.
+        reward: reward terms and weights, see `TaskEnv`; only `set_progress` changes the weights.
         autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
 
     Raises:
@@ -138,7 +137,7 @@ class ArmVectorEnv(gym.vector.VectorEnv):
             UserError: the actions have a wrong shape, or an episode has ended and automatic resets are disabled.
             FloatingPointError: an action is not finite.
         """
-        waiting = self.ended.copy()  # arms that NextStep resets in this step; r2s drops the results of their actions
+        waiting = self.ended.copy()  # arms that NextStep resets in this step; their actions have no effect
         if waiting.any() and self.mode == AutoresetMode.DISABLED:
             raise UserError(f"step: the episode of arm {waiting.argmax()} has ended; reset it first")
         action = np.asarray(actions, dtype=np.float32)

@@ -21,7 +21,8 @@ class Learner(nn.Module, ABC):
     """An off-policy actor-critic algorithm.
 
     The training loop calls `explore`, `update`, `set_lr`, `policy`, `state_dict` and `load_state_dict`. The state
-    dict includes the optimizer and the number of updates, so a restored learner continues bit for bit.
+    dict includes the optimizer and the number of updates, so a restored learner continues with equal results, bit for
+    bit.
 
     Args:
         scale: mean and standard deviation (d,) that normalize an observation.
@@ -41,7 +42,7 @@ class Learner(nn.Module, ABC):
     """
 
     action_scale: Tensor
-    compiled: tuple[str, ...] = ("gradients",)  # methods to compile: those that compute the most
+    compiled: tuple[str, ...] = ("gradients",)  # the methods that `compile` compiles: the slowest ones
 
     def __init__(
         self,
@@ -117,7 +118,7 @@ class Learner(nn.Module, ABC):
 
     @property
     def policy(self) -> Policy:
-        """The deterministic policy, which shares the weights of this learner."""
+        """The deterministic policy, whose networks are those of this learner."""
         return Policy(self.normalizer, self.actor, self.action_scale)
 
     def set_lr(self, share: float) -> None:
@@ -174,7 +175,7 @@ class Learner(nn.Module, ABC):
             for name, method in eager.items():
                 setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
             traced = dynamo.patch(trace_autograd_ops=True)  # the graph contains torch.autograd.grad
-            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # this update draws noise
+            with traced, inductor.patch(workers), torch.random.fork_rng(devices):  # the update draws noise
                 self.update(batch)
         except RuntimeError as error:
             why = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -251,7 +252,7 @@ class EntropyLearner(Learner):
     Args:
         scale, action_scale, critics, shared: see `Learner`.
         alpha_init: initial temperature. target_entropy: desired entropy of the policy; if None, minus the number of
-            values in an action.
+            action components.
     """
 
     entropy_goal: Tensor
@@ -277,7 +278,7 @@ class EntropyLearner(Learner):
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     def set_exploration(self, share: float) -> None:
-        """Change the target entropy by n log(share), as scaling a Gaussian in R^n by `share` changes its entropy."""
+        """Add n log(share) to the target entropy: the entropy change of a Gaussian in R^n scaled by `share`."""
         super().set_exploration(share)
         self.entropy_goal.fill_(self.target_entropy + len(self.action_scale) * math.log(share))
 
@@ -313,7 +314,8 @@ class EntropyLearner(Learner):
 def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
     """Return the action tanh(loc + scale * noise) (B, a) and the log-density (B,) of the action; noise ~ N(0, 1).
 
-    With the identity log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)), the density is finite where tanh saturates.
+    The identity log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) avoids an infinite log-density where tanh
+    saturates.
     """
     loc, scale = gaussian
     x = loc + scale * noise

@@ -25,7 +25,7 @@ PEAK = 1.875  # peak speed / mean speed of a minimum-jerk motion (15 / 8)
 
 
 class Oracle:
-    """A policy for B arms, with the interface of `Policy`: minimum-jerk motion under computed torque.
+    """A baseline for B arms, with the interface of `Policy`: computed torque tracks a minimum-jerk joint motion.
 
     Args:
         robot, task: the arm and its task with control=torque. dynamics: dynamics of one arm, for computed torque.
@@ -48,7 +48,7 @@ class Oracle:
 
     @torch.no_grad()
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d); an arm with zero effort begins a new motion."""
+        """Return actions (B, n) in [-1, 1] for observations (B, d); zero effort marks a new episode."""
         rows, n = observation.numpy().astype(np.float64), self.robot.n
         out = np.empty((len(rows), n))
         for i, row in enumerate(rows):
@@ -75,7 +75,7 @@ class Oracle:
     def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
         """Return joint angles (n,) rad near `start`, within limits, that bring the end effector to `goal` (3,) m.
 
-        Damped least squares solves the kinematics. Joints whose friction exceeds the torque limit do not move.
+        Damped least squares moves only the joints whose friction is below the torque limit.
         """
         q, jacobian = start.copy(), np.empty((3, self.robot.n))
         low, high = self.robot.q_min + 0.15, self.robot.q_max - 0.15
@@ -105,7 +105,7 @@ class ZeroAction:
         self._action_dim = action_dim
 
     def action(self, observation: Tensor) -> Tensor:
-        """Return actions (B, a) of zero."""
+        """Return zero actions (B, a)."""
         return torch.zeros(len(observation), self._action_dim)
 
 
@@ -128,8 +128,8 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     """Return the baseline `algo=hybrid_force`: zero actions under control=hybrid.
 
-    With zero actions, the controller exerts the requested force f on the surface in open loop. Its torque for this
-    force is J^T f plus the modeled friction torque.
+    With zero actions, the controller exerts the requested force f on the surface in open loop. The controller's
+    torque for this force is J^T f plus the modeled friction torque.
 
     Raises:
         UserError: the controller is not control=hybrid, or the task has no contact.

@@ -79,7 +79,7 @@ class Policy(nn.Module):
 
 
 class Critics(nn.Module):
-    """An ensemble of C critics with LayerNorm, as one batched network: (B, d), (B, a) -> (C, B, outputs)."""
+    """C critics with LayerNorm in one batched network: observation (B, d), action (B, a) -> (C, B, outputs)."""
 
     def __init__(self, obs_dim: int, act_dim: int, hidden: tuple[int, ...], count: int, outputs: int):
         super().__init__()

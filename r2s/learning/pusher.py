@@ -2,10 +2,10 @@
 
 The pusher's model is quasi-static and independent of the box's mass and friction. Let a frictionless push of length s
 act at a face point p along the inward normal n. In the model, the push moves the box by s n / (1 + h^2) and turns it
-by s h / (r (1 + h^2)), with h = (p x n) / r. Here r is the ratio of friction moment to friction force (limit surface,
-r2s/physics/sliding.py). The pusher divides the errors of position and yaw by their tolerances. In every control
-period, the pusher selects the face point whose best push reduces the error fastest. The time of a push includes the
-tip's travel to the face point.
+by s h / (r (1 + h^2)), with h = (p x n) / r. Here r is the largest friction moment divided by the largest friction
+force (limit surface, r2s/physics/sliding.py). The pusher divides the errors of position and yaw by their tolerances.
+In every control period, the pusher selects the face point whose best push reduces the error fastest. The time of a
+push includes the tip's travel to the face point.
 """
 
 import numpy as np
@@ -24,13 +24,13 @@ from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
 from r2s.tasks.push_measures import GOOD_M, GOOD_RAD
 from r2s.tasks.task import Task
 
-POINTS, EDGE = 9, 0.75  # number of points per face; the points span this share of an edge
+POINTS, EDGE = 9, 0.75  # number of face points per face, and the share of the edge that they span
 CLEAR = 0.02  # m, clearance between tip and box while the tip moves around the box
-NEAR = 0.012  # m, the tip pushes if its lateral distance from the face point is smaller
+NEAR = 0.012  # m, the tip pushes if its lateral distance from the face point is smaller than this
 TOLERANCE = np.array([GOOD_M, GOOD_M, GOOD_RAD])  # m, m, rad: unit in which the pusher measures pose errors
 DONE = 0.3  # error, in tolerances, at which the pusher stops: 9 mm or 3 degrees; pose noise alone causes 0.06
-SPEED, TRAVEL, SLOW_M = 0.15, 0.2, 0.02  # m/s, tip speed in and between pushes; m, a push shorter than this is slower
-GAIN = 0.25  # tip speed feedback gain / damping of the impedance law; 25 Hz and the latency allow little more
+SPEED, TRAVEL, SLOW_M = 0.15, 0.2, 0.02  # m/s, tip speed in and between pushes; m, shorter pushes are slower
+GAIN = 0.25  # feedback gain on the tip speed / damping of the impedance; 25 Hz and the latency allow little more
 
 
 class Pusher:
@@ -93,7 +93,7 @@ class Pusher:
         return np.einsum("bnk,bn->bk", inverse, torque)
 
     def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip velocity (3,) m/s along the table, and the push direction (2,), 0 without a push."""
+        """Return the tip velocity (3,) m/s along the table, and the push direction (2,), or 0 without a push."""
         c, s = np.cos(box[2]), np.sin(box[2])
         rotation = np.array([[c, s], [-s, c]])  # from table axes to box axes
         at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), error[2]]) / TOLERANCE
@@ -103,7 +103,7 @@ class Pusher:
         point, normal, radius = self._points[k], self._normals[k], self._task.tip_radius
         across, push = np.array([-normal[1], normal[0]]), np.zeros(2)
         aside, gap = (at - point) @ across, (point - at) @ normal - radius
-        if abs(aside) < NEAR and -radius < gap < 2 * CLEAR:  # a tip beyond the face would move away from it
+        if abs(aside) < NEAR and -radius < gap < 2 * CLEAR:  # no push if the tip is past the face
             push = rotation.T @ normal
             velocity = SPEED * min(1.0, (length + max(gap, 0.0)) / SLOW_M) * normal - 3.0 * aside * across
         else:
@@ -189,7 +189,7 @@ def _face_points(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _crosses(a: np.ndarray, b: np.ndarray, half: np.ndarray) -> bool:
-    """Return whether the line from a to b (2,) m crosses a rectangle centered at 0 with half edges `half` (2,) m."""
+    """Return whether the segment from a to b (2,) m crosses a rectangle centered at 0 with half edges (2,) m."""
     low, high = 0.0, 1.0
     for k in range(2):
         step = b[k] - a[k]

@@ -18,7 +18,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import nominal_plane, tilted
 
-Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or one for all arms
+Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or of one arm for all
 
 DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # random fields of a `Surface`
 TRIES = 64  # largest number of draws per tensor; if all are rejected, the link gets the tensor of the center
@@ -28,10 +28,10 @@ TRIES = 64  # largest number of draws per tensor; if all are rejected, the link 
 class UniformRandomization:
     """Draw friction parameters and inertia tensors uniformly around a center, as the paper does.
 
-    Each friction parameter phi is center * U(1 - phi_relative, 1 + phi_relative); the paper uses phi_relative = 0.10.
-    Each tensor element is center * U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05. All draws are
-    independent, so some tensors, mainly of slender links, are physically impossible (see `physical`). r2s draws
-    impossible tensors again. With inertia_relative = 0.05, the share of valid draws is 100 % for the Panda's links 4
+    Each friction parameter is its center times U(1 - phi_relative, 1 + phi_relative); the paper uses phi_relative =
+    0.10. Each tensor element is its center times U(1 - inertia_relative, 1 + inertia_relative); the paper uses 0.05.
+    All draws are independent, so some tensors, mainly of slender links, are physically impossible (see `physical`).
+    r2s redraws such tensors. With inertia_relative = 0.05, the share of valid draws is 100 % for the Panda's links 4
     and 7, 47 to 63 % for links 2, 3, 5 and 6, and 22 % for link 1, a rod (I_zz is 0.013 I_xx). Because of the
     redraws, I_xx and I_yy of link 1 have the correlation 0.97; tensor elements of links 2 to 7 have correlations up
     to 0.6. Even with redraws, each element varies over its full range of +-5 %.
@@ -78,10 +78,11 @@ class UniformRandomization:
 
 @dataclass(frozen=True)
 class PosteriorRandomization:
-    """Draw each arm's dynamics from a posterior: a random row of `samples` (S, P), parameters in `space`.
+    """Draw each arm's dynamics from a posterior: a random row of `samples` (S, P), parameters of `space`.
 
     Whole rows preserve the correlations between parameters. Every row is physically valid: tensor scales are
-    positive, and the full inertia parametrization contains only valid bodies. payload: see `UniformRandomization`.
+    positive, and the full inertia parametrization admits only valid bodies. payload: see `UniformRandomization`.
+
     """
 
     space: ParameterSpace
@@ -151,9 +152,9 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
 class ContactRandomization(UniformRandomization):
     """Draw arms as `UniformRandomization` does, and for each arm a random surface near a nominal plane.
 
-    The exponent is either end of its range, with equal probability. Stiffness is log-uniform; damping, friction and
-    bristle are uniform. The plane is shifted along its normal by U(-place, place), and tilted about a random axis by
-    U(0, tilt).
+    The exponent is one end of its range; both ends have equal probability. Stiffness is log-uniform; damping,
+    friction and bristle are uniform. The plane is shifted along its normal by U(-place, place), and tilted about a
+    random axis by U(0, tilt).
 
     Attributes:
         point, normal: point (3,) m and normal (3,) of the nominal plane; if None, those of a work table below the tip
@@ -191,7 +192,7 @@ class ContactRandomization(UniformRandomization):
 
     def __post_init__(self):
         super().__post_init__()
-        _ = self._plane, self._identified  # raises for wrong settings
+        _ = self._plane, self._identified  # raises UserError for wrong settings
         for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
             low = {"stiffness": "(0, inf)", "exponent": "[1, 2]"}.get(name, "[0, inf)")
             check_pair(name, getattr(self, name), low)
@@ -247,7 +248,7 @@ def check_payload(payload: Sequence[float] | None, robot: Robot) -> None:
 def with_payloads(
     robot: Robot, dynamics: Dynamics, payload: Sequence[float] | None, rng: np.random.Generator, m: int
 ) -> Dynamics:
-    """Return the dynamics of m arms, each with a random payload of [least, most] kg, or unchanged if payload=None.
+    """Return the dynamics of m arms with random payloads of [least, most] kg; if payload=None, return `dynamics`.
 
     The mass of a payload is uniform. The center of mass is uniform in a ball about the end effector, with half the
     radius that `payload_max` allows. The inertia tensor is that of a ball of water. Gravity compensation ignores the

@@ -33,7 +33,7 @@ class Replay:
         self.seen += max(0, count - self.size)  # skip transitions that this call would overwrite
         count = min(count, self.size)
         first = self.seen % self.size
-        fits = min(count, self.size - first)  # rows left to the buffer's end; further transitions go to row 0 onwards
+        fits = min(count, self.size - first)  # rows up to the buffer's end; other transitions go to row 0 onwards
         for name, rows in self._rows.items():
             added = transitions[name][-count:]
             rows[first : first + fits] = added[:fits]

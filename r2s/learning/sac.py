@@ -14,11 +14,11 @@ from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class SAC(EntropyLearner):
-    """Learn a stochastic policy; the smallest value of several critics limits overestimation.
+    """Learn a stochastic policy; the minimum over several critics limits overestimated values.
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.
-        n_critics: number of critics; target and actor loss use the smallest value.
+        n_critics: number of critics; target and actor loss use the minimum over the critics.
     """
 
     def __init__(self, scale: tuple[Tensor, Tensor], action_scale: Tensor, *, n_critics: int = 2, **shared: Any):

@@ -1,7 +1,7 @@
 """Twin Delayed Deep Deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477).
 
-TD3 differs from DDPG in three ways: the target uses the smaller value of two critics, the action in the target has
-noise, and only every other update changes the actor and the target networks. The losses equal those of
+TD3 differs from DDPG in three ways. The target uses the smaller value of two critics. The action in the target has
+noise. Only every other update changes the actor and the target networks. The losses equal those of
 `torchrl.objectives.TD3Loss` with the squared error of Fujimoto et al.; tests compare r2s and torchrl.
 """
 
@@ -16,11 +16,11 @@ from r2s.learning.learner import DeterministicLearner, differentiate, polyak
 
 
 class TD3(DeterministicLearner):
-    """Learn a deterministic policy; the smallest value of several critics limits overestimation.
+    """Learn a deterministic policy; the minimum over several critics limits overestimated values.
 
     Args:
         scale, action_scale, shared: see `DeterministicLearner`.
-        n_critics: number of critics; the target uses the smallest value, the actor loss uses the first critic.
+        n_critics: number of critics; the target uses the minimum over the critics, the actor loss the first critic.
         smoothing_std, smoothing_clip: standard deviation and limit of the noise on the action in the target.
         policy_delay: number of critic updates per update of the actor and the target networks.
     """
@@ -51,7 +51,7 @@ class TD3(DeterministicLearner):
         """Return critic and actor losses of a batch.
 
         Args:
-            batch: see `Learner.update`, with normalized observations.
+            batch: as for `Learner.update`, but with normalized observations.
             noise: (B, a), standard normal noise for the next action.
         """
         return {"loss_critic": self._critic_loss(batch, noise), "loss_actor": self._actor_loss(batch)}

@@ -57,7 +57,7 @@ class TQC(EntropyLearner):
 def quantile_huber(quantiles: Tensor, target: Tensor) -> Tensor:
     """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044), summed over the critics.
 
-    The loss of a critic is a mean over the batch, the critic's quantiles and the target atoms.
+    A critic's loss is the mean over the batch, the critic's quantiles and the target atoms.
     The loss of a quantile and a target atom is |tau - [delta < 0]| huber(delta), where delta = atom - quantile, and
     tau is the quantile's probability. huber(delta) is delta^2 / 2 for |delta| <= 1, otherwise |delta| - 1/2.
 

@@ -1,14 +1,13 @@
 """Train any algorithm: act, step all arms, store transitions, update, and evaluate at intervals.
 
-The budget limits wall-clock minutes, env steps, or both; the used share of the budget sets the curriculum. If only
-env_steps is limited, runs with equal seeds and equal numbers of threads agree bit for bit, even after a stop and
+The budget limits wall-clock minutes, env steps, or both; a curriculum depends on the used share of the budget. If
+only env_steps is limited, runs with equal seeds and equal numbers of threads agree bit for bit, even after a stop and
 resumption. If minutes are limited, the curriculum depends on the clock, so runs differ.
 
 The arms step in a separate thread while the learner updates, so an update uses only transitions of earlier steps. On
-one core, steps and updates alternate, with the same result as in parallel. Physics and updates have
-separate OpenMP threads. After an update, shared threads would spin for milliseconds on cores that the physics needs.
-On a busy machine, each synchronization of shared threads would also wait for threads that the operating system has
-suspended.
+one core, steps and updates alternate, with the same result as in parallel. Physics and updates have separate OpenMP
+threads. If they shared threads, the threads would spin for milliseconds after each update, on cores that the physics
+needs. On a busy machine, each synchronization of shared threads would also wait for suspended threads.
 """
 
 import copy
@@ -68,7 +67,7 @@ class Loop:
 
     Attributes:
         batch_size: transitions per update. updates_per_step: updates per step of all arms.
-        learning_starts: env steps before the first update, with random actions or actions of the demonstrator.
+        learning_starts: env steps before the first update; their actions are random or from the demonstrator.
         replay_size: capacity of the replay buffer in transitions.
         lr_decay, lr_end: after the share lr_decay of the budget, the learning rate falls linearly to lr_end times its
             initial value.
@@ -120,7 +119,8 @@ class Callbacks:
 
     Attributes:
         log: called with each row of metrics.csv. evaluated: called with each row of evaluations.csv.
-        progress: called after every step with an update, with the used share of the budget and numbers to show.
+        progress: called after every step that includes an update; receives the used share of the budget and numbers
+            to show.
     """
 
     log: Callable[[dict], None] = lambda row: None
@@ -148,8 +148,8 @@ def train(
         loop, budget: settings of the training loop, and length of the training.
         demonstrator: source of the actions in the first loop.learning_starts env steps; if None, the actions are
             uniformly random.
-        checkpoint: saves the training after every evaluation but the last. A training with a saved checkpoint resumes
-            from the checkpoint. If None, the training is not saved.
+        checkpoint: saves the training after every evaluation except the last. A training with a saved checkpoint
+            resumes from the checkpoint. If None, the training is not saved.
         callbacks: functions that receive logs and progress.
 
     Raises:
@@ -163,7 +163,7 @@ def train(
         env.weights = env.reward.weights(env.task, spent, run.factor)
         algo.set_lr(loop.lr_share(spent))
         algo.set_exploration(loop.explore_end**spent)
-        learns = run.env_steps >= max(1, loop.learning_starts)  # an update needs a transition
+        learns = run.env_steps >= max(1, loop.learning_starts)  # an update needs at least one transition
         with run.step(spent):
             for _ in range(loop.updates_per_step if learns else 0):
                 losses = run.update()
@@ -185,8 +185,8 @@ class Training:
     """State of a training: arms, learner, replay buffer and counters; for the arguments, see `train`.
 
     Attributes:
-        env_steps, updates: numbers of env steps and updates so far. next_eval: number of env steps from which
-            the next evaluation is due.
+        env_steps, updates: numbers of env steps and updates so far. next_eval: number of env steps at which the next
+            evaluation is due.
         factor: last result of `Reward.adapt`, initially `Reward.factor`. evaluation: last row of evaluations.csv.
     """
 
@@ -332,11 +332,11 @@ def keep_memory() -> None:
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
         libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     except (OSError, AttributeError):
-        pass  # another C library: updates are slower, with the same result
+        pass  # another C library: slower updates with equal results
 
 
 def fastest_matmul(device: torch.device) -> str:
-    """Return the fastest matrix precision: "medium" (bfloat16) if the device has bfloat16 units, else "highest".
+    """Return the fastest precision of matrix products: "medium" if the device has bfloat16 units, else "highest".
 
     On a CPU with AVX-512 but without bfloat16 units, "medium" saves no time for hidden layers of 128 to 256 units:
     rounding the factors takes as long as the faster products save (benchmarks/results/speed.md).

@@ -18,9 +18,9 @@ NOISES = "_sigma", "_noise", "_pose_noise"
 class VectorArms:
     """Simulate `width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
 
-    Every millisecond runs these stages: control law, soft start, low-pass, clip, rate limit, safety filter, delay and
-    lag, physics. The simulator computes kinematics once per control period. `State` stores true speeds and sensor
-    noise separately.
+    Every simulated millisecond consists of these stages: control law, soft start, low-pass, clip, rate limit, safety
+    filter, delay and lag, physics. The simulator computes kinematics once per control period. `State` stores true
+    speeds and sensor noise separately.
 
     Attributes:
         speeds: None, because simulated speeds are exact and need no smoothing.
@@ -57,7 +57,7 @@ class VectorArms:
         self.sim.drive(limits, torque, task.cutoff_hz, soft_start_s, task.push_limit)
         self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
         self.speeds = None
-        self._limited = np.zeros(width)  # cycles that the safety filter changed before the last step
+        self._limited = np.zeros(width)  # number of cycles that the safety filter changed before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
         self.seed(seed)
         self._sigma, self._noise = np.zeros((2, width, robot.n))
@@ -100,7 +100,7 @@ class VectorArms:
             self._pose_noise[at] = self._pose_sigma * self._rng.standard_normal(self._pose_noise[at].shape)
 
     def read(self) -> State:
-        """Return the current state of all arms, with views of the simulator's arrays instead of copies."""
+        """Return the current state of all arms; its arrays are views of the simulator's arrays, not copies."""
         sim, t = self.sim, self._steps * self._period
         limited = (sim.limited - self._limited) / self._substeps
         noise = self._noise if self._sigma.any() else None

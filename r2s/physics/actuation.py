@@ -1,9 +1,9 @@
 """Convert target torque to joint torque in steps of 1 ms: soft start, low-pass, clip, rate limit, motor delay.
 
-Training, evaluation and hardware share soft start, low-pass, clip and rate limit, so these stages delay a torque
-equally on the arm and in simulation. The safety filter (safety_filter.py) acts between rate limit and motor delay. In
-training and evaluation, the filter runs in the physics step (mujoco_callback.py); on an arm, it runs in the driver
-(r2s/arm/driver.py).
+Training, evaluation and hardware share soft start, low-pass, clip and rate limit. These stages therefore delay a
+torque equally on the arm and in simulation. The safety filter (safety_filter.py) acts between rate limit and motor
+delay. In training and evaluation, the filter runs in the physics step (mujoco_callback.py); on an arm, it runs in the
+driver (r2s/arm/driver.py).
 """
 
 import math
@@ -25,7 +25,7 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
 
     Args:
         target: Nm, target torque. filtered, effort: Nm, low-pass state and effort of the previous cycle.
-        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: cycles of the soft start.
+        cycle: number of the current cycle, from 1. factor: gain of the low-pass. fade: soft start, cycles.
         tau_max: Nm, largest effort. step_max: Nm, largest change of the effort per cycle.
     """
     faded = target
@@ -92,8 +92,8 @@ class Actuation:
 
 
 MAX_DELAY = 0.02  # s, longest pure delay that `Motors` can simulate
-# Steps by which a semi-implicit simulation responds too early, because q(k+1) - 2 q(k) + q(k-1) is h^2 a(k). On an
-# arm with constant acceleration a in each step, this difference is h^2 (a(k-1) + a(k)) / 2.
+# Steps by which a semi-implicit simulation responds too early. In such a simulation, q(k+1) - 2 q(k) + q(k-1) is h^2
+# a(k). On an arm with the constant acceleration a(k) in step k, this second difference is h^2 (a(k-1) + a(k)) / 2.
 EARLY = 0.5
 SLOTS = int(MAX_DELAY / SIM_DT) + 3  # number of commands in the delay line
 
@@ -103,8 +103,8 @@ def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
     If a command takes effect in the middle of a step, the previous command acts until that time. The motor torque m
-    follows the command u: dm/dt = (u - m) / lag. From an initial torque m0, the mean of m over s steps is u + (m0 -
-    u) (1 - exp(-s / lag)) lag / s.
+    follows the command u: dm/dt = (u - m) / lag. For a constant command u and an initial torque m0, the mean of m
+    over s steps is u + (m0 - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
         line: (SLOTS, n) Nm, recent commands; row k % SLOTS is the command of cycle k. motor: (n,) Nm, motor torques.
@@ -134,7 +134,7 @@ def delayed(tau, delay, lag, steps, line, motor, cycle, out):
 
 
 def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Convert delay and lag from s to steps for `motor_torque`; clip the delay at MAX_DELAY, then add EARLY."""
+    """Convert delay and lag from s to steps for `motor_torque`; limit the delay to MAX_DELAY; add EARLY steps."""
     steps = np.clip(np.asarray(delay) / SIM_DT, 0.0, MAX_DELAY / SIM_DT) + EARLY
     return steps, np.asarray(lag) / SIM_DT
 
@@ -142,8 +142,8 @@ def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.n
 class Motors:
     """Convert the commands of m simulated arms to joint torques, by a pure delay and then a first-order lag.
 
-    Delay and lag need not be whole steps. The simulation responds half a step too early (EARLY), so `Motors` adds
-    half a step of delay.
+    Delay and lag may contain fractions of a step. The simulation responds half a step too early (EARLY), so `Motors`
+    adds half a step of delay.
     """
 
     def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):

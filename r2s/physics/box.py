@@ -10,12 +10,13 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import default_plane, nominal_plane
 
-SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; low enough for the hand to stay above the box
-PUSHED_AT = 0.4  # ratio of the height at which the tip pushes to the box's height
+SIZE = 0.12, 0.12, 0.08  # m, edges along the box's axes; the hand stays above a box of this height
+PUSHED_AT = 0.4  # height at which the tip pushes / height of the box
 SPREAD, YAW = 0.02, 20.0  # m, degrees: largest deviations of a box from its nominal pose, to either side
-FORWARD = 0.25  # distance from tip at home ahead to nominal box / distance from base to table point below tip
-# Ranges for a box: mass kg, friction with the table, friction with the tip, stiffness N/m, damping s/m, bristle m;
-# from a carton on a smooth table to a block of wood on a dry table
+# nominal distance of the box ahead of the tip at home / distance from the base to the table point below the tip
+FORWARD = 0.25
+# Ranges for a box: mass kg, friction coefficients with table and tip, stiffness N/m, damping s/m and bristle m of the
+# contact with the tip; from a carton on a smooth table to a block of wood on a dry table
 MASS, TABLE, TIP = (0.3, 1.5), (0.2, 0.5), (0.1, 0.5)
 STIFFNESS, DAMPING, BRISTLE = (5e3, 1e5), (0.5, 3.0), (1e-4, 3e-4)
 EXPECTED = {"mass": 0.8, "table": 0.35, "friction": 0.3, "stiffness": 2.5e4, "damping": 1.5, "bristle": 2e-4}
@@ -53,7 +54,7 @@ class TableFrame:
         return np.concatenate([centre, np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1) @ self.axes], axis=-1)
 
     def moved(self, pose: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Return poses (m, 6) of boxes after a displacement `by` (m, 3) in the table frame: x m, y m and yaw rad."""
+        """Return poses (m, 6) of boxes after a displacement `by` (m, 3): x m, y m, yaw rad in the table frame."""
         c, s = np.cos(by[:, 2:]), np.sin(by[:, 2:])
         first, up = pose[:, 3:], self.axes[2]
         turned = c * first + s * np.cross(up, first)  # `first` is perpendicular to `up`

@@ -4,11 +4,11 @@ r2s checks the geoms of the robot's file, except planes and height fields. If th
 geoms, r2s checks only these geoms. Convex hulls replace meshes, as in MuJoCo, and bounding spheres replace signed
 distance fields. The check omits some pairs:
 
-- The check omits the table for a geom of constant height: either no joint moves the geom, or only joints with
-  vertical axes do.
+- The check omits a geom and the table if the geom's height is constant: either no joint moves the geom, or only
+  joints with vertical axes do.
 - The check omits two geoms of neighboring links, because neighboring links touch at their joint.
-- The check omits two geoms closer than HOUSING_M at q_home, because both can be parts of one joint's housing. In the
-  Panda's shoulder, for example, a housing contains geoms of links that are two joints apart.
+- The check omits two geoms closer than HOUSING_M at q_home, because both geoms may belong to the housing of one
+  joint. In the Panda's shoulder, for example, one housing contains geoms of links that are two joints apart.
 """
 
 from collections.abc import Collection
@@ -37,7 +37,7 @@ class CollisionPairs:
     """Pairs of geoms whose distance the collision check computes.
 
     Attributes:
-        above: ids of the geoms to check with the table. pairs: pairs of geom ids; pairs with an obstacle come first.
+        above: ids of geoms to check against the table. pairs: pairs of geom ids; pairs with an obstacle come first.
         link: (ngeom,) number of each geom's link, from 1; 0: the base.
     """
 
@@ -90,7 +90,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 class Scene(NamedTuple):
     """Bodies (G, WIDTH), vertices (V, 3) m of their hulls, and the height of the table, m.
 
-    above: (A,), indices of bodies to check with the table. pairs: (P, 2), indices of bodies to check with each other.
+    above: (A,), indices of bodies to check against the table. pairs: (P, 2), pairs of body indices to check.
     """
 
     bodies: np.ndarray
@@ -236,7 +236,7 @@ def body_poses(links, bodies, q, frames, poses):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
-    """Return pair k's distance, m; above `enough` m, a lower bound > `enough` suffices. work: (10, 3), scratch."""
+    """Return pair k's distance, m, or a lower bound of it that exceeds `enough` m. work: (10, 3), scratch array."""
     bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]

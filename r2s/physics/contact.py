@@ -2,10 +2,10 @@
 
 The normal force is the mean of Hunt and Crossley's force (surface.py) over the step. Between the depths d0 and d1,
 the mean of the elastic force K d^e is the discrete gradient (V(d1) - V(d0)) / (d1 - d0) of the force's potential V
-(Gonzalez, J. Nonlinear Science 6, 1996). A discrete gradient conserves the energy of a bounce at any stiffness, even
-if contact begins or ends within the step. In a semi-implicit step, q1 = q + h dq1, velocities are half a step older
-than positions. Therefore, d0 = d - h rate / 2 and d1 = d0 + h (rate + rate1) / 2, with the depth d and the
-penetration rates `rate` before and `rate1` after the step.
+(Gonzalez, Journal of Nonlinear Science 6, 1996). A discrete gradient conserves the energy of a bounce at any
+stiffness, even if contact begins or ends within the step. A semi-implicit step computes q1 = q + h dq1, so velocities
+are half a step older than positions. Therefore, d0 = d - h rate / 2 and d1 = d0 + h (rate + rate1) / 2, with the
+depth d and the penetration rates `rate` before and `rate1` after the step.
 
 The stiffness of tangential bristles is proportional to the normal force F (Canudas de Wit et al., IEEE TAC 40(3),
 1995). Backward Euler integrates the bristle deflection z: dz/dt = v - |v| z / z_s with the sliding velocity v and z_s
@@ -13,10 +13,11 @@ The stiffness of tangential bristles is proportional to the normal force F (Canu
 point. While the tip slides steadily, the magnitude of friction is mu F.
 
 The unknowns of a contact step are the joint velocities at the step's end. `add_contact` linearizes normal force and
-friction about a guess of the unknowns. `add_contact` then adds the constant term to the driving torque, and the
-linear term to the mass matrix. Stiction is solved together with contact (stick_slip.py), so contact can move a
-resting joint. `start_guess` writes the first guess. `contact_velocity` repeats `add_contact`, `coming_velocity` and
-`next_guess` until the guess is accurate; one repetition is usually enough. `finish_contact` ends the step.
+friction about a guess of the unknowns. `add_contact` then adds the linearized force's constant term to the driving
+torque, and its linear term to the mass matrix. `coming_velocity` (stick_slip.py) solves stiction together with
+contact, so contact can move a resting joint. `start_guess` writes the first guess. `contact_velocity` repeats
+`add_contact`, `coming_velocity` and `next_guess` until the guess is accurate; one pass is usually enough.
+`finish_contact` ends the step.
 """
 
 import numpy as np
@@ -67,8 +68,8 @@ MARGIN = 1e-3  # m, margin in the prediction of a touch: a tip would need 2000 m
 FAR = 0.02  # m, a tip farther away would need 20 m/s to touch within a step
 ROUNDS = 12  # largest number of guesses in a step
 TOLERANCE = 1e-4  # allowed relative error of the normal force after the last guess
-LATE = 1e-2  # allowed ratio of the tangential force's error, due to the guess, to the normal force
-BOX_LATE = 1e-3  # allowed relative error of table friction, due to the guessed speed of the box
+LATE = 1e-2  # allowed (error of the tangential force due to the guess) / (normal force)
+BOX_LATE = 1e-3  # allowed relative error that the guessed speed of the box causes in table friction
 NEGLIGIBLE = 1e-6  # N, force that is treated as 0
 SHORT = 1e-6  # ratio |d1 - d0| / depth below which V(d1) - V(d0) is round-off; mean_force then uses the mean depth
 
@@ -135,11 +136,11 @@ def _from_box(contact, x, y, z):
 def near(contact, place, anchor, axis, dq, h, jacobian):
     """Write a tip's depth and Jacobian (ROWS, n); return whether the tip may touch the surface in this step.
 
-    Call `near` only once per step: if the tip cannot touch the box, `near` also moves a sliding box by one step.
+    Call `near` only once per step: if the tip cannot touch the box, `near` also moves the box by one step.
 
     Args:
         contact: (COLUMNS,), see contact_layout.py; force and deflection become 0 if the tip cannot touch the surface.
-        place: position (3,) m and rotation (9,), in the base frame, of the link that carries the tool.
+        place: position (3,) m and rotation (9,), in the base frame, of the link with the tool.
         anchor, axis: (n, 3) m and (n, 3), position and direction of each joint axis. dq: (n,) rad/s, joint speeds.
     """
     position, R = place
@@ -194,7 +195,7 @@ def _box_rate(contact):
 
 @njit(cache=True, error_model="numpy")
 def _bristles(contact, force, speed, h):
-    """Return spring constant, N/m, and damping, N s/m, of friction for a normal force, N, and a sliding speed, m/s.
+    """Return friction's spring constant, N/m, and damping, N s/m, at a normal force, N, and a sliding speed, m/s.
 
     The friction force is -(spring z + damper v), with the deflection z before and the velocity v after the step.
     """
@@ -268,7 +269,10 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
-    """Add a movable box's contact force; held: N, normal and negated tangential force (3) at fixed box velocity."""
+    """Add the linearized contact force of a movable box, as `add_contact` does.
+
+    held: N, normal force and negated tangential force (3) for a constant box velocity.
+    """
     n, at = contact[NORMAL : NORMAL + 3], np.empty(3)
     for k in range(3):
         at[k] = held[0] * n[k] - held[1 + k]
@@ -340,7 +344,7 @@ def _deflect(contact, slide, speed, h, terms):
 
 @njit(cache=True, error_model="numpy")
 def explicit_contact(contact, jacobian, dq, h):
-    """Do an explicit contact step of h s, which must be much shorter than the contact's oscillation period."""
+    """Compute an explicit contact step of h s, which must be much shorter than the contact's oscillation period."""
     tangent = np.empty(3)
     rate, speed = _velocity(jacobian, dq, tangent)
     if contact[MASS] > 0.0:
@@ -365,7 +369,7 @@ def contact_torque(contact, jacobian, out):
 
 @njit(cache=True, error_model="numpy")
 def contact_velocity(touch, mass, damping, h, forces, dq_min, work, coming):
-    """Solve a step in contact: write final joint velocities (n,) rad/s to `coming` and results to `contact`.
+    """Solve a step in contact; write the final joint velocities (n,) rad/s to `coming`, and the force to `contact`.
 
     Args:
         touch: arrays `contact` (COLUMNS,) and `jacobian` (ROWS, n) of `near`. work: (2 n + 6, n), scratch array.

@@ -9,21 +9,21 @@ from r2s.physics.surface import Surface
 
 # Columns of `contact`: the surface (see `Surface`), the tool, and the results of a step
 K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
-# HALF: half edges of a box; 0: plane. AXES: matrix with box axes as columns, row by row. NORMAL: at the tip for a box
+# HALF: half edges of a box; 0: plane. AXES: box axes as columns, row by row. NORMAL: of a box, at the tip
 HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
 # Columns for a box that slides on a table (sliding.py). MASS: 0 for a fixed surface. WEIGHT: N. TABLE: friction
 # coefficient. REACH: m, ratio of the moment to the force of table friction. UP: table normal. VELOCITY (3): m/s, of
 # center. SPIN: rad/s, about UP. STRAIN (4): m, elastic deflection on the table; the fourth value is REACH times an
-# angle. ARM (3): m, vector from the center to the contact. LOAD: N, table friction while the box slides.
+# angle about UP. ARM (3): m, vector from the center to the contact. LOAD: N, table friction while the box slides.
 MASS, INERTIA, WEIGHT, TABLE, REACH, UP = range(DEPTH + 1, DEPTH + 7)
 VELOCITY, SPIN, STRAIN, ARM, LOAD = UP + 3, UP + 6, UP + 7, UP + 11, UP + 14
 COLUMNS = LOAD + 1
-ROWS = 4  # rows of the Jacobian: normal direction, then the tangential parts of x, y and z
+ROWS = 4  # rows of the Jacobian: normal motion; x, y and z of the tangential motion
 # Columns of `guess`. RATE, SLIDE (3): penetration rate and tangential velocity before the step. NEXT, SPEED: guessed
-# rate and speed after the step. BEGIN: m, depth d0. LINEAR, SLID (3): solved normal force, tangential velocity
+# rate and speed after the step. BEGIN: m, depth d0. LINEAR, SLID (3): solved normal force and tangential velocity
 RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE = 0, 1, 4, 5, 6, 7, 8
 SPRING, DAMPER, LINEAR, SLID = 9, 10, 11, 12
-# With a box: tip velocity before the step (3), contact force at unchanged tip velocity (3) N, decrease of this force
+# With a box: tip velocity before the step (3), contact force at constant tip velocity (3) N, decrease of this force
 # per change of tip velocity (9) N s/m, velocity and spin of the box after the step (4), guessed speed of the box
 TIP_BEGIN, FORCE_BEGIN, RESISTANCE = SLID + 3, SLID + 6, SLID + 9
 BOX_END, BOX_SPEED = RESISTANCE + 9, RESISTANCE + 13

@@ -7,12 +7,13 @@ to `hidden` (push_limit.py). The driver therefore has three kinds of stop:
 - hold: the arm rests with the target torque J^T R; J is the tip's Jacobian, and R is the push limit's estimate of the
   contact force at the stop's start.
 - release: the tip moves outward at the speed LEAVE until the contact force F vanishes. A velocity loop tracks the
-  joint velocity of least kinetic energy, -LEAVE m M^-1 J^T, with the mass matrix M and the tip's effective mass m.
-  The feedforward contains the present estimate R and the modeled joint friction, which corresponds to a force h at
-  the tip. For an arm with more friction, an integral term adds a force of at most h. On a tip that moves outward,
-  joint friction exerts the inward force h, so the estimate R is F - h. The release ends when R falls to RELEASED -
-  SLIDES h. If the true friction is at most SLIDES h, the remaining contact force is at most RELEASED. If the true
-  friction is at most h, the remaining force is at most RELEASED + (1 - SLIDES) h.
+  joint velocity -LEAVE m M^-1 J^T, with the mass matrix M and the tip's effective mass m. Of all joint velocities
+  with the tip speed LEAVE, this velocity has the least kinetic energy. The feedforward contains the present estimate
+  R and the modeled joint friction, which corresponds to a force h at the tip. If the arm has more friction than the
+  model, an integral term adds a force of at most h. While the tip moves outward, joint friction exerts the inward
+  force h on the tip, so the estimate R is F - h. The release ends when R falls to RELEASED - SLIDES h. If the true
+  friction is at most SLIDES h, the remaining contact force is at most RELEASED. If the true friction is at most h,
+  the remaining force is at most RELEASED + (1 - SLIDES) h.
 - retreat: the arm releases the tip, then moves the tip RETREAT_M farther outward.
 
 Every stop obeys the limits of push, speed and acceleration, and every outward motion ends after LEAVES_S.
@@ -27,10 +28,12 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
 RELEASED = 0.5  # N, largest contact force of a released tip
-SLIDES = 0.25  # ratio of friction in slow sliding to breakaway friction; 0.35 with conf/friction/paper
-RETREAT_M = 0.01  # m; a free path, because the tip came from `task.clearance` = 15 mm above the plane
-LEAVES_S = 0.4  # s; 0.1 s remains for braking. 20 N press 10 mm into the softest surface of conf/dr/contact.yaml
-MOST = 0.25  # largest share of a joint's allowed speed that the outward motion uses
+SLIDES = 0.25  # friction in slow sliding / breakaway torque; 0.35 with conf/friction/paper
+RETREAT_M = 0.01  # m; this path is free, because the tip came from `task.clearance` = 15 mm above the plane
+# s, longest outward motion; 0.1 s of the driver's 0.5 s remains for braking. A force of 20 N presses the tip 10 mm
+# into the softest surface of conf/dr/contact.yaml
+LEAVES_S = 0.4
+MOST = 0.25  # largest ratio of a joint's speed in the outward motion to the joint's allowed speed
 GAIN = 0.5 * RATE  # 1/s, gain of the velocity loop: half of the latency budget remains for the estimate R
 BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
@@ -50,7 +53,7 @@ def stop_torque(limit, arm, kinematics, friction, limits, held, target):
     unpack(arm.mass, 1.0, ddq, root)
     factor(root, root)
     solve(root, lever)
-    mobility, behind, share, kept = 0.0, 0.0, 0.0, 0.0  # behind: N, h of the module's docstring
+    mobility, behind, share, kept = 0.0, 0.0, 0.0, 0.0  # behind: N, the force h of the module's docstring
     for j in range(n):
         mobility += row[j] * lever[j]
         kept += lever[j] * held[j]

@@ -3,14 +3,14 @@
 A control law is a compiled function `law(q, dq, command, parameters, memory, out)` with these arguments:
 
     q, dq: (n,) rad, rad/s, measured in this cycle.
-    command: (c,), constant in a control period: the policy's action in SI units, then the setpoint of the task.
+    command: (c,), the policy's action in SI units, then the task's setpoint; constant in a control period.
     parameters: (p,), parameters of the law, constant during a motion.
     memory: (k,), state of the law, 0 at the beginning of a motion.
     out: (n,) Nm, target torque that the law computes, without gravity.
 
 Training runs a control law in MuJoCo's callback (mujoco_callback.py), and every arm runs the same law in the driver
 (r2s/arm/driver.py) or in an exported bundle. The package r2s/control selects the control law and its parameters. The
-control laws are in r2s/physics, beside MuJoCo's callback, because numba keeps one cache of compiled code per folder.
+control laws are in r2s/physics, beside MuJoCo's callback, because numba caches compiled code per folder.
 """
 
 from collections.abc import Callable
@@ -75,7 +75,7 @@ BUILT_IN = (torque_law, computed_torque_law, joint_impedance_law, cartesian_impe
 
 
 def law_number(law: Callable) -> int:
-    """Return the number by which `control_law` calls a law; compile a user's law first, once per process."""
+    """Return the number that selects a law in `control_law`; compile a user's law once per process."""
     return BUILT_IN.index(law) if law in BUILT_IN else control_address(law)
 
 
@@ -105,7 +105,7 @@ def _run_built_in(number, q, dq, command, parameters, memory, out):
 def run_law(law: Callable, q: np.ndarray, dq: np.ndarray, command: np.ndarray, parameters: np.ndarray, memory: int):
     """Return a law's torques (m, n) Nm in the first cycle of a motion, at q, dq (m, n) with commands (m, c)."""
     out = np.empty(q.shape)
-    q, dq = np.ascontiguousarray(q), np.ascontiguousarray(dq)  # one array type, so that numba compiles once
+    q, dq = np.ascontiguousarray(q), np.ascontiguousarray(dq)  # one array type, so that numba compiles only once
     if law in BUILT_IN:
         _run_built_in(BUILT_IN.index(law), q, dq, command, parameters, np.zeros(memory), out)
         return out

@@ -1,8 +1,8 @@
 """Compute the distance of two convex bodies: spheres, capsules, cylinders, boxes, ellipsoids or convex hulls.
 
-A body consists of all points within a radius of its core, and a support function describes the core. The algorithm of
-Gilbert, Johnson and Keerthi (IEEE Journal of Robotics and Automation 4(2), 1988) computes the distance of two cores,
-with the simplex cases of Ericson (Real-Time Collision Detection, 2005, ch. 5).
+A body consists of its core and all points within a given radius of the core; a support function describes the core.
+The algorithm of Gilbert, Johnson and Keerthi (IEEE Journal of Robotics and Automation 4(2), 1988) computes the
+distance of two cores. The cases of a simplex follow Ericson (Real-Time Collision Detection, 2005, ch. 5).
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from r2s.compiled import njit
 # of the bounding sphere.
 KIND, RADIUS, SIZE, FIRST, COUNT, BOUND, BODY = 0, 1, 2, 5, 6, 7, 8
 POINT, SEGMENT, CYLINDER, BOX, ELLIPSOID, HULL = range(6)
-CLOSE = 1e-7  # m, gap between upper and lower bound at which the iteration ends
+CLOSE = 1e-7  # m, gap between upper and lower bound of the distance at which the iteration ends
 ITERATIONS = 64
 
 
@@ -54,7 +54,7 @@ def support_point(body, vertices, pose, dx, dy, dz):
 
 @njit(cache=True, error_model="numpy")
 def separation(enough, a, pose_a, b, pose_b, vertices, work):
-    """Return two bodies' distance, m (0 or less: overlap); above `enough` m, a lower bound > `enough` suffices."""
+    """Return two bodies' distance, m (0 or less: overlap), or a lower bound of it that exceeds `enough` m."""
     around = a[RADIUS] + b[RADIUS]
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return np.sqrt(_segments(a, pose_a, b, pose_b)) - around
@@ -180,5 +180,5 @@ def _on_triangle(s):
         _copy(s, 1 if other else 0, s, 2)
         return _on_edge(s)
     share = 1.0 / (wa + wb + wc)
-    p, q = wb * share, wc * share  # along the edges to b and to c
+    p, q = wb * share, wc * share  # coordinates along the edges a b and a c
     return a[0] + p * ux + q * vx, a[1] + p * uy + q * vy, a[2] + p * uz + q * vz, 3

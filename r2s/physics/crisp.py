@@ -1,4 +1,4 @@
-"""Export friction parameters to a YAML file for crisp_controllers (ROS 2), in the form of the paper's eq. (5).
+"""Export friction parameters to a YAML file for crisp_controllers (ROS 2), in the form of the paper's equation (5).
 
 crisp_controllers (github.com/utiasDSL/crisp_controllers) adds fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
 fp3)) to each joint's torque. r2s fits fp1, fp2 and fp3 to an arm's friction; the sigmoid law without viscous friction
@@ -40,7 +40,7 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
         def error(x: np.ndarray, j: int = j) -> np.ndarray:
             return sigmoid_law(dq[:, j], x) - true[:, j]
 
-        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # one like viscous, one like Coulomb friction
+        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # nearly viscous; nearly Coulomb friction
         fits = [least_squares(error, start, bounds=bounds, x_scale="jac") for start in starts]
         out[j] = min(fits, key=lambda fit: fit.cost).x
     return out, np.sqrt(np.mean((sigmoid_law(dq, out) - true) ** 2, axis=0))

@@ -18,7 +18,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.urdf import GEAR, ROTOR
 from r2s.physics.welds import Bodies, about, make_pose, rotation
 
-ENDLESS = 1e16  # rad, SDF represents a joint without limits by this value
+ENDLESS = 1e16  # rad, position limit in SDF for a joint without limits
 HAND = 1e-12, 1e-13  # kg, kg m^2 of the URDF link `ee`: for a link without inertia, DART assumes 1 kg and 1 kg m^2
 
 
@@ -99,7 +99,7 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf; return a message for each format that cannot represent the arm.
 
-    If the arm has armature, as most arms have, write no arm.sdf and return no message, because SDF has no rotors.
+    SDF has no rotors: for an arm with armature, as most arms have, write no arm.sdf and return no message about it.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
@@ -221,8 +221,8 @@ def write_world(
 
     The physics step is 1 ms; simulated time runs as fast as possible. The world has no gravity (libfranka's
     convention), no limits of velocity or torque (r2s enforces both), and no friction (r2s applies friction torque).
-    Because SDF has no rotors, a joint damping of armature / 1 ms replaces armature, and r2s/engines cancels the
-    damping torque.
+    Because SDF has no rotors, a joint damping of armature / 1 ms replaces the armature, and the engine cancels the
+    torque of this damping.
 
     Args:
         path: file to write. robot, dynamics: the arm. plugin: the world's plugin element. version: SDF version.

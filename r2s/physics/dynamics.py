@@ -13,7 +13,7 @@ from r2s.physics.robot import Robot, per_joint
 from r2s.physics.surface import Surface
 
 STICTION_MODELS = ("command", "net")
-CREEP = 2e-3  # rad/s, dq_min of "net": above the residual speed 1 ms after a stop, below the speed of any motion
+CREEP = 2e-3  # rad/s, largest dq_min of "net": above the residual speed 1 ms after a stop, below that of any motion
 PHI1 = 0.02  # ratio of `phi1` (twice the Coulomb torque) to tau_max for a joint without friction in the file
 MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: largest allowed friction parameter, above that of any arm
 
@@ -29,7 +29,7 @@ class Dynamics:
         dq_min: rad/s, speed below which a joint can stick.
         mass: (..., n) kg, link masses. com: (..., n, 3) m, centers of mass, link frames.
         inertia: (..., n, 3, 3) kg m^2, inertia tensor of each link about its center of mass, link axes.
-        armature: (..., n) kg m^2, rotor inertia reflected to the joint; link-side torque sensors do not measure it.
+        armature: (..., n) kg m^2, rotor inertia reflected to the joint; link-side sensors do not measure its torque.
         load: (..., n) Nm/Nm, ratio of load-dependent friction to the gravity torque at the joint.
         drag: (..., n, 2) Nm, coefficients of sin q and cos q in an angle-dependent offset, such as a cable's torque.
         gain: (..., n), relative error of the link-side torque sensor or of the motor's torque constant; this error
@@ -97,7 +97,7 @@ class Dynamics:
         )
 
     def holding_contact(self) -> "Dynamics":
-        """Return the dynamics, with stiction_model="net" if the friction law is discontinuous at rest.
+        """Return the dynamics, with stiction_model="net" and dq_min <= CREEP if friction is discontinuous at rest.
 
         With stiction_model="command", any contact force would move a joint at rest.
         """

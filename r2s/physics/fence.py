@@ -1,15 +1,15 @@
-"""Stop an arm before it touches itself or the table, by a compiled check in the driver that takes microseconds.
+"""Stop an arm before it touches itself or the table: the driver runs a compiled check that takes microseconds.
 
 The fence predicts the posture in which the arm would rest if it braked now. In the predicted posture, the bodies of
 each pair of `CollisionCheck` must be at least FENCE_M apart. The required distance grows with speed, to FENCE_M (1 +
 SPREAD) at full speed, because links swing while they brake. A stop ramps the allowed joint speeds down to 0 within
-BRAKE_S, and joints follow the ramp with a lag of LAG_S. The joint with the largest ratio of speed to allowed speed
-brakes first; every other joint begins to brake when the ramp has fallen to that joint's ratio. During a motion, the
+BRAKE_S, and joints follow the ramp with a lag of LAG_S. A joint begins to brake when the ramp has fallen to the
+joint's ratio of speed to allowed speed, so the joint with the largest ratio brakes first. During a motion, the
 predicted posture changes continuously, so it cannot jump over a body.
 
-If two bodies are closer than FENCE_M at a motion's start, the arm may move them apart. Their required distance is
-then half of their largest distance in the motion so far, but at most FENCE_M. The fence ignores initially overlapping
-bodies until they separate.
+If two bodies are closer than FENCE_M at a motion's start, the arm may move them apart. The required distance of these
+bodies is then half of their largest distance in the motion so far, but at most FENCE_M. The fence ignores initially
+overlapping bodies until they separate.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ class Fence(NamedTuple):
 
 
 def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return the indices (E,) of the pairs at which the driver would stop the motions q, dq (E, T, n); -1: no stop.
+    """Return the index (E,) of the pair for which the driver would stop each motion q, dq (E, T, n); -1: no stop.
 
     limits: (n, COLUMNS), limits of the joints from `filter_limits`.
     """
@@ -49,7 +49,7 @@ def first_breaches(check: CollisionCheck, limits: np.ndarray, q: np.ndarray, dq:
 
 @njit(cache=True, error_model="numpy")
 def breached(fence, limits, q, dq, least):
-    """Return the index of the first pair of bodies that would come too close if the arm braked now; -1: no pair.
+    """Return the index of the first pair of bodies that would be too close if the arm braked now; -1: no pair.
 
     Args:
         fence: geometry. limits: (n, COLUMNS) of `filter_limits`.

@@ -1,7 +1,8 @@
 """Joint friction laws, called families; r2s contains four families, and users can add families.
 
-A friction family contains a law for arrays and, for the physics step (mujoco_callback.py), a compiled version.
-`friction.family=` selects a built-in family by name, or a user's family by a dotted path such as my_module.MY_FAMILY.
+A friction family contains a law for arrays and, for the physics step (mujoco_callback.py), a compiled version of the
+law. `friction.family=` selects a built-in family by name, or a user's family by a dotted path such as
+my_module.MY_FAMILY.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ VISCOUS = "viscous"  # name of the viscous parameter in every family that has on
 
 @dataclass(frozen=True)
 class Family:
-    """Friction law of a joint with K parameters; the torque is 0 at rest and positive for positive velocity.
+    """Friction law with K parameters for a joint; the torque is 0 at rest and positive for positive velocity.
 
     Attributes:
         name: name of the friction family in tables.
@@ -257,7 +258,10 @@ STRIBECK = Family(
 
 @njit(cache=True)
 def _bristle_native(p, v, h, memory):
-    """Return Stribeck friction and LuGre damping; z from dz/dt = (v - |v| z) / presliding (Dahl) replaces sign(v)."""
+    """Return torque and slope of Stribeck friction with LuGre damping.
+
+    The bristle deflection z replaces sign(v); its rate is dz/dt = (v - |v| z) / presliding (Dahl).
+    """
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
@@ -265,7 +269,7 @@ def _bristle_native(p, v, h, memory):
     level = p[0] * (1.0 + side * p[1]) * (1.0 + p[3] * (1.0 + side * p[6]) * np.exp(-((v / p[4]) ** 2)))
     stiff = level / p[5]
     rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
-    # second term: force of the deflection's change in the coming step at the present velocity, and bristle damping
+    # second term: force due to the change of z in the coming step at constant velocity, and bristle damping
     viscous = p[2] * (1.0 + s * p[7])
     return level * z + stiff * rate * (v - abs(v) * z) + viscous * v, stiff * rate * (1.0 - s * z) + viscous
 
@@ -337,7 +341,7 @@ def family(name: str) -> Family:
 
 
 def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
-    """Raise UserError if `family` would import `name`, which `file` contains, from a module outside of `trust`."""
+    """Raise UserError if `family` would import the family `name` in `file` from a module that is not in `trust`."""
     module = name.split(".")[0]
     if "." in name and name not in _imported and module not in trust:
         raise UserError(
@@ -347,7 +351,7 @@ def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
 
 
 def family_path(one: Family) -> str:
-    """Return the name or dotted path by which the function `family` finds the family `one`."""
+    """Return the name or dotted path for which the function `family` returns the family `one`."""
     return next((path for path, f in _imported.items() if f is one), one.name)
 
 

@@ -2,17 +2,17 @@
 
     tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
 
-The Cartesian law has the task error e, the Jacobian J, the task stiffness K, and the null-space stiffness K_n. The
-damping D = 2 zeta (M # K_q) gives every mode the damping ratio zeta. The mass matrix M and the joint stiffness K_q =
-J^T K J + N^T K_n N have the geometric mean M # K_q = M (M^-1 K_q)^(1/2). The double diagonalization of Albu-Schaeffer
-et al. (ICRA 2003) yields the same damping D from eigenvectors. The null-space projector N is dynamically consistent
-(Khatib, IEEE J. Robotics and Automation 1987). Every spring force, even a clipped one, has a potential. An energy
-tank (Ferraguti et al., ICRA 2013) must supply the energy that a rise of stiffness adds to the springs; damping
-refills the tank. The tank ignores the work of moving targets and of the null-space spring (Dietrich et al., RA-L
-2016). The feedforward cancels errors of gravity compensation and friction: bristle friction at the measured angle,
-other friction at the reference speed dq_r. A feedforward above the true friction would accelerate the arm. A
-feedforward that cancels a bristle stiffness k after a delay d adds damping k sin(w d) / w > 0 at frequencies w < pi /
-d.
+This Cartesian law contains the task error e, the Jacobian J, the task stiffness K, and the null-space stiffness K_n.
+The damping D = 2 zeta (M # K_q) gives every mode the damping ratio zeta. The mass matrix M and the joint stiffness
+K_q = J^T K J + N^T K_n N have the geometric mean M # K_q = M (M^-1 K_q)^(1/2). The double diagonalization of
+Albu-Schaeffer and others (ICRA 2003) yields the same damping D from eigenvectors. The null-space projector N is
+dynamically consistent (Khatib, IEEE Journal of Robotics and Automation 1987). Every spring force has a potential,
+even if clipped. An energy tank (Ferraguti et al., ICRA 2013) must supply the energy that a rise of stiffness adds to
+the springs; damping refills the tank. The tank ignores the work of moving targets and of the null-space spring
+(Dietrich et al., RA-L 2016). The feedforward cancels friction and the errors of gravity compensation. The feedforward
+contains bristle friction at the measured angle, or other friction at the reference speed dq_r. A feedforward above
+the true friction would accelerate the arm. A feedforward that cancels a bristle stiffness k after a delay d adds
+damping k sin(w d) / w > 0 at frequencies w < pi / d.
 """
 
 import numpy as np
@@ -29,10 +29,10 @@ from r2s.physics.newton_euler import (
 )
 
 # Parameters: cycles between two updates of D and N, 2 zeta, spring energies J at which force and moment saturate,
-# first level and size of the tank J, cycle s. Then indices in the command (-1: none), size of the target, number of
-# task axes (3 or 6), whether the law is hybrid, rate of its integrals 1/s, largest force and integral N. APPROACH:
-# above 0 if the spring to the target bounds a hybrid force; 1 if dq_r affects only the friction feedforward; SLIDES
-# if the target moves on a surface whose slope the law estimates.
+# initial level and capacity of the tank J, cycle s. Then indices in the command (-1: none), size of the target,
+# number of task axes (3 or 6), whether the law is hybrid, rate of the integrals 1/s, largest force and integral N.
+# APPROACH: if above 0, the spring to the target bounds the normal force of hybrid control. 1: dq_r affects only the
+# friction feedforward. SLIDES: the target moves on a surface whose slope the law estimates.
 HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
 DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
 K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
@@ -54,24 +54,25 @@ SPRINGS = 4  # number of stiffnesses in the task's axes
 ROUNDS = 14  # iterations of the geometric mean: enough if squared frequencies differ by a factor of 1e4
 FREE = 1.0  # rad/s, frequency that sets the damping of modes without a spring
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice REST_DQ
-# SETTLE_S: s, lag of the low-passed angles for friction; cuts a Panda's encoder noise, 1.4e-5 rad, to a third. STEP:
-# the bristles are updated after a motion of STEP times the presliding distance, at least ENCODER rad, 10 times the
-# reduced noise
+# SETTLE_S: s, lag of the low-pass on the angles for friction; reduces a Panda's encoder noise, 1.4e-5 rad, to a
+# third. STEP: the law updates the bristles after a motion of STEP times the presliding distance, but at least ENCODER
+# rad. ENCODER is 10 times the reduced noise.
 SETTLE_S, STEP, ENCODER = 5e-3, 0.1, 5e-5
-# rad/s. REST_DQ: speed below which a joint may rest, 3.5 times the noise of (q - MEAN) / SETTLE_S. DIRECTION_DQ:
-# width of friction's sign change over reference speed; in press.py on twins 0 and 1, values from 0.003 to 0.01
-# perform equally
+# rad/s. REST_DQ: speed below which a joint may be at rest, 3.5 times the noise of (q - MEAN) / SETTLE_S.
+# DIRECTION_DQ: reference speed over which the friction feedforward changes sign; in press.py on twins 0 and 1, values
+# from 0.003 to 0.01 perform equally
 REST_DQ, DIRECTION_DQ = 0.01, 0.003
-# SLOPE_RATE: 1/s; the slope estimate settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING: m/s, speed below
-# which the estimate adapts slower: 5 times the tip's speed noise, 3e-3 rad/s (Panda) at levers of 0.5 m in 7 joints
+# SLOPE_RATE: 1/s, rate of the slope estimate, which settles while a path accelerates (`ramp_s` of 0.4 s). SLIDING:
+# m/s, speed below which the estimate adapts more slowly. SLIDING is 5 times the noise of the tip speed, due to 3e-3
+# rad/s (Panda) in 7 joints at levers of 0.5 m.
 SLOPE_RATE, SLIDING = 10.0, 0.02
-SMALLEST = 0.01  # smallest share of a requested rise of stiffness; the next smaller share is 0
+SMALLEST = 0.01  # the law halves a requested rise of stiffness down to about this share, then omits the rise
 MOBILITY = 1e-3  # 1/kg, 1/(kg m^2): directions with less mobility, near a singularity, are treated as blocked
 
 
 @njit(cache=True, error_model="numpy")
 def arm_pose(q, parameters, frames, jacobian, place):
-    """Write link poses (n, POSE), the tip's Jacobian (6, n), translation rows first, and the tip position (3,) m."""
+    """Write link poses (n, POSE), the tip's Jacobian (6, n; first translation, then rotation) and position (3,) m."""
     n = len(q)
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     x, y, z = 0.0, 0.0, 0.0
@@ -92,7 +93,7 @@ def arm_pose(q, parameters, frames, jacobian, place):
 def arm_tips(q, parameters):
     """Return tip positions (m, 3) m and translational Jacobians (m, 3, n) m/rad of m postures q (m, n) rad.
 
-    parameters: array of an impedance law, which also describes the links and the tip.
+    parameters: parameters of an impedance law, which also describe the links and the tip.
     """
     m, n = q.shape
     places, out = np.empty((m, 3)), np.empty((m, 3, n))
@@ -149,8 +150,9 @@ def invert(matrix, n):
 def geometric_mean(K, mobility, out):
     """Write the geometric mean K # M = M (M^-1 K)^(1/2), (n, n), of positive definite matrices; mobility: M^-1.
 
-    From P = K and Q = M^-1, iterate P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2. The iteration is Denman and Beavers'
-    (Higham, Functions of Matrices, 2008, eq. 6.28), multiplied by M so that all iterates stay symmetric.
+    From P = K and Q = M^-1, iterate P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2. This is the iteration of Denman and
+    Beavers (Higham, Functions of Matrices, 2008, eq. 6.28) with iterates multiplied by M or M^-1, so that P and Q
+    stay symmetric.
     """
     n = len(K)
     scale = 0.0  # mean squared frequency
@@ -178,11 +180,11 @@ def geometric_mean(K, mobility, out):
 
 @njit(cache=True, error_model="numpy")
 def spring(s, limit):
-    """Return a saturating spring's energy U, J, and the factor on the linear force K e; s: J, energy e^T K e / 2.
+    """Return a saturating spring's energy U, J, and the factor on the linear force K e; s: J, linear spring's energy.
 
-    The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. U depends on s alone, so U is a potential of the
-    force for every K. U rises with K. The force is at most sqrt(2 K limit). If limit is clip^2 / (2 K_high), the
-    force is at most `clip` for every K up to K_high.
+    The energy U is s for s <= limit, else 2 sqrt(s limit) - limit. The linear spring has the energy s = e^T K e / 2.
+    U depends on the error e only through s, so U is a potential of the force for every K. U rises with K. The force
+    is at most sqrt(2 K limit). If limit is clip^2 / (2 K_high), the force is at most `clip` for every K up to K_high.
     """
     if s <= limit:
         return s, 1.0
@@ -192,7 +194,7 @@ def spring(s, limit):
 
 @njit(cache=True, error_model="numpy")
 def task_energy(K, error, tilt, parameters):
-    """Return the energy, J, of springs K (4,) at a position error (3,) m; tilt: 1 - cosine of the rotation error."""
+    """Return the energy, J, of springs K (4,) at a position error (3,) m; tilt: 1 - cos(rotation error)."""
     s = 0.5 * (K[0] * error[0] ** 2 + K[1] * error[1] ** 2 + K[2] * error[2] ** 2)
     return spring(s, parameters[FORCE_LIMIT])[0] + spring(K[3] * tilt, parameters[MOMENT_LIMIT])[0]
 
@@ -234,8 +236,9 @@ def friction_ahead(v, q, j, load, parameters, memory, at):
     With bristles, the feedforward is the bristle deflection z times the smaller of the friction magnitudes at
     reference speed and measured speed. The measured joint motion drives the deflection: dz/dt = (dq - |dq| z) /
     presliding (Dahl 1968). Without bristles and with APPROACH = 1, the feedforward is the friction at v. Without
-    bristles and with another APPROACH, the feedforward has the sign of v; for |v| >> DIRECTION_DQ, it is at least the
-    breakaway torque on a joint at rest. load: Nm, load-dependent friction. at: index of dq_r in `memory`.
+    bristles and with another APPROACH, the feedforward has the sign of v. On a joint at rest, its magnitude is at
+    least the breakaway torque for |v| >> DIRECTION_DQ. load: Nm, load-dependent friction. at: index of dq_r in
+    `memory`.
     """
     row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
     mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
@@ -273,8 +276,8 @@ def feedforward(q, parameters, frames, jacobian, memory, at, out):
     at: index of dq_r in `memory`.
     """
     n = len(q)
-    m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all links beyond a joint
-    M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # mass and first moment of these links
+    m, x, y, z = 0.0, 0.0, 0.0, 0.0  # sums over all links beyond a joint: errors of mass and first moment
+    M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # sums over these links: mass and first moment
     for j in range(n - 1, -1, -1):
         row, R = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], pose_axes(frames[j])
         u, v, w = rotate(R, row[MOMENT_ERROR], row[MOMENT_ERROR + 1], row[MOMENT_ERROR + 2])

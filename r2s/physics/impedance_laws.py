@@ -135,7 +135,7 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
 
 @njit(cache=True, error_model="numpy")
 def rotation_error(R, command, parameters, error):
-    """Write the rotation error (3,), axis times sine of the angle to the target; return 1 - cosine of this angle.
+    """Write the rotation error (3,), axis * sine of the angle to the target; return 1 - cosine of this angle.
 
     The sum of the action's and the task's rotation vectors rotates the home orientation to the target orientation.
     Luh, Walker and Paul define the rotation error (IEEE TAC 1980, eq. 22).
@@ -291,7 +291,7 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     normal, along, slides = target + int(parameters[TARGET_SIZE]), 0.0, parameters[APPROACH] == SLIDES
     if parameters[TARGET_SIZE] >= 6.0:
         velocity[:] = command[target + 3 : target + 6]
-    if slides:  # a sliding target moves within a control period
+    if slides:  # the target of a sliding tip moves within a control period
         error += parameters[CYCLE_S] * (memory[SINCE] - 0.5 * parameters[HOLD]) * velocity
     if parameters[HYBRID] > 0.0:
         along = error[0] * command[normal] + error[1] * command[normal + 1] + error[2] * command[normal + 2]

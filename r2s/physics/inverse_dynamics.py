@@ -37,7 +37,7 @@ class InverseDynamics:
         """
         own, nominal = self._links
         out = np.empty_like(q)
-        motion = np.array(q), np.array(dq), np.array(ddq)  # one array type, so that numba compiles once
+        motion = np.array(q), np.array(dq), np.array(ddq)  # one array type, so that numba compiles only once
         _rigid(own, nominal, self.robot.gravity, np.array(self.dynamics.armature), motion, out, False)
         return out
 
@@ -48,7 +48,7 @@ class InverseDynamics:
         return out
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
-        """Return the command (m, n) Nm, without gravity, for q, dq, ddq, with friction at `sliding` (m, n) rad/s."""
+        """Return the command (m, n) Nm without gravity for q, dq, ddq; sliding: (m, n) rad/s, speeds for friction."""
         d = self.dynamics
         out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
         if d.drag.any():

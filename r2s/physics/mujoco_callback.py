@@ -3,13 +3,13 @@
 `install()` registers a native control callback. The callback reads each arm's parameters from `jnt_user`, so a batch
 of different arms runs at full speed. In each physics step, the callback computes friction (friction.py). Once
 `Simulator.drive` has been called, the callback also computes control law (control_laws.py), safety filter
-(safety_filter.py) and motor delay (actuation.py). MuJoCo computes accelerations right after the control callback, so
-the callback knows the sum of all other forces, which stiction (stick_slip.py) and contact (contact.py) need.
+(safety_filter.py) and motor delay (actuation.py). Stiction (stick_slip.py) and contact (contact.py) need the sum of
+all other forces. The callback knows this sum, because MuJoCo computes accelerations right after the callback.
 
 A linearly implicit method integrates the friction torque tau_f. The callback subtracts tau_f from qfrc_passive, and
-adds the slope D = d tau_f / dv >= 0 at the current velocity v to dof_damping. Implicit integrators therefore solve
-with M + h D. The method is accurate to first order, and stable even for real wrist joints, with D of 3-10 Nm s/rad
-and inertias of 0.004-0.012 kg m^2.
+adds the slope D = d tau_f / dv >= 0 at the current velocity v to dof_damping. MuJoCo's implicit integrator therefore
+solves with the matrix M + h D. The method is accurate to first order. It is stable even for the wrist joints of real
+arms, where D is 3-10 Nm s/rad and the inertia is 0.004-0.012 kg m^2.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether to sum up link masses
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # widths: 1, 3, 1, 3
-NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: use stick_slip.py. REST: friction when sliding begins
+NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: use stick_slip.py. REST: friction at sliding onset
 GRAVITY = REST_POS + 1  # 3 wide
 DELAY, LAG, LEVEL = range(GRAVITY + 3, GRAVITY + 6)  # LEVEL: friction level for the safety filter
 LIMITS = LEVEL + 1  # limits of the safety filter, COLUMNS wide; 0: no filter
@@ -69,7 +69,7 @@ BRISTLES, PRESLIDING = FAMILIES.index(BRISTLE_FAMILY), BRISTLE_FAMILY.names.inde
 
 
 def number(family: Family, hold: str) -> int:
-    """Return the number that selects a friction law in `jnt_user`; compile a user's law first, once per process."""
+    """Return the number that selects a friction law in `jnt_user`; compile a user's law once per process."""
     law = family.native if hold == "command" or family.sharp is None else family.sharp
     return BUILT_IN.index(law) if law in BUILT_IN else friction_address(law)
 
@@ -93,7 +93,7 @@ for _k in reversed(range(len(BUILT_IN))):
 
 @njit(inline="always")
 def _weight(mass, hx, hy, hz, anchor, axis, gravity):
-    """Return the gravity torque, Nm, about a joint, axis . ((h - mass anchor) x gravity); h: kg m, first moment."""
+    """Return the gravity torque, Nm, about a joint, axis^T ((h - mass anchor) x gravity); h: kg m, first moment."""
     x, y, z = hx - mass * anchor[0], hy - mass * anchor[1], hz - mass * anchor[2]
     level = gravity[0] * (axis[1] * z - axis[2] * y) + gravity[1] * (axis[2] * x - axis[0] * z)
     return level + gravity[2] * (axis[0] * y - axis[1] * x)
@@ -111,7 +111,7 @@ def _first_moment(mass, xpos, xmat, h):
 @njit(inline="always")
 def _direction(v, net, z, user):
     """Return the factor on load-dependent friction, in [-1, 1], and its slope, s/rad; z: bristle deflection."""
-    if user[FAMILY] == BRISTLES:  # for z in the coming step, without bristle damping
+    if user[FAMILY] == BRISTLES:  # z after the coming step, without bristle damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
     if net:
@@ -245,7 +245,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by the control law's; n is no constant, which saves a minute of compiling."""
+    """Replace the applied torques by those of the control law; a variable n saves a minute of compilation."""
     user = carray(as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(as_doubles(fields[0]), (n,)), carray(as_doubles(fields[1]), (n,))
     applied, kept = carray(as_doubles(fields[2]), (n,)), carray(as_doubles(fields[5]), (KEPT, n))
@@ -261,7 +261,7 @@ def _control(n, user, fields):
 def _drive(n, user, fields, places):
     """Apply `condition_joint`, safety filter, delay and lag, in this order, to the applied torques.
 
-    If n is a constant, numba unrolls the loops, so that the filter takes half the time (benchmarks/law.py).
+    If n is a constant, numba unrolls the loops, which halves the filter's time (benchmarks/law.py).
 
     Args:
         n: number of joints. user, fields, places: addresses of MuJoCo's arrays.

@@ -1,4 +1,4 @@
-"""Find, in a live model, the byte offsets of the mjModel and mjData fields that the compiled callback reads."""
+"""Find the byte offsets of the mjModel and mjData fields that the compiled callback reads, in a compiled model."""
 
 import ctypes
 from typing import Any
@@ -14,13 +14,13 @@ DATA_FIELDS = (  # in the order of mujoco_callback.py
 
 
 def struct_offsets(width: int, kept: int) -> dict[str, int]:
-    """Return the byte offsets of MODEL_FIELDS in mjModel and DATA_FIELDS in mjData, found in a live model.
+    """Return the byte offsets of MODEL_FIELDS in mjModel and DATA_FIELDS in mjData, found in a compiled model.
 
-    A field that contains the address of an array's NumPy view is the array's pointer. MuJoCo's introspection lists
-    the size fields in the order of the struct.
+    The field with the address of an array's NumPy view is the pointer to this array. MuJoCo's introspection lists the
+    size fields in the order of the struct.
 
     Args:
-        width: number of columns of `jnt_user` in the live model. kept: number of rows of `userdata` (kept, n).
+        width: number of columns of `jnt_user` in that model. kept: number of rows of `userdata` (kept, n).
     """
     joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
     spec = mujoco.MjSpec.from_string(

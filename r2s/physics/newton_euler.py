@@ -92,7 +92,7 @@ def _project(mass, bias, work):
             s[19],
             s[20],
             s[21],
-        )  # joint axis, and velocity at the base's origin for 1 rad/s
+        )  # joint axis, and velocity at the base's origin when the joint turns at 1 rad/s
         m, hx, hy, hz = s[6], s[7], s[8], s[9]
         tx, ty, tz = _cross(zx, zy, zz, hx, hy, hz)
         lx, ly, lz = m * vx + tx, m * vy + ty, m * vz + tz
@@ -117,7 +117,7 @@ def joint_frame(R, link, angle):
         R: rotation of the parent link (9 numbers, row by row). link: row of `links_of`. angle: joint angle, rad.
 
     Returns:
-        Offset of the link from the parent link, m, joint axis, and rotation matrix of the link, all in base axes.
+        Offset (m) of the link from the parent link, joint axis, and rotation matrix of the link, all in base axes.
     """
     offset = rotate(R, link[PLACE], link[PLACE + 1], link[PLACE + 2])
     R = product(R, link, FRAME)

@@ -1,4 +1,4 @@
-"""Obstacles: boxes around an arm that its links must not touch."""
+"""Obstacles: boxes that the links of an arm must not touch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

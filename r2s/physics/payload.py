@@ -1,8 +1,8 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-r2s adds a payload to mass, center and inertia tensor of the last link, which is exact in every simulator. An external
-force could not represent a payload, because the force would depend on the acceleration that it causes. The payload's
-frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
+r2s adds a payload to mass, center and inertia tensor of the last link; this method is exact in every simulator. An
+external force could not represent a payload, because the force would depend on the acceleration that it causes. The
+payload's frame is the frame of `robot.ee_site`; on a Panda, this frame is the flange, as in libfranka's setLoad.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
 
 Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centers (..., n, 3) m, tensors (..., n, 3, 3)
-USUAL = 0.5  # ratio of usual to largest allowed payload mass, and of usual to largest allowed distance
+USUAL = 0.5  # usual payload mass / largest allowed mass, and usual distance / largest allowed distance
 WATER = 1000.0  # kg/m^3
 
 
@@ -48,7 +48,7 @@ class Payload:
 
 
 def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload") -> Payload | None:
-    """Return the payload that a setting describes as a number of kg, a mapping or a file; None for null or 0 kg.
+    """Return the payload that a setting describes: a mass in kg, a mapping or a file; None for null or 0 kg.
 
     A number is the mass, kg, of a point mass at the end effector. A mapping contains `mass` and optionally `centre`
     (3,) m, `inertia` (xx, yy, zz or xx, yy, zz, xy, xz, yz, kg m^2 about `centre`; default: a sphere of water),
@@ -115,7 +115,7 @@ def _of_file(name: str, path: Path) -> Any:
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
-    """Return the inertia tensor (3, 3) kg m^2 from 3 moments or 6 elements; None: of a sphere of water.
+    """Return the inertia tensor (3, 3) kg m^2 from 3 moments or 6 elements or, for None, of a sphere of water.
 
     A principal moment may be at most m (2 d)^2, with the largest allowed mass m and distance d in `most`.
     """

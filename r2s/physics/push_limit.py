@@ -1,7 +1,7 @@
 """Limit the force with which a tool's tip presses on a surface, and the tip's closing speed at contact.
 
 A push is a force along the surface's inward normal. Along the inward normal, the tip's Jacobian J, speed v and
-effective mass m = 1 / (J M^-1 J^T) (Khatib, IEEE J. Robotics and Automation 3(1), 1987) satisfy
+effective mass m = 1 / (J M^-1 J^T) (Khatib, IEEE Journal of Robotics and Automation 3(1), 1987) satisfy
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
@@ -15,7 +15,7 @@ P is the push of the command, F >= 0 is the contact force, and P_f is the push o
 The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass filtered P - m dv/dt.
 In free motion, the estimate R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, the estimate
 R is P, so the speed rule allows the push P to rise. If the tip moves inward faster than v_max, or outward faster than
-`speed_near` / OVERSHOOT, the push limit caps the estimate R at 0.
+`speed_near` / OVERSHOOT (in a stop: OVERSHOOT LEAVE), the push limit caps the estimate R at 0.
 
 On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). By the
 speed rule, the tip is not faster than speed_near when F reaches force_max. By the force rule, P + P_f <= force_max,
@@ -25,8 +25,8 @@ plane with the normal n. On a surface with friction, the bound therefore contain
 instead of F and k.
 
 The force rule and the speed rule restrict the torque to two half-spaces with the same normal J M^-1. Of all torques
-in both half-spaces, Gauss' principle selects the one nearest to the effort: the effort minus J^T f. Regula falsi
-finds the force f for which the torque also satisfies the acceleration bounds (safety_filter.py).
+in both half-spaces, Gauss' principle selects the torque nearest to the effort, which is the effort minus J^T f.
+Regula falsi finds the force f for which the torque also satisfies the acceleration bounds (safety_filter.py).
 """
 
 from dataclasses import dataclass
@@ -43,8 +43,9 @@ from r2s.physics.safety_filter import APPROACH, RATE, JointDynamics, bounded, jo
 from r2s.physics.safety_filter import WORK as FILTER_WORK
 from r2s.physics.tip import Tip, nominal_plane
 
-# Columns of a limit: settings, its state (R in N, last speed in m/s, whether this speed is valid), and a stop's state
-# (contact_stop.py): phase, contact force N at its start, height m at which the tip left the surface, outward pull N
+# Columns of a limit: settings; state of the push limit: R in N, last speed in m/s, whether this speed is valid; state
+# of a stop (contact_stop.py): phase, contact force N at the start, height m at which the tip left the surface,
+# outward pull N
 FORCE_MAX, SPEED_NEAR, SLOPE, MARGIN, POINT, NORMAL, TIP, RADIUS, RESISTED, SPEED, BEGUN = (
     *(0, 1, 2, 3, 4, 7, 10, 13, 14, 15, 16),
 )
@@ -81,7 +82,7 @@ class PushLimit:
 
     def columns(self, robot: Robot) -> np.ndarray:
         """Return the initial argument `limit` (COLUMNS,) of `push_bound` for the robot's tool."""
-        Tip(robot)  # raises without a tool
+        Tip(robot)  # raises UserError without a tool
         site, axes = ee_pose(robot)
         out = np.zeros(COLUMNS)
         out[FORCE_MAX], out[SPEED_NEAR] = self.force_max, self.speed_near / OVERSHOOT
@@ -91,7 +92,7 @@ class PushLimit:
         return out
 
     def at(self, robot: Robot, friction: np.ndarray, q: np.ndarray) -> tuple[float, float]:
-        """Return the effective mass, kg, at q (n,) rad, and the largest push, N, by joint friction (n,) Nm."""
+        """Return the effective mass, kg, at q (n,) rad, and the largest push, N, of joint friction (n,) Nm."""
         row = -self.normal @ Tip(robot)(q)[1]
         lever = InverseInertia(robot)(q[None])[0] @ row
         mass = 1.0 / float(row @ lever)
@@ -104,7 +105,7 @@ class PushLimit:
         surface friction can push a sliding tip inward without limit.
         """
         jacobian = Tip(robot)(q)[1]
-        moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, for a normal force
+        moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, per unit normal force
         mass = 1.0 / float(moved @ self.normal)
         left = 1.0 - friction * mass * float(np.linalg.norm(moved - self.normal / mass))
         return (self.force_max + self.speed_near * np.sqrt(left * stiffness * mass)) / left if left > 0.0 else np.inf
@@ -123,8 +124,8 @@ def push_limit(
 
     Args:
         robot: an arm with a tool. friction: (n,) Nm, friction level of each joint.
-        force_max, speed_near: N and m/s, see `PushLimit`; a speed_near of None limits the contact force at home, on a
-            surface of 1e5 N/m, to 2 force_max.
+        force_max, speed_near: N and m/s, see `PushLimit`; None for `speed_near`: the speed that limits the contact
+            force to 2 force_max, at home on a surface of 1e5 N/m.
         plane: point (3,) m and normal (3,); if None, a work table below the tip at home. asked: N, a task's largest
             force.
         stop: a key of STOPS (contact_stop.py), "release" by default.
@@ -239,8 +240,8 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     """Limit the push and the joint accelerations that the torques `out` (n,) Nm cause.
 
-    The contact force acts as an external load. Return whether `out` changed. `filter_torque` explains `share` and
-    `limits`; `push_bound` explains the other arguments.
+    The acceleration bounds include the estimated contact force. Return whether `out` changed. `filter_torque`
+    explains `share` and `limits`; `push_bound` explains the other arguments.
     """
     n = len(out)
     own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()
@@ -257,8 +258,8 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     mobility = 0.0
     for j in range(n):
         mobility += row[j] * lever[j]
-    # low, high: N, bracket of f; before, after: excess there. If no joint is at its bound, the first trial hits the
-    # middle of the tolerance CLOSE; at its edge, round-off could require another trial
+    # low, high: N, bracket of f; before, after: excess at low and high. If no joint is at its bound, the first trial
+    # hits the middle of the tolerance CLOSE; a trial at the edge of CLOSE could fail by round-off
     low, high, after, force = 0.0, np.inf, 0.0, (before + 0.5 * CLOSE) / mobility
     for _ in range(ROUNDS):
         for j in range(n):

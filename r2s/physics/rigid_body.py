@@ -112,7 +112,7 @@ def rigid_body(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rest (T, n) Nm and regressor (T, n, n, 10) of torque = rest + regressor @ standard parameters.
 
-    The torque `rest` is due to armature and welded bodies in the robot's file. `regressor` explains the arguments.
+    `rest` is the torque due to armature and to welded bodies in the robot's file. `regressor` explains the arguments.
     """
     total = nominal_torque(robot, q, dq, ddq, False if gravity is None else gravity)
     y = regressor(robot, q, dq, ddq, gravity)

@@ -1,9 +1,9 @@
 """Load a `Robot`: kinematics, inertia and gravity from an MJCF or URDF file, limits from the file or the config.
 
-r2s commands joint torques, so `Robot.model` has the file's joints and links, but no actuators, sensors, keyframes,
-free objects, gravity compensation or contacts. The file's damping and frictionloss are nominal values of the friction
-law (dynamics.py), so `Robot.model` sets both to 0, but keeps nonlinear damping. The file's armature is the nominal
-rotor inertia. `robot.mjcf=FILE` loads any serial arm of hinge joints.
+`Robot.model` has the file's joints and links, but no sensors, keyframes, free objects, gravity compensation or
+contacts, and no actuators, because r2s commands joint torques. The file's damping and frictionloss are nominal values
+of the friction law (dynamics.py), so `Robot.model` sets both to 0. Nonlinear damping stays in `Robot.model`. The
+file's armature is the nominal rotor inertia. `robot.mjcf=FILE` loads any serial arm of hinge joints.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,10 +28,10 @@ PANDA = "r2s:models/panda.xml"
 RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm, and physics step
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of the Panda's size
-# Default payload limits, the ratios of a Panda (3 kg, 0.15 m, 87 Nm): weight of the payload * reach / largest torque
-# limit, and distance from the end effector to the payload's center / reach.
+# Ratios that define default payload limits, from a Panda (3 kg, 0.15 m, 87 Nm): payload weight * reach / largest
+# torque limit, and distance from the end effector to the payload's center / reach.
 PAYLOAD_SHARE, PAYLOAD_FAR = 0.33, 0.15
-OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot that tasks use, not `load_robot`
+OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot for tasks, not for `load_robot`
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Robot:
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its center of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
         damping, frictionloss: (n,) Nm s/rad and (n,) Nm, viscous and Coulomb friction in the file, 0 by default.
-        velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3, whose velocity limit is sqrt(2
-            deceleration distance + offset^2) - offset at a distance, rad, from a position limit; None: the velocity
-            limit does not depend on position.
+        velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3. At a distance, rad, from a
+            position limit, an FR3's velocity limit is sqrt(2 deceleration distance + offset^2) - offset. None: the
+            velocity limit does not depend on position.
         tool: the spherical tip that touches surfaces; None: no tool.
         lock: {joint: rad or m}, positions of the welded joints.
         payload_max: (2,) largest payload mass, kg, and largest distance, m, from end effector to payload center.
@@ -135,7 +135,7 @@ class Robot:
 
 
 def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
-    """Return an array (n,) from one value per joint or one for all joints; joints: their name in error messages.
+    """Return an array (n,) from one value per joint or one for all joints; joints: name of the joints in messages.
 
     Raises:
         UserError: the number of values is wrong, or a value is not a number.
@@ -174,14 +174,14 @@ def load_robot(
 
     r2s reads position limits, torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
     its motor), q_home (a keyframe named home) and, from a URDF, velocity limits. MJCF and URDF have no limits of
-    acceleration or torque rate. r2s ignores `gravcomp`, disabled gravity and objects on free joints in the file.
+    acceleration or torque rate. r2s ignores `gravcomp`, gravity flags and objects on free joints in the file.
 
     Args:
         mjcf: path of the file; `r2s:` is the package's folder, as in `r2s:models/panda.xml`; if None, load the Panda.
         ee: site, body or link of the end effector; if None, use the only site, or the last link of a URDF.
         q_home, q_min, q_max, dq_max, ddq_max, tau_max, dtau_max: see `Robot`; if None, from the file or a default.
         gravity: (3,) m/s^2 in the base frame; None: the file's gravity or, for a URDF, gravity of an upright base.
-        armature: kg m^2, rotor inertia at the joints; None: the file's armature.
+        armature: kg m^2, rotor inertia reflected to the joints; None: the file's armature.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
         lock: {joint: rad or m}, positions at which to weld joints, such as a gripper's; None: weld no joint.
         payload_max, payload_far: kg and m, for `Robot.payload_max`; if None, from torque limits and reach.

@@ -9,16 +9,16 @@ from r2s.errors import UserError, choices
 
 LIGHTEST = 1 / 500  # smallest link mass / moving mass: real wrists have 1/170 (UR16e) to 1/20, placeholders 1/10,000
 HEAVIEST = 2.0  # largest link mass / mass of all other links: up to 0.8 for the upper arm of a real arm
-DEGREES_FROM = 30.0  # limits between 30 rad and 360 rad are taken for degrees
+DEGREES_FROM = 30.0  # rad; position limits above this value, up to 360, are probably in degrees
 VIRTUAL = 0.01  # m: a link whose two joints are closer is part of a universal joint and needs no mass
 WEIGHT = 2.0  # largest plausible gravity torque in the worst posture, as a multiple of tau_max
 POSTURES = 200  # number of random postures in which gravity torque is computed
-WIDEST = 2.0  # largest distance of a link's parts from the link's center of mass, in arm lengths
-DENSEST = 2e4  # kg/m^3, tungsten: no link has smaller moments than a tungsten ball of its mass
+WIDEST = 2.0  # largest plausible distance of a link's parts from the link's center of mass, in arm lengths
+DENSEST = 2e4  # kg/m^3, tungsten: no link has smaller moments than a tungsten ball of the link's mass
 
 
 def check_arm(model: mujoco.MjModel, path: Path) -> None:
-    """Raise UserError unless the joints are hinges of one serial chain, one per body, without couplings."""
+    """Raise UserError unless the joints are uncoupled hinges of one serial chain, with one joint per body."""
     name = f"robot.mjcf: {path.name}"
     if model.njnt == 0:
         raise UserError(f"{name} has no joints")
@@ -56,7 +56,7 @@ def _check_couplings(model: mujoco.MjModel, name: str) -> None:
         if kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
             bodies = [model.site_bodyid[k] if model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE else k for k in ends]
             welded = len({int(model.body_weldid[k]) for k in bodies}) == 1
-            if welded or any(model.body_mocapid[k] >= 0 for k in bodies):  # a user drags the arm by a mocap body
+            if welded or any(model.body_mocapid[k] >= 0 for k in bodies):  # a mocap body is a handle for the user
                 continue
             what = " and ".join(f"'{model.body(k).name}'" for k in bodies)
         elif kind == mujoco.mjtEq.mjEQ_JOINT:

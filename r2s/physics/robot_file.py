@@ -1,7 +1,7 @@
 """Read the arm in an MJCF or URDF file, weld locked joints, and remove elements of the simulation.
 
-The reader removes loose objects of MJCF scenes: bodies with free or ball joints only. A gripper's fingers are welded
-at the positions in `robot.lock`, so the fingers become part of the link that holds the gripper.
+The reader removes loose objects of MJCF scenes: bodies with free or ball joints only. The reader welds a gripper's
+fingers at the positions in `robot.lock`, so the fingers become part of the link with the gripper.
 """
 
 from collections.abc import Mapping
@@ -66,7 +66,7 @@ def strip(spec: mujoco.MjSpec) -> None:
 
 
 def rotors(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return each joint's rotor inertia (n,) kg m^2 and viscous damping (n,) Nm s/rad, including the motor's."""
+    """Return each joint's rotor inertia (n,) kg m^2 and viscous damping (n,) Nm s/rad, both including the motor's."""
     armature, damping = model.dof_armature[model.jnt_dofadr].copy(), model.dof_damping[model.jnt_dofadr].copy()
     for i in np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT):
         joint, square = model.actuator_trnid[i, 0], model.actuator_gear[i, 0] ** 2
@@ -144,7 +144,7 @@ def _weld(spec: mujoco.MjSpec, lock: Mapping[str, float], path: Path) -> None:
 
 
 def _lump(spec: mujoco.MjSpec, welded: set[str | int]) -> None:
-    """Add the inertia of welded bodies, and of bodies fixed to them, to the moving links that they are welded to."""
+    """Add the inertia of welded bodies, and of bodies fixed to welded bodies, to the links that move these bodies."""
     model = spec.compile()
     bodies, of = Bodies(model), {body.id: body for body in spec.bodies}
     carriers = {int(model.body_weldid[body.id]) for body in of.values() if (body.name or body.id) in welded}

@@ -1,12 +1,12 @@
-"""Limit joint accelerations near speed and position limits, as the last stage before the arm: the safety filter.
+"""The safety filter, the last stage before the arm, limits joint accelerations near speed and position limits.
 
 Training and every arm run the same compiled safety filter. The filter's input is the effort, the target torque after
-the low-pass (r2s/physics/actuation.py). The safety filter consists of three limits:
+the low-pass (r2s/physics/actuation.py). The safety filter has three stages:
 
 - Fading: the policy's torque fades out as a joint approaches its velocity limit or a position limit.
 - Acceleration limit: each joint's acceleration a = M^-1 (tau - Coriolis torque) satisfies -RATE (v + dq) <= a <= RATE
   (v - dq), with the mass matrix M and the speed v allowed at q. By Gauss' principle of least constraint, the filter
-  selects the torque nearest to the effort within the acceleration limit, which is the effort plus torques of
+  selects the torque nearest to the effort within the acceleration limit. This torque is the effort plus torques of
   fictitious joint stops. Joint friction only widens the acceleration limit, so overestimated friction never
   accelerates a joint.
 - Rate limit: the filter clips each joint's torque, then multiplies the torque rates of all joints by the same factor.
@@ -15,7 +15,8 @@ the low-pass (r2s/physics/actuation.py). The safety filter consists of three lim
   joint axes are almost parallel.
 
 The acceleration limit is a control barrier function (Ames et al., European Control Conference 2019). The command is
-continuous in state and effort, so the filter causes no chattering. RATE is low enough for the latency of an arm.
+continuous in state and effort, so the filter causes no chattering. RATE is low enough for an arm with the latency
+LATENCY_S.
 """
 
 import math
@@ -34,15 +35,15 @@ LATENCY_S = 0.012
 # 1/s, rate of the acceleration limit. A first-order loop with delay d does not overshoot for rate * d <= 1/e: at
 # equality, s + rate exp(-s d) = 0 has a double real root.
 RATE = round(1 / (math.e * LATENCY_S))
-APPROACH = 0.25 * RATE  # 1/s, allowed speed per distance from a position limit: critical damping of the loop
+APPROACH = 0.25 * RATE  # 1/s, allowed speed / distance from a position limit, for critical damping of the loop
 ALLOWED = 0.66  # share of dq_max that the filter allows; model errors add to the speed (docs/explanation/safety.md)
 FADED = 0.82  # the policy's torque fades out between the speeds ALLOWED * dq_max and FADED * dq_max
 # Q_MARGIN: rad, distance from a position limit at which the allowed speed towards the limit is 0; at most a tenth of
 # the range. Closer to the limit, the policy's torque fades out over Q_FADE_SHARE times this distance.
 Q_MARGIN, Q_FADE_SHARE = 0.1, 0.6
 ENVELOPE_SHARE = 0.55  # share of the position-dependent velocity limit of an FR3 that the filter uses
-# s, time in which the allowed speed ramps down while braking. With 0.1 s, the base joint's torque reached 60 Nm.
-# Limited to 1 Nm/ms, this torque fell too late, and threw a stretched elbow forward.
+# s, time in which the allowed speed ramps down while braking. With 0.1 s, the braking torque of the base joint
+# reached 60 Nm. At the rate limit of 1 Nm/ms, this torque fell too late, and threw a stretched elbow forward.
 BRAKE_S = 0.15
 TOLERANCE = 1e-9  # rad/s^2, tolerance of the acceleration bounds
 PIVOTS = 5  # number of rounds of block pivoting; single pivots follow, which always terminate (Murty 1974)
@@ -70,9 +71,10 @@ class JointDynamics(NamedTuple):
 def filter_limits(robot: Robot, torque: np.ndarray, speed_share: float = 1.0) -> np.ndarray:
     """Return the argument `limits` (n, COLUMNS) of `filter_torque`.
 
-    The filter's mass matrix adds inertia (column ADDED) to light joints, just enough that at rest the largest target
-    torque of any joint satisfies the acceleration limit. Added inertia raises the gain of the loop of filter and arm.
-    The added inertia is limited so that LATENCY_S causes a phase lag of at most DELAY_PHASE in this loop.
+    The filter adds inertia (column ADDED) to light joints in the mass matrix: just enough for an arm at rest to
+    satisfy the acceleration limit under the largest target torque of any joint. Added inertia raises the gain of the
+    loop of filter and arm. The added inertia is therefore limited, so that LATENCY_S causes a phase lag of at most
+    DELAY_PHASE in this loop.
 
     Args:
         robot: the arm, for its position, velocity, torque and rate limits and mass matrix in the home posture.
@@ -88,7 +90,8 @@ def filter_limits(robot: Robot, torque: np.ndarray, speed_share: float = 1.0) ->
     mobility = InverseInertia(robot)(robot.q_home[None])[0]
     inertia = 1 / np.diag(mobility)
     most = (DELAY_PHASE / (RATE * LATENCY_S) - 1) * inertia
-    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm, as effective as the most effective target torque
+    # Nm, torque at a joint that accelerates the joint as much as any joint's largest target torque can
+    equivalent = inertia * (np.abs(mobility) * torque).max(1)
     out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.step_max
     out[:, [DQ_ALLOWED, DQ_MAX]] *= speed_share
@@ -276,7 +279,7 @@ def _stop_torque(ddq, low, high, work, root):
                 reached += mobility[j, k] * stop[k]
             following[j] = side[j]
             if side[j] * stop[j] > 0.0:
-                following[j] = 0.0  # this stop would pull outwards
+                following[j] = 0.0  # this stop would pull outward
             elif side[j] == 0.0:
                 beyond = -1.0 if reached < low[j] - TOLERANCE else 0.0
                 following[j] = 1.0 if reached > high[j] + TOLERANCE else beyond

@@ -2,7 +2,7 @@
 
 The simulation has no gravity, and commanded torques exclude gravity (libfranka's convention), because the arm adds
 its own gravity compensation. The arm computes gravity compensation from the nominal links and the declared payload.
-The simulation adds the torque error of gravity compensation (r2s/physics/mujoco_callback.py).
+The simulation adds only the torque error of gravity compensation (r2s/physics/mujoco_callback.py).
 """
 
 from collections.abc import Mapping
@@ -70,7 +70,7 @@ class Simulator:
         self._bodies = self.model.jnt_bodyid
         self._site = self.model.site(robot.ee_site).id
         self._user = self.batch.expand("jnt_user")
-        self._damping = self.batch.expand("dof_damping")  # one array per arm, because the friction law writes it
+        self._damping = self.batch.expand("dof_damping")  # one array per arm, for the slope of its friction
         self._armature = self.batch.expand("dof_armature")
         self._inertia = self.batch.expand("body_inertia")
         self._iquat = self.batch.expand("body_iquat")
@@ -145,7 +145,7 @@ class Simulator:
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
         """Set the commands (nsim, c) of the arms' control laws until the next call of `command`.
 
-        speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: keep the last noise;
+        speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: the last noise stays;
         `reset` sets the noise to 0.
         """
         n = self.robot.n
@@ -154,7 +154,7 @@ class Simulator:
             self._memory[:, native.NOISE * n : (native.NOISE + 1) * n] = speed_noise
 
     def push(self, tau: np.ndarray) -> None:
-        """Apply external joint torques tau (nsim, n) Nm, besides the arms' offsets, until the next call of `push`."""
+        """Apply external joint torques tau (nsim, n) Nm, in addition to offsets, until the next call of `push`."""
         self._user[:, :, native.OFFSET] = self._offset + tau
 
     def reset(
@@ -267,7 +267,7 @@ def _jacobian(axis, anchor, ee):
 
 
 def single_arm(robot: Robot, dynamics: Dynamics) -> mujoco.MjModel:
-    """Return the model of one arm without gravity and contact: its links, rotors and friction law."""
+    """Return the model of one arm with links, rotors and friction law of `dynamics`, without gravity and contact."""
     native.install()
     memory = native.KEPT * robot.n + (0 if robot.tool is None else COLUMNS)
     model = robot.model(gravity=False, user=native.WIDTH, memory=memory)

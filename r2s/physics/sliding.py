@@ -2,20 +2,20 @@
 
 The limit surface of table friction is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
 Tanie, IROS 1992). A box with center velocity v and spin w has the generalized velocity u = (v, r w), and the table
-friction -mu N u / |u| under the normal force N. Pressure on the base is uniform, so the ratio r of friction moment to
-force is the mean distance between the base's points and the base's center. On a box at rest, table friction is the
-elastic force -mu N z / `RIGID` with a deflection z. Backward Euler integrates dz/dt = u - |u| z / RIGID; while the
-box slides, z / RIGID equals u / |u|.
+friction -mu N u / |u| under the normal force N. The model assumes uniform pressure on the base, so the ratio r of
+friction moment to friction force is the mean distance between the base's points and the base's center. On a box at
+rest, table friction is the elastic force -mu N z / `RIGID` with a deflection z. Backward Euler integrates dz/dt = u -
+|u| z / RIGID; while the box slides, z / RIGID equals u / |u|.
 
-The box is not a body of the MuJoCo model, so simulations without a box do not change. Training, twins and engines
+The box is not a body of the MuJoCo model, so simulations without a box stay unchanged. Training, twins and engines
 share one compiled law, which solves joint friction and box motion together. The box neither tilts nor lifts off
 (`check_size` in box.py). The tip does not touch the table; the tip's vertical force only changes the box's load.
 
-In a step, the contact force on the tip is F = F0 - K d, with a resistance K, N s/m. Here, d is the change of the
-tip's velocity relative to the box, and F0 is the force for d = 0. The box's velocity after the step is linear in F,
-with the mobility h W at the contact. Elimination of the box's velocity yields the contact force F = (1 + h K W)^-1
-(F0 + K d_0 - K d_tip) for the joint equations. Here, d_tip is the change of the tip's velocity, and d_0 is the change
-of the box's velocity for F = 0.
+In a step, the contact force on the tip is F = F0 - K d, with a resistance K, N s/m. The vector d is the change of the
+tip's velocity relative to the box, and F0 is the contact force for d = 0. The box's velocity after the step is linear
+in F, with the mobility h W at the contact. Elimination of the box's velocity yields the contact force F = (1 + h K
+W)^-1 (F0 + K d_0 - K d_tip) for the joint equations. The vector d_tip is the change of the tip's velocity, and d_0 is
+the change of the box's velocity for F = 0.
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ from r2s.physics.contact_layout import (
 )
 
 RIGID = 1e-6  # m, largest elastic deflection of a box on its table
-STILL = 1e-6  # m/s, speed below which a box without contact is at rest; table friction stops 4e-3 m/s within 1 ms
+STILL = 1e-6  # m/s, speed below which a box without contact is at rest; friction stops a box of 4e-3 m/s in 1 ms
 ROUNDS = 30  # largest number of guesses of the box's speed
 CLOSE = 1e-4  # relative error of the guessed speed at which the iteration ends
 
@@ -188,7 +188,7 @@ def _divide(a, vector, matrix):
 
 @njit(cache=True, error_model="numpy")
 def yielded(contact, tip, h, guess, point):
-    """Write the box's velocity at the contact to `point`; return the relative friction error due to the speed guess.
+    """Write the box's velocity at the contact to `point`; return table friction's relative error due to the guess.
 
     `point` and `tip`, (3,) m/s, are velocities after the step.
     """

@@ -2,8 +2,8 @@
 
 A joint at rest sticks while its net torque lies between its edges, the breakaway torques in the negative and positive
 direction. The net torque includes the coupling to other joints, but not the joint's own friction. If the net torque
-is beyond an edge, the joint slides in the torque's direction. Torques are constant in a step, and accelerations are
-constant between events, so each event is located exactly (event-driven integration: Pfeiffer and Glocker, Multibody
+exceeds an edge, the joint slides in the torque's direction. Torques are constant in a step, and accelerations are
+constant between events, so the time of each event is exact (event-driven integration: Pfeiffer and Glocker, Multibody
 Dynamics with Unilateral Contacts, 1996). Time stepping would apply the friction at a step's end to the whole step. At
 a reversal, the impulse error would be up to the friction times the step h.
 
@@ -26,8 +26,8 @@ class JointForces(NamedTuple):
 
     dq: (n,) rad/s, joint velocities. drive: (n,) Nm, sum of torques without friction. friction: (n,) Nm, friction at
     dq. rest: (2, n) Nm, kinetic friction at zero speed in negative and positive direction. edges: (2, n) Nm,
-    breakaway torques in negative and positive direction. Their magnitudes are at least those of `rest`. For a
-    joint without stiction, both edges are 0.
+    breakaway torques in negative and positive direction. The magnitudes of `edges` are at least those of `rest`. For
+    a joint without stiction, both edges are 0.
     """
 
     dq: np.ndarray
@@ -75,7 +75,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
         return True
     took_part, left, events = False, h, 0
     while True:
-        while True:  # the sticking joint that is farthest beyond its edges breaks away
+        while True:  # the sticking joint with the net torque farthest beyond its edges breaks away
             for j in range(n):
                 acceleration[j] = forces.drive[j] - friction[j]
             unpack(mass, h, damping, root)
@@ -114,7 +114,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
 
 @njit(cache=True, error_model="numpy")
 def _initial_sides(forces, dq_min, side, friction, coming):
-    """Write each joint's side, friction and velocity; return whether a HELD joint creeps and whether all rest."""
+    """Write each joint's side, friction and velocity; return whether a HELD joint moves, and whether all rest."""
     dq, drive, edges, n = forces.dq, forces.drive, forces.edges, len(forces.dq)
     slow, held, inside = False, 0, True
     for j in range(n):
@@ -148,7 +148,7 @@ def _first_stop(coming, acceleration, side, left):
 
 @njit(cache=True, error_model="numpy")
 def _farthest_beyond(mass, acceleration, forces, side):
-    """Return the index of the sticking joint farthest beyond its edges (-1: none), and the sign of its net torque."""
+    """Return the sticking joint whose net torque is farthest beyond its edges (-1: none), and this torque's sign."""
     worst, at, direction = 0.0, -1, 1.0
     for j in range(len(side)):
         if side[j] == HELD:

@@ -16,7 +16,7 @@ from r2s.errors import UserError, instead_of, nearest_file
 from r2s.files import located
 
 TINY = np.finfo(float).tiny
-UNIT_DEPTH = 1e-3  # m, penetration depth at which `stiffness` is force per depth
+UNIT_DEPTH = 1e-3  # m, penetration depth at which the elastic force is `stiffness` * depth
 TOOL_KEYS = ("tip_in_flange_m", "radius_m", "mass_kg", "frame")
 
 

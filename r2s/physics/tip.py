@@ -6,9 +6,9 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.robot import Robot
 
-BELOW = 0.15  # gap from nominal surface to tip in home posture, relative to the end effector's distance from the base
+BELOW = 0.15  # gap between nominal surface and tip in the home posture / distance from base to end effector
 POSTURE = 1e-3  # m^2, damping in the least-squares steps of inverse kinematics
-MARGIN = 0.1  # rad, distance that inverse kinematics keeps from the position limits
+MARGIN = 0.1  # rad, smallest distance of a solution of inverse kinematics from the position limits
 CLOSE = 1e-4  # m, position error at which inverse kinematics ends
 ROUNDS = 60
 

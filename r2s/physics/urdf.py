@@ -38,7 +38,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
     The spec has the file's body and joint names, joint damping and friction. `lock` ({name: rad or m}) fixes joints
-    at the given positions. Joints that mimic a locked joint are also fixed, at the positions that result.
+    at the given positions. `lock` also fixes joints that mimic a locked joint, at the resulting positions.
 
     Raises:
         UserError: the file is not XML, not URDF, or not an arm of revolute (or continuous) joints.

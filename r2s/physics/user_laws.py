@@ -1,8 +1,8 @@
 """Call a user's control or friction law from the cached compiled code of r2s.
 
 Compiling the code of r2s for a new law would take half a minute in every process, so r2s compiles only the user's
-law, and calls the law by address. A built-in law has an index, a small integer, instead of an address. A float64
-represents every address exactly, because addresses are below 2^53.
+law, and calls the law by address. A built-in law has an index, a small integer, instead of an address. r2s stores
+index or address as a float64, which is exact, because addresses are below 2^53.
 """
 
 from collections.abc import Callable

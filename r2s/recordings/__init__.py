@@ -1,1 +1,1 @@
-"""Recordings of an arm: the data type, file readers, breakaway ramps and checks."""
+"""Define recordings of an arm; read them from files and logs, repair and check them, and write them to files."""

@@ -7,12 +7,12 @@ from r2s.recordings.recording import Recording
 
 LEAST = 0.02  # rad RMS about a linear trend; a joint that moves less has no speed factor
 UNEXPLAINED = 0.03  # largest share of a joint's mean square motion that a valid speed factor leaves unexplained
-WRONG = 0.1  # a speed factor this far from 1 is an error; filters of dq and elastic gears change it by 1 to 2 %
-ALIKE = 0.05  # if the joints' speed factors spread less than this (relative), the clock or the unit of dq is wrong
+WRONG = 0.1  # a speed factor this far from 1 is an error; filters of dq and elastic gears cause 1 to 2 %
+ALIKE = 0.05  # if all speed factors are wrong and spread less than this (relative), the clock or dq's unit is wrong
 
 
 def speed_factors(recording: Recording) -> np.ndarray:
-    """Return speed factors (n,), change of q / integral of dq; nan if a joint's motion does not determine its factor.
+    """Return each joint's speed factor (n,): change of q / integral of dq; nan if the motion does not determine it.
 
     In each trajectory, linear trends of q and of the integral of dq are removed, so that a bias of dq has no effect.
     """

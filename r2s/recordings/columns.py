@@ -10,7 +10,7 @@ from r2s.recordings.csv_table import bare_name
 from r2s.recordings.robot_logs import Table, choose_joints
 
 Spec = str | list[str] | None
-DEFAULT_COLUMNS = {  # field -> default column names; the first one in the file is used
+DEFAULT_COLUMNS = {  # field -> default column names; r2s uses the first name that the file has
     "t": ("t",),
     "q": ("q",),
     "dq": ("dq",),
@@ -19,7 +19,7 @@ DEFAULT_COLUMNS = {  # field -> default column names; the first one in the file 
 }
 TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # kind of torque -> column name
 NAMES = ("joint_names", "joints", "names", "name")  # names that an array of joint names may have in .npz or HDF5
-CURRENT = ("current", "i")  # columns of motor current, read instead of torque if the user sets a torque constant
+CURRENT = ("current", "i")  # columns of motor current, which replace torque if the user sets a torque constant
 OPTIONAL = ("dq", "trajectory")
 WORDS = {  # field -> words for the field in a column name that also contains a joint name
     "q": ("q", "position", "positions", "pos", "angle"),
@@ -104,7 +104,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _joint_of(column: str, robot_joints: Sequence[str]) -> tuple[int, str]:
-    """Return the index of the joint that a column name contains (-1: none), and the remaining name in lower case."""
+    """Return the index of the joint named in a column name (-1: no joint), and the rest of the name in lower case."""
     lower = column.lower()
     cores = [re.sub(r"^joint_|_joint$", "", joint.lower()) for joint in robot_joints]
     for k in sorted(range(len(cores)), key=lambda k: -len(cores[k])):
@@ -148,7 +148,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
         user: the user's joint names, data.joints. robot_joints, n: names and number of the robot's joints.
 
     Raises:
-        UserError: `user` names joints but the file names none, or the file lacks a joint.
+        UserError: `user` names joints but the file contains no joint names, or the file lacks a joint.
     """
     key = next((k for k in NAMES if k in table and table[k].ndim == 1 and table[k].dtype.kind in "USO"), None)
     if key is None:
@@ -167,7 +167,7 @@ def by_names(table: Table, user: Sequence[str] | None, robot_joints: Sequence[st
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return the columns q1, q2, ... for pattern "q{}" and first=1; first=None begins at q0 or, if missing, q1."""
+    """Return the columns q1, q2, ... for pattern "q{}" and first=1; first=None: begin at q0 if present, else q1."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)

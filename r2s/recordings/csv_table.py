@@ -74,7 +74,7 @@ def _numbers(column: pd.Series) -> pd.Series:
 
 
 def without_units(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the table in SI units, with units in names such as `q1 [deg]` or `t (ms)` removed."""
+    """Return the table in SI units; remove the units from names such as `q1 [deg]` or `t (ms)`."""
     out = {}
     for name, column in table.items():
         bare, factor = bare_name(name)
@@ -88,7 +88,7 @@ def bare_name(name: str) -> tuple[str, float]:
     found = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", name)
     unit = found[2].strip().lower() if found else ""
     if not found or unit not in UNITS or (unit in ("a", "ma") and not found[1].lower().startswith(("i", "current"))):
-        return name, 1.0  # `tau1 [A]` keeps its unit: it is a current
+        return name, 1.0  # keep the unit of `tau1 [A]`: this column is a current
     return found[1], UNITS[unit]
 
 

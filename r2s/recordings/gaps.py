@@ -10,7 +10,7 @@ SLACK = 1e-6  # relative tolerance for round-off: steps of a 20 Hz clock are not
 
 
 def longest_step(steps: np.ndarray, max_gap_s: float | None = None) -> float:
-    """Return the longest time step that is not a pause, s, increased by the relative tolerance SLACK.
+    """Return the longest time step (s) that is not a pause, including the relative tolerance SLACK.
 
     Args:
         steps: (T,) s, time steps. max_gap_s: s, the user's limit; if None, the limit is five median steps, but at

@@ -15,8 +15,8 @@ DT = 1e-3  # s, step of the common grid of recordings with different rates; r2s 
 def joined(recordings: Sequence[Recording]) -> Recording:
     """Join recordings into one; if their rates or command periods differ, resample all of them to 1 kHz first.
 
-    Only signals that all recordings have are kept. The result's `period` is None; `Recording.in_phase` finds a common
-    period.
+    The result contains only signals that all recordings have. The result's `period` is None; `Recording.in_phase`
+    finds a common period.
 
     Raises:
         UserError: the recordings differ in kind of torque or number of joints.

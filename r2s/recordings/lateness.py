@@ -11,7 +11,7 @@ from r2s.recordings.recording import Recording
 COMPARED_S = 60.0  # s, total length of the parts of a recording in which dq is compared with q
 EDGE = 100  # ms that are ignored at both ends of a trajectory, where the filter has transients
 BLOCK = 500  # ms, length of blocks whose errors are treated as independent
-LATE_S, SURE = 5e-4, 3.0  # s (half a step) and standard deviations; a lateness below either limit is not corrected
+LATE_S, SURE = 5e-4, 3.0  # s (half a step), standard deviations; a lateness below either limit stays uncorrected
 OFF = 0.05  # share of the RMS speed; if the error of corrected dq is larger, dq is not the derivative of q
 
 
@@ -30,7 +30,7 @@ class Lateness:
 
     @property
     def sure(self) -> np.ndarray:
-        """Lateness (n,) s to correct: `s`, but 0 where `s` is too small or too uncertain; nan stays nan."""
+        """Lateness (n,) s to correct: 0 if `s` is too small or too uncertain, nan if `s` is nan, otherwise `s`."""
         seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
         return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
 

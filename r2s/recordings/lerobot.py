@@ -1,7 +1,7 @@
 """Read and write recordings as a LeRobotDataset v3 (Hugging Face LeRobot): parquet files and meta/info.json.
 
 `write_dataset` stores commanded torque as `action`, and measured torque or motor torque as `observation.effort`.
-`lerobot_table` finds angles, velocities and torques by words in the names of features and of their elements.
+`lerobot_table` recognizes angles, velocities and torques by words in the names of features and of feature elements.
 """
 
 import json
@@ -51,9 +51,9 @@ def dataset_files(folder: Path) -> list[Path]:
 def lerobot_table(folder: Path) -> Table:
     """Return t (T,) s, trajectory (T,), joint_names (m,) and, if stored, q, dq, tau, tau_J_d, current (T, m).
 
-    t is frame_index / fps, or the timestamp if the two differ; `trajectory` is the episode index. A torque in
+    t is frame_index / fps, or the logged timestamp if this differs; `trajectory` is the episode index. A torque in
     `action` is returned as tau_J_d. Features of a gripper, hand or pose are ignored. The entry `reader_note` names
-    the clock and features that were used.
+    the clock and the features that this function read.
 
     Raises:
         UserError: the dataset has no torque or is not version 3, or a file is damaged.
@@ -63,7 +63,7 @@ def lerobot_table(folder: Path) -> Table:
     channels = _channels(features)
     found: dict[str, dict[str, tuple[str, int, float]]] = {}
     for field, joint, place in channels:
-        found.setdefault(field, {}).setdefault(joint, place)  # the first feature with a field and joint is used
+        found.setdefault(field, {}).setdefault(joint, place)  # of several features for a joint's field, use the first
     torques = [field for field in ("tau", "tau_J_d", "current") if field in found]
     joints = [j for j in found.get("q", {}) if any(j in found[field] for field in torques)]
     if not joints:

@@ -12,7 +12,7 @@ from r2s.recordings.recording import Recording
 
 M_MMAP_THRESHOLD, MAPPED = -3, 4 << 20  # option of glibc's mallopt(3); bytes
 LONG_S = 600.0  # s; intermediate results of longer recordings take hundreds of MB
-MANY = 10  # number of parts; only a recording longer than LONG_S has more parts
+MANY = 10  # number of parts; only recordings longer than LONG_S have more parts than this
 
 
 def give_back(recording: Recording) -> None:
@@ -30,7 +30,7 @@ def _trim() -> None:
 
 
 def joined_arrays(parts: Sequence[object], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return {name: array joined from all parts}; the parts' own arrays are deleted to save memory."""
+    """Return {name: array joined from all parts}; delete these arrays from the parts to save memory."""
     out = {}
     for name in names:
         out[name] = np.concatenate([vars(part).pop(name) for part in parts])
@@ -66,7 +66,7 @@ def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iter
 
 
 def spread(recording: Recording, seconds: float, each_s: float = 10.0) -> Recording:
-    """Return stretches of `each_s` s, evenly spread over the recording, with a total length of `seconds` s.
+    """Return stretches of `each_s` s, `seconds` s in total, at equal distances over the whole recording.
 
     A recording of at most `seconds` s is returned unchanged.
     """

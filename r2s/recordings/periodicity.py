@@ -13,7 +13,7 @@ STEP = 0.02  # s, grid of the comparison
 MIN_MOTION = 3.0  # least standard deviation of a joint's motion, in tolerances; the range is then about 10 tolerances
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
-MAX_COMPARED = 60  # limit on the tracks compared with one track and on the pieces in `overlap`, for speed
+MAX_COMPARED = 60  # largest number of tracks compared with one track, and of pieces in `overlap`, to save time
 PIECE_S, PIECE_MOTION = 1.0, 2.0  # least duration (s) and range (standard deviations of the motion) of a piece
 TRACKING = 0.03  # rad RMS, difference between two repetitions, each with 15 to 20 mrad of tracking error
 # smallest and largest tolerance, in standard deviations of an angle; at 0.2, unrelated motions of a joint match
@@ -41,23 +41,23 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return tracks of at least OVERLAP_S s: one per stretch if `each`, else cut at restarts and long pauses."""
+    """Return tracks of at least OVERLAP_S s: one per stretch if `each`, else one between restarts or long pauses."""
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
 
 
 def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
-    """Return whether the clock restarts, or pauses longer than PAUSE_S, between two stretches."""
+    """Return whether the clock restarts, or the log pauses for more than PAUSE_S, between two stretches."""
     pause = t[two[1].start] - t[two[0].stop - 1]
     return bool(pause <= 0 or pause > PAUSE_S)
 
 
 def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
-    """Return the period of the motion, s, and time shifts (K,) s that align repeated motion in K tracks.
+    """Return the period (s) of the motion, and time shifts (K,) s that align repeated motion in K tracks.
 
-    The period is None if no motion repeats. If no track repeats itself, but tracks repeat each other, the period is
-    the time span of all aligned tracks.
+    The period is None if no motion repeats. If no track contains a repetition, but tracks repeat each other, the
+    period is the duration of all aligned tracks.
     """
     shift, found, period, tolerance = np.zeros(len(tracks)), False, None, _tolerance(tracks)
     for k, b in enumerate(tracks if tolerance.any() else []):
@@ -77,8 +77,8 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
 
-    A piece of `other` occurs in `training` if, in each joint, its RMS distance from some motion in `training` is
-    below the `_tolerance` of `other`.
+    A piece of `other` occurs in `training` if, in each joint, the RMS distance between the piece and a motion in
+    `training` is below the `_tolerance` of `other`.
     """
     tolerance, deviation = _tolerance(other), _deviation(other)
     pieces = [piece for track in other for piece in _pieces(track.q, PIECE_MOTION * deviation.max())]
@@ -101,8 +101,8 @@ def _deviation(tracks: Sequence[Track]) -> np.ndarray:
 def _tolerance(tracks: Sequence[Track]) -> np.ndarray:
     """Return the RMS distance (n,) rad, per joint, below which two pieces of motion in `tracks` are treated as equal.
 
-    The distance is TRACKING, clipped to the range SIMILAR x s. Here s is the joint's standard deviation, but at least
-    STILL x the largest standard deviation of all joints.
+    The distance is TRACKING, clipped to the range SIMILAR times s, where s is the joint's standard deviation, or
+    STILL times the largest standard deviation of all joints if this is larger.
     """
     deviation = _deviation(tracks)
     return np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
@@ -153,8 +153,8 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 def _errors(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (L,) of a and b at each of L lags: the largest RMS distance of a joint, in tolerances.
 
-    Also return the number of common rows (L,). The distance is inf if the common rows last less than OVERLAP_S, or
-    if no joint moves: no standard deviation exceeds MIN_MOTION tolerances.
+    The second result is the number of common rows (L,). The distance is inf if the common rows last less than
+    OVERLAP_S, or if no joint's standard deviation exceeds MIN_MOTION tolerances.
     """
     square, variance, count = _distances(a, b)
     counts = (count >= OVERLAP_S / STEP) & ((variance / tolerance**2).max(1) > MIN_MOTION**2)
@@ -162,7 +162,7 @@ def _errors(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> tuple[np.nda
 
 
 def _own_lag(track: Track, tolerance: np.ndarray) -> int | None:
-    """Return the first lag, in rows, at which a track repeats itself, or None if the track does not repeat."""
+    """Return the first lag (in rows) at which a track repeats itself, or None if the track does not repeat."""
     q, least = track.q, round(OVERLAP_S / STEP)
     error = _errors(q, q, tolerance)[0][len(q) - 1 :]  # from lag 0
     error[:least] = np.inf
@@ -174,7 +174,7 @@ def _own_lag(track: Track, tolerance: np.ndarray) -> int | None:
 
 
 def _lag(a: Track, b: Track, tolerance: np.ndarray) -> int | None:
-    """Return the lag, in rows, at which b repeats a with the longest overlap, or None if b does not repeat a."""
+    """Return the lag (in rows) at which b repeats a with the longest overlap, or None if b does not repeat a."""
     error, count = _errors(a.q, b.q, tolerance)
     runs = _runs(error < 1.0)
     if not runs:

@@ -26,8 +26,8 @@ class Ramps:
 
     Attributes:
         recording: motion with commanded torque; identification uses t, and the ramped joint's q and tau.
-        joint: ramped joint, from 0. sign: direction, 1 or -1. pose: posture index, from 0. These three have K values;
-            a single value applies to all ramps.
+        joint: ramped joint, from 0. sign: direction, 1 or -1. pose: posture index, from 0. `joint`, `sign` and `pose`
+            have K values; a single value applies to all ramps.
 
     Raises:
         UserError: the torque is not commanded, or `joint`, `sign` or `pose` has a wrong shape or value.
@@ -82,7 +82,7 @@ def read_ramps(
         path: file of ramps.
         columns: {field: column name} of a log, see `readers.read`.
         n_joints: expected number of joints.
-        max_gap_s: s; a longer time step separates ramps; if None, the result of `longest_step` is the limit.
+        max_gap_s: s, limit on the time step within a ramp; if None, the result of `longest_step` is the limit.
         joints: names of the joints in the log. model_joints, limits: names and position limits of the robot's joints.
             See `readers.read`.
 
@@ -150,7 +150,7 @@ def _from_columns(table: Table, how: Options) -> Ramps:
 
 
 def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
-    """Expand `values`, one per ramp or per row, to one value per row (T,); `ramp` (T,) is each row's ramp index."""
+    """Expand `values` (one per ramp or per row) to one value per row (T,); `ramp` (T,): ramp index of each row."""
     count = ramp[-1] + 1 if len(ramp) else 0
     if values.dtype.kind not in "iuf":
         raise UserError(f"column '{field}': expected numbers, got type {values.dtype}")
@@ -160,14 +160,14 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError unless the ramped joint's command changes mainly along `sign`, or no command changes."""
+    """Raise UserError unless the ramped joint's command changes mainly along `sign`, or all commands are constant."""
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY
         until = int(moved.argmax()) + 1 if moved.any() else len(moved)  # after breakaway the arm may brake
         change = r.tau[rows][:until] - r.tau[rows.start]
         up, down = (sign * change).max(0), (-sign * change).max(0)
-        if up[j] > down[j] or np.maximum(up, down).max() < MIN_RISE:  # no change: the joint moved before the ramp
+        if up[j] > down[j] or np.maximum(up, down).max() < MIN_RISE:  # constant if the joint moved before the ramp
             continue
         other = int(np.maximum(up, down).argmax())
         got = "the opposite" if other == j else f"a change of joint {other + 1}"

@@ -23,7 +23,7 @@ from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_
 HDF5 = (".h5", ".hdf5")
 SUFFIXES = (".csv", ".npz", ".parquet", *HDF5, *BAGS)
 NO_BAG = dict.fromkeys(("topic", "joints", "model_joints", "n_joints"))
-RESTART_S = 0.1  # s; a clock has restarted if it jumps back to within this time of its first value
+RESTART_S = 0.1  # s; a clock that jumps back to less than this time from its first value has restarted
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Options:
     period: float | None = None
     name: str = ""
     torque_constant: np.ndarray | None = None
-    restarts: bool = False  # whether a clock that goes back to its start begins a new trajectory
+    restarts: bool = False  # whether a clock restart begins a new trajectory
     robot_joints: Sequence[str] | None = None
     limits: tuple[np.ndarray, np.ndarray] | None = None
     repair: bool = True  # whether the reader may sort or omit rows
@@ -63,28 +63,29 @@ def read(
     Args:
         path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
             LeRobotDataset.
-        torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); if None, the file declares it.
+        torque: kind of torque, "measured", "commanded" or "motor" (see `Recording`); if None, the file must declare
+            the kind.
         columns: {field: column name} for t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The default names
             are in DEFAULT_COLUMNS; for tau, the name in TAU has priority. For q, dq and tau, a name stands for one
             array (T, n), or for columns numbered from 1 or 0: q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... In a name,
             `{j}` (from 1) or `{i}` (from 0) stands for the joint number. A list of names has one column name per
             joint. In HDF5 a column name is the path of a dataset, such as robot/q.
         n_joints: expected number of joints.
-        max_gap_s: s, longest time step within a trajectory. If None, the result of `longest_step` is the limit; if
-            inf, gaps do not separate trajectories.
+        max_gap_s: s, longest time step within a trajectory; None: the result of `longest_step`; inf: gaps do not
+            separate trajectories.
         period: s, period of the motion, see `Recording`.
         name: name of the recording; if None, the file name without its suffix.
         topic: ROS topic to read from a bag, see `bag_table`.
         joints, model_joints: the robot's joint names in the file, and in the robot description. `by_names` and
             `choose_joints` select and sort the file's joints by these names.
-        torque_constant: Nm/A, (n,) or one value: joint torque, after the gear, per motor current. If set, the column
-            of tau contains motor current.
+        torque_constant: Nm/A, (n,) or one value: joint torque, after the gear, per motor current; if given, the
+            column of tau contains motor current.
         limits: (lowest, highest) q of the robot, (n,) rad each; angles outside are shifted inside by full
             revolutions, if possible.
 
-    Without a column dq, dq is the central difference of q over the logged time. Gaps separate trajectories. Clock
-    restarts also separate trajectories, except in bags and in files with a column `trajectory`. Log faults with only
-    one remedy are repaired (r2s/recordings/repairs.py), and the recording's notes list the repairs. A file that
+    Without a column dq, dq is the central difference of q over the logged time. Gaps and clock restarts separate
+    trajectories; clock restarts do not do so in bags and in files with a column `trajectory`. The reader repairs log
+    faults that have only one remedy (r2s/recordings/repairs.py); the recording's notes list the repairs. A file that
     `Recording.save` wrote is restored unchanged, but without its notes.
 
     Raises:
@@ -93,7 +94,7 @@ def read(
     constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
     table = load_table(path, {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints})
-    restarts = not is_bag(path)  # a bag may interleave messages from before and after a restart
+    restarts = not is_bag(path)  # in a bag, messages from before and after a restart may alternate
     how = Options(torque, columns or {}, n_joints, max_gap_s, period, name or path.stem, constant, restarts)
     how = replace(how, robot_joints=model_joints, limits=limits)
     try:

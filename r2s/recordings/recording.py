@@ -16,7 +16,7 @@ from r2s.recordings.periodicity import find_period, overlap, tracks_of
 
 TORQUES = ("measured", "commanded", "motor")
 MIN_ROWS = 10
-SPLIT_GUARD_S = 0.1  # s; `split` drops training rows this close to a validation row: adjacent rows are almost equal
+SPLIT_GUARD_S = 0.1  # s; `split` drops training rows this close to a validation row, which are almost equal to it
 FIELDS = ("t", "q", "dq", "tau", "trajectory")
 SIGNALS = (  # further values that an arm may measure or estimate, with libfranka's names; see `ArmState`
     "tau_ext_hat_filtered", "O_F_ext_hat_K", "joint_contact", "cartesian_contact", "joint_collision",
@@ -28,19 +28,19 @@ SIGNALS = (  # further values that an arm may measure or estimate, with libfrank
 class Recording:
     """Motion and torque of n joints in T rows; the constructor checks the arrays and makes them read-only.
 
-    Methods return new recordings. A difference, filter or window never includes rows of two trajectories.
+    Methods return new recordings. No difference, filter or window includes rows of two trajectories.
 
     Attributes:
-        t: (T,) s, logged time; t increases within a trajectory, evenly or not, and may restart in the next one.
+        t: (T,) s, logged time; increases within each trajectory, evenly or not; may restart in a new trajectory.
         q, dq, tau: (T, n) joint angles in rad, velocities in rad/s and torques in Nm.
         torque: kind of `tau`: "measured" (by a link-side sensor, with gravity), "commanded" (without gravity) or
-            "motor" (motor torque times gear ratio; it contains gravity, all friction and rotor inertia).
-        signals: {name from `SIGNALS`: (T,) or (T, k)}, further values that the arm reported; None becomes {}.
-        trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses. If None, all
+            "motor" (motor torque times gear ratio, with gravity, all friction and rotor inertia).
+        signals: {name from `SIGNALS`: (T,) or (T, k)}, further values that the arm reported; None: no signals.
+        trajectory: (T,) trajectory index of each row; a trajectory is a part of the log without pauses; None: all
             indices are 0.
         period: s, period of the motion on the clock `t` (see `split`); None if no period is known.
         notes: remarks of the file reader, such as one line per repair.
-        command_period: s, time for which the arm applies each command; if None, until the next row.
+        command_period: s, time for which the arm applies each command; None: until the next row.
     """
 
     t: np.ndarray
@@ -214,7 +214,7 @@ class Recording:
         return out
 
     def smooth(self, cutoff_hz: float) -> "Recording":
-        """Low-pass q, dq and tau without delay, by a Butterworth filter of order 4 forwards and then backwards.
+        """Low-pass q, dq and tau without delay, by a Butterworth filter of order 4, run forwards and backwards.
 
         The two passes together have a gain of -6 dB at the cutoff. Time steps must be uniform (see `resample`).
         """
@@ -246,10 +246,10 @@ class Recording:
         return self.derivative(self.dq)
 
     def find_period(self) -> float | None:
-        """Return the period of the motion, s, or None if the motion does not repeat itself.
+        """Return the period (s) of the motion, or None if the motion does not repeat itself.
 
-        A repetition lasts at least 0.5 s. In it, the RMS difference of each joint is below a tolerance (about 0.03
-        rad), and at least one joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after a
+        A repetition lasts at least 0.5 s. In a repetition, each joint's RMS difference is below a tolerance (about
+        0.03 rad), and at least one joint moves by about ten tolerances. `in_phase` also aligns repetitions after a
         clock restart.
         """
         return self._period_and_clock()[0]
@@ -289,8 +289,8 @@ class Recording:
 
         1. If the motion has a period (argument or attribute), validation is the end of each period: the rows whose
            phase (`t` modulo period) is largest. A chronological split would put repeated motion on both sides.
-        2. Otherwise, validation consists of the last trajectories, if their share of the rows is at least half of
-           `validation_fraction` and at most twice `validation_fraction` (or 0.5, if larger).
+        2. Otherwise, validation consists of the last trajectories, if they have between 0.5 f and max(2 f, 0.5) of
+           the rows, where f is `validation_fraction`.
         3. Otherwise, validation is the end of the recording.
 
         Except in case 2, training has no rows within 0.1 s of a validation row. Single-row trajectories are dropped.
@@ -308,7 +308,7 @@ class Recording:
         elif len(self.stretches) > 1:
             count, share = len(self.t), validation_fraction
             first = min((s.start for s in self.stretches[1:]), key=lambda row: abs(row - (1 - share) * count))
-            if not 0.5 * share <= 1 - first / count <= max(2 * share, 0.5):  # as in a log with one early pause
+            if not 0.5 * share <= 1 - first / count <= max(2 * share, 0.5):  # for example, one early pause
                 first = min(round((1 - share) * count), count - 1)
             close = (self.trajectory == self.trajectory[first]) & (self.t > self.t[first] - SPLIT_GUARD_S)
             validation = np.arange(count) >= first

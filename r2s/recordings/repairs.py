@@ -75,7 +75,7 @@ def _order(arrays: Arrays) -> np.ndarray | None:
 
 
 def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Arrays, list[str]]:
-    """Remove jumps of q by a full revolution within a trajectory; return the arrays and a note on each repair.
+    """Remove jumps of q by a full revolution within a trajectory; return the arrays and a list of notes on repairs.
 
     limits: (low, high) joint limits, (n,) rad each; angles outside are shifted inside by full revolutions, if
     possible.
@@ -105,7 +105,7 @@ def unwrap(arrays: Arrays, limits: tuple[np.ndarray, np.ndarray] | None = None) 
 
 
 def _into(q: np.ndarray, index: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Move trajectories beyond the limits inside, by full revolutions; return q (T, n) and the shifted joints."""
+    """Shift trajectories by full revolutions into the limits; return q (T, n) and the indices of shifted joints."""
     if (q.min(0) >= low - SLACK).all() and (q.max(0) <= high + SLACK).all():
         return q, []
     out, turned = q.copy(), set()

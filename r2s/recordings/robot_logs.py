@@ -72,8 +72,8 @@ def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
     """Shift the logged tau_J_d (T, n) Nm by one cycle, so that each state is paired with the next command.
 
     A Franka state at t (T,) s contains the command of the previous cycle, but a `Recording` (`r2s.arm.recorder`)
-    pairs a state with the next command. If the log has a longer time step than a control cycle, shifted commands are
-    interpolated. The last command is not shifted, because the log contains no later command.
+    pairs a state with the next command. If the log's time step is longer than a control cycle, the shifted commands
+    are interpolated. The last command is not shifted, because the log contains no later command.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
 
@@ -97,10 +97,10 @@ def bag_table(
 ) -> Table:
     """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) from one topic of a bag.
 
-    t starts at 0 and comes from the header stamps, or from bag time if all stamps are 0. Messages that lack joints of
-    the robot, such as a gripper's, are ignored. Messages are sorted by time, and repeated messages are dropped. The
-    entry `reader_note` states how many messages were omitted: those with stamp 0, and those before the first complete
-    message.
+    t starts at 0 and comes from the header stamps, or from bag time if all stamps are 0. Messages without all joints
+    of the robot, such as messages of a gripper, are ignored. Messages are sorted by time, and repeated messages are
+    dropped. The entry `reader_note` states how many messages were omitted: those with stamp 0, and those before the
+    first complete message.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap file, or the folder of a ROS 2 bag.
@@ -120,7 +120,7 @@ def bag_table(
     stamp = np.array([s.stamp for s in kept])
     if not stamp.any():
         stamp = np.array([s.received for s in kept])
-    use, notes = stamp != 0, []  # a driver may send messages before it knows the time
+    use, notes = stamp != 0, []  # drivers may send messages before they know the time
     if not use.all():
         notes.append(f"{int((~use).sum())} messages with stamp 0 are left out")
     valued = ~np.any([np.isnan(x).any(axis=1) for x in table.values()], axis=0)
@@ -141,9 +141,10 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    Logs may order joints differently: some ROS 2 drivers sort them by name. The first applicable rule is used: (1)
-    `joints`; (2) `model_joints`, if each occurs once, perhaps with a prefix as in panda_joint1; (3) n names that
-    differ only in a number, sorted by this number; (4) the first n names, if n is 1 or `model_joints` is empty.
+    Logs may order joints differently: some ROS 2 drivers sort joints by name. The function uses the first applicable
+    rule. Rule 1: `joints`. Rule 2: `model_joints`, if each name occurs once, perhaps with a prefix as in
+    panda_joint1. Rule 3: n names that differ only in a number, sorted by this number. Rule 4: the first n names, if n
+    is 1 or `model_joints` is empty.
 
     Args:
         logged: joint names in the log.

@@ -122,7 +122,7 @@ class _Messages:
         ]
 
     def wrenches(self, wrench: np.ndarray, ns: np.ndarray) -> list[Message]:
-        """Return messages of `O_F_ext_hat_K` (T, 6): force, N, and moment, Nm, that the arm exerts, in base axes."""
+        """Return messages of `O_F_ext_hat_K` (T, 6): force (N) and moment (Nm) that the arm exerts, in base axes."""
         of, stamped = (self._types[f"geometry_msgs/msg/{kind}"] for kind in ("Wrench", "WrenchStamped"))
         return [
             (at, "/external_wrench", stamped(self._header(at), of(force=self._xyz(x[:3]), torque=self._xyz(x[3:]))))

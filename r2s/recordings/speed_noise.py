@@ -11,9 +11,9 @@ from r2s.recordings.recording import Recording
 
 HALF_S = 0.02  # s, half window of the Savitzky-Golay cubic; position noise of 1e-5 rad then causes 3e-4 rad/s
 MAX_HALF_S = 0.05  # s, largest half window: at 80 Hz the slope of a 2 Hz oscillation then errs by 0.04 %
-PIECE_S = 0.05  # s, length of the pieces among which the calm ones are chosen
+PIECE_S = 0.05  # s, length of the pieces from which the calmest are chosen
 CALM = 0.1  # share of the pieces that are used, namely those with the smallest acceleration
-LONGEST_S = 600.0  # s, longest part of a recording that is used
+LONGEST_S = 600.0  # s; of a longer recording, parts of this total length are used
 MAX_NOISE = 1.0  # rad/s, more than any velocity sensor adds
 MIN_ROWS = 8  # least number of samples for the slope of a cubic
 UNEVEN = 0.25  # share of the median step; a step that differs by more, as after a lost sample, ends a piece
@@ -24,8 +24,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
 
     The noise is dq minus a reference velocity, the slope of a cubic fit to q (Savitzky and Golay, Analytical
     Chemistry 36(8), 1964). At low acceleration, the fitted slope is accurate, and a delay of dq has no effect. The
-    result is the median RMS noise of the calmest 50 ms pieces. These are the 10 % with the smallest acceleration, the
-    second derivative of q.
+    result is the median RMS noise over 50 ms pieces, but only over the 10 % with the smallest acceleration (second
+    derivative of q).
 
     Raises:
         UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.

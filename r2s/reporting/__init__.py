@@ -1,1 +1,1 @@
-"""Report on runs: tables, pages, figures, Rerun recordings, comparisons of runs, and experiment trackers."""
+"""Report runs in tables, pages, figures and Rerun recordings; compare runs; show runs in experiment trackers."""

@@ -18,7 +18,7 @@ def doubtful(cell: str) -> bool:
 
 
 def report_markdown(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
-    """Write report.md from {heading: items}, with the first heading as the title and relative links to figures."""
+    """Write report.md from {heading: items}; the first heading is the title, and links to figures are relative."""
     lines: list[str] = []
     for i, (heading, items) in enumerate(sections.items()):
         lines += [f"{'#' if i == 0 else '##'} {heading}", ""]

@@ -20,7 +20,7 @@ LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # line widths in the Rerun viewer: estimate, 
 
 
 def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Sequence[float]) -> list[Path]:
-    """Draw the estimates of payload and friction in `rows` over time; mark payload changes at times `changes`, s."""
+    """Draw the estimates of payload and friction in `rows` over time; mark payload changes (times `changes`, s)."""
     t, colour = rows["t"].to_numpy(), colours(["estimate"])["estimate"]
 
     def band(axis, name: str, title: str, label: str, scale: float = 1.0) -> None:

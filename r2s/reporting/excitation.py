@@ -21,7 +21,7 @@ from r2s.runs import Run
 def excitation_page(
     console: Console, run: Run, robot: Robot, motion: Excitation, design: PlannedWidths
 ) -> dict[str, Any]:
-    """Print the expected widths of parameter intervals; write report.md, figure and recording; return a summary."""
+    """Print expected widths of 95 % intervals; write report.md, figure and recording; return a summary."""
     table = width_table(design, robot.n)
     print_table(console, table, f"{WIDTHS}, of {design.torque} torque", LEGEND)
     share = {"velocity": np.abs(motion.dq) / robot.dq_max, "acceleration": np.abs(motion.ddq) / robot.ddq_max}
@@ -42,7 +42,7 @@ def excitation_page(
 
 
 def motion_figure(path: Any, robot: Robot, motion: Excitation) -> Any:
-    """Draw joint angles, limits of the angles, and joint velocities over time."""
+    """Draw joint angles with their limits, and joint velocities, over time."""
     some = thin(len(motion.t))
     low, high = robot.q_range
     with joint_panels(path, robot.n, "planned motion") as axes:

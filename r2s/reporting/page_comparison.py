@@ -1,4 +1,4 @@
-"""Compare the tables in two versions of a page in benchmarks/results, cell by cell and with intervals.
+"""Compare the table cells in two versions of a page of benchmarks/results, and test whether intervals overlap.
 
 Cells are matched by section, row and column, so added rows and changed paragraphs do not affect the comparison.
 """
@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Remove the rows of all tables in a page, so that a table shows only its header unless it is computed again."""
+    """Remove the rows of all tables in a page; a table that is not computed again then shows only its header."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -43,7 +43,7 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
     `verdict` is one of VERDICTS. The verdict "last digit" means that numbers differ by at most one unit of their last
     digits. The verdict "beyond intervals" means that an interval in the old cell and its counterpart in the new cell
     do not overlap. `change` is the largest relative change of a number in the cell; NaN if the cell has no numbers,
-    or if their count differs.
+    or a different count of numbers in the two versions.
     """
     old, new = table_cells(before), table_cells(now)
     rows = []

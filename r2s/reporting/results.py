@@ -38,7 +38,7 @@ def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.Da
 
 
 def all_pages(folder: Path, last: dict[str, Any]) -> None:
-    """Write report.md in `folder` with a row per page, from `last`, this run's summary, and other runs' summaries."""
+    """Write report.md in `folder` with a row per page: from this run's summary `last` and older summaries."""
     done = {last["page"]: last}
     for path in sorted(folder.glob("*/summary.json")):
         other = json.loads(path.read_text())

@@ -16,8 +16,8 @@ from r2s.runs import status_of
 
 LOST = ("failed", "killed")
 COLUMNS = ["status", "age", "result"]
-LONGEST = 46  # letters to which r2s cuts run names in a terminal; the time at the start of a name identifies the run
-LEAST = 20  # least number of letters of a result that are shown
+LONGEST = 46  # largest number of shown letters of a run name; the time at the start of the name identifies the run
+LEAST = 20  # least number of shown letters of a result
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:

@@ -63,7 +63,7 @@ def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, 
 def print_table(
     console: Console, frame: pd.DataFrame, title: str, caption: str | None = None, sentences: bool = False
 ) -> None:
-    """Print a table of strings; dim the cells that are `doubtful`, unless the cells are `sentences`."""
+    """Print a table of strings; dim `doubtful` cells, unless the cells contain sentences."""
     how = {"title_justify": "left", "caption_justify": "left", "padding": (0, 1, 0, 0)}
     table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **how)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))

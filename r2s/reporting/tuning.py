@@ -1,4 +1,4 @@
-"""Report stage=tune: the trials, and a comparison of their best value with a grid search at equal compute."""
+"""Report stage=tune: the trials, and a comparison of the search with a grid search of equal training time."""
 
 from collections.abc import Sequence
 from glob import glob
@@ -14,8 +14,8 @@ from r2s.reporting.document import Item, report_markdown
 from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
-ORDERS = 2000  # number of random orders of a grid's jobs; their mean has a standard error of sigma / 45
-SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # shares of the search's training time, summed over its trials
+ORDERS = 2000  # number of random job orders; a mean over them has 1/45 of their standard deviation as standard error
+SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # fractions of the search's training time at which search and grid are compared
 
 
 def trials_table(study: Any, folder: Path) -> pd.DataFrame:
@@ -32,7 +32,7 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) found by the times `at` (K,) s; trials run in sequence and last `spent` s each.
+    """Return the best value (K,) found by the times `at` (K,) s if trials run one by one for `spent` s each.
 
     Pruned and failed trials take time, but have the value nan. sign: 1 if a larger value is better, else -1.
     """

@@ -1,1 +1,1 @@
-"""Stages of r2s, one module each; only stages and the command line read the config."""
+"""Stages of r2s, and their helpers; only these modules and the command line read the config."""

@@ -17,7 +17,7 @@ BESIDE = ("calibration",)  # keys of conf/adapt that are not arguments of the ad
 def calibrated(calibration, robot, trust=()):
     """Return the identified dynamics, (parameter space, posterior draws) and (training, validation recording).
 
-    The draws are None if posterior.npz is missing. The recordings are None if one of them is missing.
+    The first pair is None without posterior.npz. The second pair is None if a recording is missing.
     """
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
@@ -80,8 +80,8 @@ def _given_recordings(folder):
 def with_declared_payload(cfg, robot, dynamics, calibration):
     """Return the dynamics of an arm whose gravity compensation includes arm.declared_payload.
 
-    If a payload was declared during the identification `calibration`, the gravity compensation held this payload, so
-    the identified model lacks it. The returned dynamics therefore declare only the change of payload since then.
+    If a payload was declared while the arm was recorded for `calibration`, the arm compensated this payload, and the
+    identified model lacks it. The returned dynamics therefore declare only the change of payload since then.
     """
     from omegaconf import OmegaConf
 

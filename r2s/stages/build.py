@@ -58,7 +58,7 @@ def make_dynamics(cfg, robot, announce=False):
     """Return the dynamics of `base_dynamics`, prepared for contact if the task of conf/task touches a surface.
 
     During contact, friction of resting joints opposes contact forces; see `Dynamics.holding_contact`. If `announce`
-    and the preparation changes the stiction model, print a line.
+    is set, print a change of the stiction model.
     """
     dynamics = base_dynamics(cfg, robot)
     if not getattr(target(cfg.task, "task"), "touches", False):
@@ -85,7 +85,7 @@ def base_dynamics(cfg, robot):
 
 
 def dynamics_of(robot, friction, inertia):
-    """Return the dynamics that the contents of a file in conf/friction and of a file in conf/inertia describe."""
+    """Return the dynamics of `friction` and `inertia`: contents of files in conf/friction and conf/inertia."""
     from r2s.physics.dynamics import nominal_dynamics
 
     for group, settings in (("friction", friction), ("inertia", inertia)):
@@ -218,7 +218,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
             finally:
                 arm.stop()
         return
-    _arm_target(cfg)  # raise UserError in this process, not in the arm's
+    _arm_target(cfg)  # raise UserError in this process, not in the process of the arm
     make = partial(part, _arm_settings(cfg, robot, task), "arm", robot, beside=list(DRIVE_KEYS))
     with ExitStack() as stack:
         try:
@@ -262,7 +262,7 @@ def within_speed_share(cfg, robot):
 
 
 def check_source(cfg, robot):
-    """Raise UserError if the settings of a simulated arm to record are wrong; do not connect to a physical arm."""
+    """If the arm to record is simulated, raise UserError for wrong settings; never connect to a physical arm."""
     if cfg.data.kind == "simulated" or is_simulated(cfg):
         with opened_source(cfg, robot, 0):
             pass
@@ -349,7 +349,7 @@ def all_threads(cfg):
 
 
 def set_threads(cfg, threads=None):
-    """Set the seed and the number of threads of torch (default: all threads); the physics has its own threads."""
+    """Set torch's seed and number of threads (default: all threads); the physics has separate threads."""
     import torch
 
     torch.set_num_threads(threads or all_threads(cfg))
@@ -357,7 +357,7 @@ def set_threads(cfg, threads=None):
 
 
 def device(cfg):
-    """Return the device of learner and replay buffer, cpu or cuda; the physics always runs on the CPU."""
+    """Return the device (cpu or cuda) of learner and replay buffer; the physics always runs on the CPU."""
     import torch
 
     if cfg.device not in ("cpu", "cuda"):

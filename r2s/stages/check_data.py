@@ -12,7 +12,7 @@ from r2s.stages.recordings import labels_of, of_one_reader, recording_files
 def check_data(cfg, to):
     """Print the verdict on each recording of `cfg`, and write the verdict to a JSON file.
 
-    to: path of the JSON file of a single recording; if None, each recording has a file ROOT/check/NAME.json.
+    to: JSON file for a single recording; if None, r2s writes ROOT/check/NAME.json for each recording.
 
     Raises:
         UserError: a file cannot be read, or a recording has the verdict fail.

@@ -51,8 +51,8 @@ def contact_data(cfg, robot, file):
 def stated_stiffness(cfg, robot):
     """Return the prior of gear stiffness from identify.gears; None if identify.gears.stiffness is unset.
 
-    identify.gears.stiffness is a run folder with gears.yaml, or numbers, Nm/rad, of relative standard deviation
-    identify.gears.accuracy.
+    identify.gears.stiffness names a run folder with gears.yaml, or states values in Nm/rad. Stated values have the
+    relative standard deviation identify.gears.accuracy.
 
     Raises:
         UserError: a value is invalid.

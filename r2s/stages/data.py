@@ -10,7 +10,7 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
-SLOW_MS = 1.5  # ms, longest hold of a command that r2s assumes without printing the hold
+SLOW_MS = 1.5  # ms; r2s prints an assumed hold of a command that is longer than this
 LEAST_PRESSES = 4
 MAX_OVERLAP = 0.2  # largest share of a validation motion that may repeat training motion, for example in the approach
 
@@ -24,7 +24,7 @@ class ArmData:
         seconds: duration of the training motion and of the validation motion, s.
         excitation_seed: seed of the training motion; the validation motion has the next seed.
         excitation: file of the training motion; if None, r2s optimizes a training motion.
-        ramp_poses: number of postures in which r2s ramps every joint in both directions; 0 means no ramps.
+        ramp_poses: number of postures in which r2s records ramps of every joint in both directions; 0 means no ramps.
         presses: number of contact motions (press and slide), which replace all motions without contact; 0 means none.
         gears: whether to record, instead of all other motions, each joint sliding slowly under a multisine torque.
         press_point, press_normal: point (3,) m and normal (3,) of the nominal plane; if None, a work table below the
@@ -118,9 +118,9 @@ class FileData:
             check_number("data.command_hz", self.command_hz, "(0, inf)")
 
     def held(self, recording):
-        """Return the recording with the hold of a command, 1 / data.command_hz.
+        """Return the recording with the hold of its commands set to 1 / data.command_hz.
 
-        If data.command_hz is unset, each command is assumed to hold until the next row; print a hold above SLOW_MS.
+        If data.command_hz is unset, assume that each command holds until the next row; print a hold above SLOW_MS.
         """
         if self.command_hz is not None:
             return replace(recording, command_period=1 / self.command_hz)

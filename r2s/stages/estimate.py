@@ -100,7 +100,7 @@ def estimate(cfg, overrides):
 
 
 def calibrated_by_commands(cfg, robot):
-    """Return `calibrated(calibration)`; raise UserError unless the model was identified from commanded torque."""
+    """Return the result of `calibrated`; raise UserError unless calibration= was identified from commanded torque."""
     if (torque := torque_of_calibration(cfg, None)) != TORQUE:
         raise UserError(
             f"calibration: stage=estimate expects a model identified with data.torque={TORQUE}, got {torque} "
@@ -120,7 +120,7 @@ def compensated(cfg, robot, dynamics):
 
 
 def identified_surface(cfg, robot):
-    """Return the identified surface estimate.surface, or None if unset; raise UserError if the robot has no tool."""
+    """Return the surface of estimate.surface, or None if unset; raise UserError for a surface without robot.tool."""
     if not cfg.estimate.surface:
         return None
     from r2s.identification.contact.contact_file import load_contact

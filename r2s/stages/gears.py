@@ -42,7 +42,7 @@ def slides_in_file(cfg, robot):
 
 
 def check_motions(cfg, robot):
-    """Raise UserError if the settings of data=arm are invalid, or if a joint's slide breaks a limit or collides."""
+    """Raise UserError if the settings of data=arm are invalid, or if a planned slide violates a limit or collides."""
     from r2s.arm.gear_motions import check_gear_motions
 
     check_data(cfg)
@@ -51,7 +51,7 @@ def check_motions(cfg, robot):
 
 
 def recorded_slides(cfg, run, robot):
-    """Let the arm slide joint by joint, and return the recording; see `recorded_once`."""
+    """Let one joint after another slide, and return the recording; see `recorded_once`."""
     from r2s.arm.gear_motions import record_gear_motions
 
     def slide(progress, timing):

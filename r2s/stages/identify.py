@@ -231,7 +231,7 @@ def fit_group(cfg, run, made, group, earlier, folder):
 def compared(made, group, found, settings, known_from):
     """Return tables and summary.json entries: contribution of each recording, and drift since the run identify.from.
 
-    known_from: text for messages, the names of the earlier identifications that provide `settings.known`.
+    known_from: names of the earlier identifications that provide `settings.known`, as text for messages.
     """
     from r2s.identification.contributions import contradictions, contributions, validated
     from r2s.identification.known import FAR, block_of, disagreement, drift_table

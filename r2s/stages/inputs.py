@@ -14,7 +14,7 @@ PARENTS = (
     "dr.surface",
     "identify.gears.stiffness",
 )  # config keys that name a run folder
-# config keys that name a file; no digest is needed inside the package, because the commit determines those files
+# config keys that name a file; files inside the package need no digest, because the commit determines them
 FILES = ("robot.mjcf", "robot.tool")
 # files of a run folder that another job may read
 READ = (
@@ -38,7 +38,7 @@ def parents_of(cfg) -> list[str]:
 def files_of(cfg, parents: Iterable[str]) -> list[Path]:
     """Return the files that a job reads: the robot files that the config names, and files of `parents`.
 
-    parents: run folders, of which a job reads the files READ, or parameter files with posterior.npz beside them.
+    parents: run folders, from which a job reads the files READ, or parameter files with posterior.npz beside them.
     """
     from omegaconf import OmegaConf
 

@@ -54,7 +54,7 @@ def identify_with_known_arm(cfg, overrides, key):
 def _prepared(cfg, robot, key):
     """Check all inputs; return the files to read, the result's key in summary.json, and a function of the open run.
 
-    The function makes the recording unless a file contains it, identifies, and returns the entry for summary.json.
+    The function records the arm unless a file is given, identifies, and returns the entry for summary.json.
     """
     stated_stiffness(cfg, robot)  # checks identify.gears
     if key == "gears":

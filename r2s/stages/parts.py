@@ -35,7 +35,7 @@ def target(node: Any, group: str) -> Callable[..., Any]:
     logging.getLogger("hydra.utils").disabled = True  # otherwise Hydra prints the error too
     try:
         return get_object(path)
-    except Exception as error:  # the import of a user's module may raise anything
+    except Exception as error:  # the import of a user's module may raise any exception
         cause = error.__cause__ or error
         while cause.__cause__ is not None:
             cause = cause.__cause__

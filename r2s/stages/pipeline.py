@@ -1,4 +1,4 @@
-"""stage=pipeline: identify, train and transfer on one computer; every command writes its own run folder.
+"""stage=pipeline: identify, train and transfer on one computer, by separate commands with a run folder each.
 
 For a task on a surface, the arm presses on the surface before the trainings, and r2s identifies the surface.
 """
@@ -27,9 +27,9 @@ STEPS = {  # {first label of the step's commands: description}
 }
 STOPPED = 3  # exit status of a command that ended because the arm stopped, see r2s/cli.py
 MODELS = ("identified", "nominal")
-# labels: computed torque, policy "identified" with adapter (both only with adapt=), identification of the surface
+# labels: computed torque and policy "identified" with adapter (both only with adapt=); identification of the surface
 COMPUTED, ADAPTED, SURFACE = "computed", "adapted", "surface"
-REFERENCE = "reference"  # for a task on a surface: its controller without learning, with the identified model
+REFERENCE = "reference"  # for a task with contact: a controller with the identified model, without learning
 ROWS = {
     COMPUTED: "computed torque",
     ADAPTED: "identified model + adapter",
@@ -54,7 +54,7 @@ def reads(cfg):
 
 
 def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
-    """Return those of the user's overrides that the stage of the config `step` reads."""
+    """Return the user's overrides that the stage in the config `step` reads."""
     own = ("stage=", "name=", "root=", "threads=", "pipeline.")
     return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
 
@@ -223,7 +223,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     unchanged = without(*changes, *(["arm.surface"] if touched or moves_box(cfg) else []))
     steps = [{"identify": step("identify", "identify", typed=unchanged)}, trained, transferred]
     if touched:
-        limits = [o for o in overrides if o.lstrip("+~").startswith("safety")]  # read because of data.presses
+        limits = [o for o in overrides if o.lstrip("+~").startswith("safety")]  # data.presses needs these
         words = [known, f"data.presses={PATHS}", *tool_words(cfg), *table, *limits]
         pressed = step("identify", SURFACE, *words, calibration=known, typed=without("adapt", "data", *changes))
         steps.insert(1, {SURFACE: pressed})
@@ -279,7 +279,7 @@ def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
 
 
 def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
-    """Return overrides that give a training the nominal model with which the identification starts."""
+    """Return overrides (friction=, inertia=) that give a training the nominal model of the identification."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices

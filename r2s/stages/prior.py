@@ -64,7 +64,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
     Args:
         earlier: list of `Earlier`, whose links and payload enter the prior. If an `Earlier` has the same kind of
             torque, all its values enter the prior, and the new model has the same friction family and terms.
-        last: whether `torque` is the last kind that r2s fits; earlier fits use only the stated values of links and
+        last: whether `torque` is the last kind that r2s fits; all other fits use only the stated values of links and
             payload.
     """
     from r2s.identification.known import BODY, Known, block_of
@@ -118,7 +118,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the start of a fit: `earlier.arm`, or `nominal` with the earlier links if the kinds of torque differ."""
+    """Return a fit's start model: `earlier.arm`; for another kind of torque, `nominal` with the earlier links."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -12,7 +12,7 @@ from r2s.stages.parts import target
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, or in a checkout
 PROGRAM = "python run.py" if CONF.parent != PACKAGE else "r2s"  # how the user starts r2s
-TRUST = "R2S_TRUST"  # environment variable: `trust=` with which the trainings of a resumed search check their configs
+TRUST = "R2S_TRUST"  # environment variable with the value of `trust=` for the trainings of a resumed search
 # matches resolvers such as ${oc.env:HOME}, nested ${a${b}} that may become a resolver, and an escaped $
 RESOLVER = re.compile(r"\$\{\s*(\w*)[^}]*(?::|\$\{)|\\\$")
 
@@ -65,14 +65,14 @@ def checked(cfg, where, trust=None):
     """Return a run folder's config with resolved interpolations; raise UserError for untrusted code.
 
     r2s calls each class or function that a config names as `_target_`. A target is allowed only if conf/ names the
-    target in the same group or a module in `trust` defines the target. Resolvers such as ${oc.env:X} need `oc` in
+    target in the same group, or if a module in `trust` defines the target. Resolvers such as ${oc.env:X} need `oc` in
     `trust`.
 
     Args:
         where: file name for error messages. trust: value of `trust=` (see `modules`) that replaces `cfg.trust`.
 
     Raises:
-        UserError: the config names untrusted code, which r2s has neither imported nor called.
+        UserError: the config names untrusted code; r2s has neither imported nor called this code.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -110,7 +110,7 @@ def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...],
 
 
 def _is_own(key, value) -> bool:
-    """Return whether a setting names no code, or a `_target_` that a file of conf/ names in the same group."""
+    """Return whether a setting names no code, or is a `_target_` that a conf/ file of the same group names."""
     if key == ("friction", "family"):
         return "." not in str(value)
     if key[-1:] != ("_target_",):

@@ -246,7 +246,7 @@ def keep_calibration(cfg, folder):
         if not given or (folder / names[0]).is_file():
             continue
         source = Path(given)
-        for name in reversed(names):  # write the first name last, because `with_own_calibration` looks for it
+        for name in reversed(names):  # copy the first file last, because `with_own_calibration` looks for it
             path = source / name if source.is_dir() else source.with_name(name)
             path = source if name == names[0] and not source.is_dir() else path
             if path.is_file():
@@ -261,7 +261,7 @@ def title(cfg):
 
 
 def evaluate_reference(cfg, overrides, parts):
-    """Evaluate a controller without training, in the same way as a trained policy."""
+    """Evaluate a controller that needs no training, in the same way as a trained policy."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.reporting import pages
     from r2s.reporting.tables import print_measures

@@ -29,7 +29,7 @@ from r2s.stages.build import (
 from r2s.stages.parts import part
 from r2s.stages.run_config import run_config
 
-REST_GAP = 0.05  # `rest`, a share of episodes, may be this much lower on the arm than predicted without a warning
+REST_GAP = 0.05  # r2s warns if the share of episodes that end at rest on the arm is this much lower than predicted
 FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward", "costs")
 WHY = {k: "it comes from the policy's run" for k in FROM_POLICY}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
@@ -66,7 +66,7 @@ def trained_config(cfg, option="policy"):
 
 @dataclass(frozen=True)
 class Request:
-    """A policy, and the start postures and goals of its episodes: the same in every simulator and on the arm.
+    """A policy with the start postures and goals of its episodes, which all simulators and the arm share.
 
     Attributes:
         robot, task: robot and task of the training. center: model at the center of the randomization.
@@ -237,7 +237,7 @@ def predict(cfg, request, robot):
 
 
 def save_arm_result(run, request, name, result, predicted):
-    """Write stops.txt, timing.csv and episodes_<arm>.csv with a row per episode; return the measures on the arm.
+    """Write stops.txt, timing.csv and episodes_<arm>.csv (a row per episode); return the measures on the arm.
 
     predicted: episodes that the model predicted; if None, the arm's episodes are not compared with a prediction.
     """
@@ -285,7 +285,7 @@ def transfer(cfg, overrides):
     engine = part(cfg.simulator, "simulator", robot) if "_target_" in cfg.simulator else None
     if twin := is_twin(cfg):
         with opened_arm(cfg, robot):
-            pass  # raise for a wrong setting of the twin before a run folder exists
+            pass  # raise UserError for a wrong setting of the twin before a run folder exists
     open_runner = partial(opened_runner, cfg, robot, task, request.center, adapter=adapter)
     opened = nullcontext() if name == "none" or twin else open_runner()
     rows, episodes, predicted, result = {}, {}, None, ArmResult()

@@ -1,4 +1,4 @@
-"""stage=tune: search settings of trainings with Optuna; each trial has a run folder of stage=train."""
+"""stage=tune: search for the best training settings with Optuna; each trial has a run folder of stage=train."""
 
 import csv
 import math
@@ -20,9 +20,9 @@ from r2s.stages.build import all_threads, console, open_run, unread
 from r2s.stages.parts import called, plain
 from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 
-MOST_STARTS = 3  # attempts to start a training that the system ends, for example because memory is short
+MOST_STARTS = 3  # largest number of starts of a training that the system kills, for example when memory is short
 POLL_S = 0.2
-STOP_S = 20.0  # s, time for a training to end after each signal; a step or an evaluation takes less
+STOP_S = 20.0  # s, wait for a training to end after each signal; a training step or an evaluation is shorter
 EDGE = 0.05  # width of the edge at each end of a range, as a fraction of the range
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
@@ -39,7 +39,7 @@ class Tune:
     Attributes:
         trials: number of trials. workers: number of parallel trainings with one thread each; if None, `threads`.
         startup: number of random trials before the TPE sampler and the pruner start.
-        measure: key of the task's measure to optimize, in the last evaluation of each training.
+        measure: key of the task's measure whose value in the last evaluation of a training is optimized.
         space: {option: list of values, or text of a range; see `parse_range`}.
         against: glob pattern of training folders to compare with the trials, such as a grid; None: no comparison.
 
@@ -203,8 +203,8 @@ class TrialRun:
     def status(self) -> str:
         """Return the state of the training.
 
-        "started": runs, started by this process. "left": runs, started by an earlier process. "none": no run folder.
-        Otherwise: the status in meta.json.
+        "started": the training runs and was started by this process. "left": it runs, started by an earlier process.
+        "none": no run folder. Otherwise: the status in meta.json.
         """
         from r2s.runs import is_locked, read_meta
 

@@ -1,1 +1,1 @@
-"""Tasks: their goals, observations and rewards, the rollout of an episode, and the measures of a policy."""
+"""Define tasks (goals, observations, rewards), run policies in episodes of a task, and compute measures of them."""

@@ -1,7 +1,7 @@
-"""Descriptions of a task's measures: key, unit, whether lower is better, and presentation in tables and figures.
+"""Describe a task's measures: key, unit, whether lower is better, and presentation in tables and figures.
 
-Each task class has a `measure_table`. Training and transfer write this table to measures.json in their run folder, so
-tables, pages and comparisons of run folders do not need the task's class.
+Each task class has a `measure_table`. Training and transfer write this table to measures.json in their run folder.
+Code that shows or compares run folders reads that file and needs no task class.
 """
 
 import json
@@ -23,9 +23,9 @@ class Measure:
 
     Attributes:
         key: column of evaluations.csv. short: name in table headings. title: name in figures and sentences.
-        unit: unit for display, "" if dimensionless. scale: displayed value divided by the stored value.
+        unit: unit for display, "" if dimensionless. scale: displayed value / stored value.
         digits: number of displayed decimals. lower_is_better: whether lower values are better.
-        root_mean_square: whether the average of several values is their root mean square.
+        root_mean_square: whether to average several values as a root mean square instead of a mean.
     """
 
     key: str
@@ -63,7 +63,7 @@ class Measure:
         return f"{self.title} {self.cell(value)} {self.unit}".strip()
 
 
-# measures of any task: transfer gap (r2s/tasks/rollout.py), safety filter, limits and stops
+# measures of every task: transfer gap (r2s/tasks/rollout.py), safety filter, limits and stops
 COMMON = (
     Measure("ee_path_rmse_mm", "path gap", "path gap to the prediction", "mm", 1, 2, True, root_mean_square=True),
     Measure("tau_rmse_Nm", "torque gap", "torque gap to the prediction", "Nm", 1, 2, True, root_mean_square=True),
@@ -80,17 +80,17 @@ class MeasureTable:
     """The measures of a task, and the keys of the measures that each table and figure shows.
 
     Attributes:
-        measures: the task's own measures, to which r2s adds the measures COMMON.
-        selection: keys of the measures that compare trainings. Every row of evaluations.csv must contain the first;
-            the last ranks the trainings.
-        rows: columns of the table with one row for each simulator and arm; by default all `measures`.
-        comparison: columns of the table of trainings. curves: panels of the figure of learning curves.
+        measures: measures of this task only; r2s adds COMMON, the measures of every task.
+        selection: keys of the measures that compare trainings. Every row of evaluations.csv must contain the first
+            key; the last key ranks the trainings.
+        rows: columns of the table that has one row per simulator or arm; by default all `measures`.
+        comparison: columns of the table that compares trainings. curves: panels of the figure with learning curves.
         scores: panels of the figure that compares the scores of trainings.
-        transfer: measures that compare adapters episode by episode in transfers to an arm.
+        transfer: measures for comparing adapters episode by episode on an arm.
         diagnostics: columns of a transfer's second table; by default COMMON.
         corner: heading of the column of row labels. description: sentence that describes what a policy does.
-        error: name, unit and scale of `Episodes.distance`. error_levels: values of the horizontal lines in the figure
-            of error over time.
+        error: name, unit and scale of `Episodes.distance`. error_levels: values of the horizontal lines in the plot
+            of the error over time.
         reward: name of `Episodes.reward`.
 
     By default, `comparison`, `curves`, `scores` and `transfer` contain the measures that `selection` lists.
@@ -124,14 +124,14 @@ class MeasureTable:
 
     @property
     def known(self) -> dict[str, Measure]:
-        """{key: Measure} of the task's own measures and of the measures COMMON."""
+        """{key: Measure} for the measures in COMMON and in `measures`."""
         return {m.key: m for m in (*COMMON, *self.measures)}
 
     def __getitem__(self, key: str) -> Measure:
         return self.known[key]
 
     def in_words(self, row: Mapping[str, Any]) -> list[str]:
-        """Return a text for each measure in `selection` that `row` contains, such as "success at 1 cm 98 %"."""
+        """Return one text, such as "success at 1 cm 98 %", for each measure in `selection` that `row` contains."""
         return [self[key].in_words(float(row[key])) for key in self.selection if row.get(key) not in (None, "")]
 
 
@@ -142,7 +142,7 @@ def write_measures(folder: Path, table: MeasureTable) -> None:
 
 
 def read_measures(folder: Path) -> MeasureTable | None:
-    """Return the table in measures.json of a run folder, or None without this file.
+    """Read measures.json of a run folder; return None if the file is missing.
 
     Raises:
         UserError: the file is damaged.

@@ -16,7 +16,7 @@ from r2s.tasks.press_measures import PRESS, WINDOW_S, press_measures
 from r2s.tasks.surface_task import FAR_N, FINE_N, HARD_N, NORMAL, SurfaceTask, near, rough
 from r2s.tasks.task import Episodes, State
 
-LEAST_STEP = 0.2  # smallest force step, as a share of high - low of `force`
+LEAST_STEP = 0.2  # smallest force step / width of the range `force`
 REVERSAL_S = 0.2  # s, time in which the friction feedforward reverses after a decrease of the force
 
 
@@ -58,7 +58,7 @@ class PressTask(SurfaceTask):
         return away * np.array([[np.cos(about), np.sin(about)]]) @ axes
 
     def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Return two forces ~ U(force), N, whose difference is at least LEAST_STEP (high - low) of `force`."""
+        """Return two forces ~ U(force), N, that differ by at least LEAST_STEP times the width of `force`."""
         low, high = self.force
         first = rng.uniform(low, high)
         second = first
@@ -67,7 +67,7 @@ class PressTask(SurfaceTask):
         return first, second
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 3) m, the touched points of the nominal plane."""
+        """Return (m, 3) m, the points of the nominal plane that the tip should touch."""
         return self.at(np.zeros(len(goals)), goals)
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -81,9 +81,9 @@ class PressTask(SurfaceTask):
         """Return the target (m, 6) of impedance control: position (m, 3) m, then velocity (m, 3) m/s.
 
         The target position moves against the normal, through the nominal plane. At the end of this motion, the spring
-        would exert the larger of the two forces even on the lowest allowed surface. The target velocity only sets the
-        direction of the friction feedforward: along the normal after a decrease of the force, otherwise against the
-        normal.
+        of the impedance would exert the larger of the two forces even on the lowest allowed surface. The target
+        velocity only sets the direction of the friction feedforward. The target velocity points along the normal
+        after a decrease of the force, otherwise against the normal.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = self.at(t, goals) - self.depth(t, goals)[:, None] * goals[:, NORMAL]

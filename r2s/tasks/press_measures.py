@@ -5,10 +5,10 @@ import numpy as np
 from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.task import Episodes
 
-WINDOW_S = 1.0  # s, duration of the two windows of the RMS force error: before the force step and before the end
+WINDOW_S = 1.0  # s, duration of the two windows of the RMS force error, one before the force step, one before the end
 IMPACT_S = 0.1  # s, duration of the impact, which begins at the first touch
 TOUCH_N = 0.5  # N, force above which the tip is in contact
-GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # limits of success: RMSE N in each window; overshoot N or share
+GOOD_N, OVER_N, OVER_SHARE = 1.0, 2.0, 0.2  # limits for success: RMS error N, overshoot N, overshoot / step
 
 PRESS = MeasureTable(
     measures=(
@@ -41,12 +41,12 @@ PRESS = MeasureTable(
 def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, float]:
     """Return the measures of `task=press`, which form one row of evaluations.csv.
 
-    force_rmse_first_N, force_rmse_last_N: RMS force error over episodes in the second before the force step, and in
-    the last second. The next four are means over episodes. overshoot_N: largest excess over the new force in the
-    direction of the step. overshoot_share: overshoot_N divided by the step. impact_N: largest force within IMPACT_S
-    of the first touch. contact: share of time in contact after the first touch. All measures above exclude stopped
-    episodes. success: share of all episodes that have no stop, RMS errors <= GOOD_N before the step and at the end,
-    and overshoot_N <= OVER_N or overshoot_share <= OVER_SHARE.
+    force_rmse_first_N: RMS force error in the second before the force step. force_rmse_last_N: RMS force error in the
+    last second. The next four measures are means over episodes. overshoot_N: largest overshoot beyond the new force,
+    in the direction of the step. overshoot_share: overshoot_N divided by the height of the step. impact_N: largest
+    force within IMPACT_S of the first touch. contact: share of time in contact after the first touch. All measures
+    above exclude stopped episodes. success: share of all episodes that meet three conditions: no stop; both RMS
+    errors <= GOOD_N; overshoot_N <= OVER_N or overshoot_share <= OVER_SHARE.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]
@@ -72,7 +72,7 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
 
 
 def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> tuple[float, ...]:
-    """Return RMS force errors before the step and at the end, overshoot (N, share), impact N, contact time share."""
+    """Return both RMS force errors N, overshoot N, overshoot / step, impact force N, share of time in contact."""
     window = round(WINDOW_S * ctrl_hz)
     error, change = force - asked, asked[-1] - asked[0]
     rmse = [float(np.sqrt((error[part] ** 2).mean())) for part in (slice(step - window, step), slice(-window, None))]
@@ -81,7 +81,7 @@ def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> 
 
 
 def impact_of(force: np.ndarray, ctrl_hz: int) -> tuple[float, float]:
-    """Return the peak force, N, within IMPACT_S of the first touch, and the share of time in contact afterwards."""
+    """Return the peak force, N, within IMPACT_S of the first touch, and the share of time in contact from then on."""
     touched = np.flatnonzero(force > TOUCH_N)
     if not len(touched):
         return 0.0, 0.0

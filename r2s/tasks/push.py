@@ -1,7 +1,7 @@
 """Task push: push a box of unknown mass and friction to a pose on the table.
 
-The table and the size of the box are given. Observations contain the pose of the box with `pose_noise`, as from a
-camera, but not the mass and friction of the box, which are part of the dynamics (`dr=box`, `arm.surface`).
+The table's pose and the box's size are known. Observations contain the box's pose with the noise `pose_noise`, as
+from a camera. The box's mass and friction are not observed; they are part of the dynamics (`dr=box`, `arm.surface`).
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ from r2s.tasks.tip_task import TipTask
 POSE, START = slice(0, 6), 6  # columns of a goal: pose of the box, then the start posture
 BEHIND = 0.04  # m, gap between tip and box at the start
 FAR_M, FAR_RAD, GAP_M, FINE_M, LEVEL_M = 0.1, 0.5, 0.05, 0.02, 0.02  # m, rad: tanh scales
-CLEAR_M = 0.01  # m, clearance below which the term `table` is negative; without the term the tip rubs on the table
+CLEAR_M = 0.01  # m, clearance below which the term `table` is negative; without this term the tip rubs on the table
 WEIGHTS = {
     "distance": 1.0,
     "yaw": 0.5,
@@ -49,8 +49,8 @@ WEIGHTS = {
     "smoothness": 1.0,
     "filter_penalty": 1.0,
 }
-# columns of an observation, counted after q, dq, effort and `limited`, in the frame of the table: position
-# of the tip m, velocity of the tip m/s, pose of the box and pose error (each x m, y m, yaw rad)
+# columns of an observation after q, dq, effort and `limited`: in the table's frame, tip position m, tip velocity m/s,
+# box pose and pose error (each x m, y m, yaw rad)
 TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 
 
@@ -58,16 +58,18 @@ TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 class PushTask(TipTask):
     """Push a box to a pose; a `Task` (r2s/tasks/task.py) from conf/task/push.yaml.
 
-    A goal is a row (6 + n,): goal pose of the box, in the form of `State.box`, and start posture of the arm, rad.
+    A goal is a row (6 + n,): the box's goal pose, encoded as in `State.box`, then the arm's start posture, rad.
     In the start posture, the tip is behind the box, at PUSHED_AT times the height of the box.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         size: (3,) m, edges of the box. away: (low, high) m, distance of a goal from the box's nominal position.
-        bearing: degrees, largest angle of a goal from straight ahead. goal_yaw: degrees, largest yaw of a goal.
-        spread, first_yaw: m and degrees, largest deviation of the box's start pose from its nominal pose, for
-            `dr=box`.
-        pose_noise: m and degrees, standard deviation of the noise of the perceived pose in simulation.
+        bearing: degrees, largest angle between a goal's direction and straight ahead. goal_yaw: degrees, largest yaw
+            of a goal.
+        spread, first_yaw: m and degrees, largest shift and rotation of the box's start pose from the nominal pose,
+            for `dr=box`.
+        pose_noise: m and degrees, standard deviations of position and yaw noise in the pose that simulated arms
+            perceive.
         point, normal: nominal position of the box on the table, m, and the table's normal; if None, see
             `table_frame`.
         displacement: m, distance by which an action of 1 shifts the tip's target in the default controller.
@@ -108,7 +110,7 @@ class PushTask(TipTask):
     )
 
     def __post_init__(self):
-        self.as_reach()  # raises for a wrong rate
+        self.as_reach()  # raises UserError for a wrong rate
         check_size("task.size", self.size, TABLE[1])
         for name in ("away", "pose_noise"):
             pair = getattr(self, name)
@@ -151,7 +153,7 @@ class PushTask(TipTask):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with limits of contact force, N, and speed, m/s, at the table of `point` and `normal`."""
+        """Return the task with limits of contact force (N) and speed (m/s) at the table plane (`point`, `normal`)."""
         plane = nominal_plane(robot, self.point, self.normal)
         return self._with("push_limit", push_limit(robot, friction, force_max, speed_near, plane))
 
@@ -167,7 +169,7 @@ class PushTask(TipTask):
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) m, tip target at zero action: the mean of `away` straight ahead of the box's nominal position."""
+        """(3,) m, tip target at zero action: straight ahead of the box's nominal position, by the mean of `away`."""
         return self.table.outside(np.array([0.5 * sum(self.away), 0.0, self.height]))
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -186,8 +188,8 @@ class PushTask(TipTask):
         """Return random goals (count, 6 + n); the class docstring describes a goal.
 
         A goal has distance ~ U(away), bearing ~ U(-bearing, bearing), yaw ~ U(-goal_yaw, goal_yaw). The tip starts
-        behind the box, with a gap of BEHIND to the rearmost possible corner and a random sideways shift of up to half
-        an edge.
+        behind the box, at the distance BEHIND from the rearmost possible corner. The tip's random sideways shift is
+        at most half the box's width.
 
         Raises:
             UserError: the tip cannot reach its start position, or the far side of the box at its goal.
@@ -216,7 +218,7 @@ class PushTask(TipTask):
         return goals[:, :3]
 
     def planar(self, state: State, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return box, goal and goal - box, (m, 3) each, in the table frame: x m, y m, yaw rad; yaw error in +-pi."""
+        """Return box pose, goal pose and error (goal - box), each (m, 3): x m, y m, yaw rad in the table's frame."""
         seen = self.table.pose(np.zeros((len(goals), 3)), 0.5 * self.size[2]) if state.box is None else state.box
         box, goal = self.table.planar(seen), self.table.planar(goals[:, POSE])
         error = goal - box
@@ -229,7 +231,7 @@ class PushTask(TipTask):
         return self.table.inside(place), np.einsum("ij,mjn->min", self.table.axes, jacobian)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 25,) that normalize observations: fixed scales of the task."""
+        """Return fixed mean and standard deviation (3 n + 25,) that normalize observations."""
         n, (low, high) = robot.n, robot.q_range
         mean = np.zeros(3 * n + 25)
         mean[:n] = 0.5 * (low + high)
@@ -258,7 +260,7 @@ class PushTask(TipTask):
         return np.concatenate(rows, axis=1, dtype=np.float32)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N: the magnitude of the force on the box, and 0, because the task requests no force."""
+        """Return (m, 2) N: the magnitude of the force on the box, and the requested force, which is 0."""
         none = np.zeros(len(goals))
         return np.stack([none if state.force is None else np.linalg.norm(state.force, axis=1), none], 1)
 
@@ -274,11 +276,11 @@ class PushTask(TipTask):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance d (m,) m of the box from its goal, and the reward terms (m, 8).
 
-        Terms, with the yaw error e: distance = -tanh(d / 10 cm); yaw = -tanh(|e| / 0.5 rad); precision =
-        `near`(d, 10 cm, 3 cm) `near`(|e|, 0.5 rad, 10 degrees); gap = -tanh(distance of the tip from the box / 5 cm);
-        height = -tanh(height error of the tip / 2 cm); table = -tanh(u / 1 cm), u being the depth by which the tip's
-        lowest point is less than 1 cm above the table (for low boxes, less than its target height); smoothness =
-        -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty = -`State.limited`.
+        Terms, with the yaw error e: distance = -tanh(d / 10 cm); yaw = -tanh(|e| / 0.5 rad); precision = `near`(d, 10
+        cm, 3 cm) `near`(|e|, 0.5 rad, 10 degrees); gap = -tanh(distance of the tip from the box / 5 cm); height =
+        -tanh(height error of the tip / 2 cm); table = -tanh(max(0, c - h) / 1 cm), with the height h of the tip's
+        lowest point above the table, and c = 1 cm (less for low boxes); smoothness = -0.03 sum tanh(|ddq| / 10
+        rad/s^2); filter_penalty = -`State.limited`.
         """
         place, _ = self.tip(state.q)
         box, _, error = self.planar(state, goals)
@@ -287,7 +289,7 @@ class PushTask(TipTask):
         gap = (np.linalg.norm(beyond.clip(0.0), axis=1) - self.tip_radius).clip(0.0)
         precise = near(d, FAR_M, GOOD_M) * near(yaw, FAR_RAD, GOOD_RAD)
         level = np.tanh(np.abs(place[:, 2] - self.height) / LEVEL_M)
-        clear = min(CLEAR_M, self.height - self.tip_radius)  # a low box is pushed with less clearance
+        clear = min(CLEAR_M, self.height - self.tip_radius)  # the tip pushes a low box with less clearance
         low = np.tanh((clear + self.tip_radius - place[:, 2]).clip(0.0) / CLEAR_M)
         terms = [-np.tanh(d / FAR_M), -np.tanh(yaw / FAR_RAD), precise, -np.tanh(gap / GAP_M), -level, -low]
         return d, np.stack([*terms, -rough(ddq), -state.limited], axis=1)
@@ -302,6 +304,6 @@ class PushTask(TipTask):
 
 
 def _turned(vectors: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    """Return vectors (m, 2) in axes that are rotated by yaw (m,) rad."""
+    """Express vectors (m, 2) in axes that are rotated by yaw (m,) rad."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1)

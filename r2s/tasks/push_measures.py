@@ -39,11 +39,11 @@ PUSH = MeasureTable(
 def push_measures(episodes: Episodes, ctrl_hz: int) -> dict[str, float]:
     """Return the measures of `task=push`, which form one row of evaluations.csv.
 
-    within_3cm, within_10deg: share of episodes with the box within 3 cm, or 10 degrees, of its goal throughout the
+    within_3cm, within_10deg: share of episodes in which the box stays within 3 cm (10 degrees) of its goal in the
     last 0.5 s. success: share of episodes within 3 cm and 10 degrees, without a stop, and with the tip always above
-    the table. distance_median_m, yaw_median_deg: median over episodes of the mean distance or yaw error in the last
-    0.5 s. force_peak_N: largest force at a control step, mean over episodes. on_table: share of episodes in which the
-    tip sinks into the table.
+    the table. distance_median_m, yaw_median_deg: mean distance and mean yaw error in the last 0.5 s, median over
+    episodes. force_peak_N: largest force of an episode, read once per control step; mean over episodes. on_table:
+    share of episodes in which the tip sinks into the table.
     """
     hold, box = round(HOLD_S * ctrl_hz), episodes.box
     assert box is not None

@@ -16,15 +16,15 @@ from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.rollout import measures
 from r2s.tasks.task import BaseTask, Episodes, ObservationTerm, State
 
-FINE_M = 0.02  # m, tanh scale of the observed error; the last centimeters span the range of this network input
+FINE_M = 0.02  # m, tanh scale of the observed error; small, so that this input resolves the last centimeters
 FINE_RAD = 0.015  # m^2/rad, tanh scale of the observed J^T error
-FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds: makes creeping joints visible
+FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds; small, so that this input resolves slow motion
 OBSERVED = (  # terms of `observe`, for metadata
     f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
 )
-SPEED_NOISE = 0.05  # rad/s, speed noise of trainings for an identified arm; equals REST (rollout.py)
+SPEED_NOISE = 0.05  # rad/s, largest speed noise in trainings for an identified arm; equals REST (rollout.py)
 CLOSE_M = 1e-3  # m, the reward divides by the initial distance, or by CLOSE_M if larger
-MIDDLE = 0.05, 0.95  # default goal region: quantiles of the distance from the shoulder in random postures
+MIDDLE = 0.05, 0.95  # default goal region: quantiles of the end effector's distance from the shoulder
 POSTURES = 500  # number of random postures from which r2s computes the quantiles MIDDLE
 
 REACH = MeasureTable(
@@ -66,12 +66,12 @@ class ReachTask(BaseTask):
         cutoff_hz: cut-off frequency of the low-pass on the torque.
         start_spread: rad, largest random deviation of a joint from q_home in a start posture.
         reach: (low, high) m, range of the distance between goal and shoulder (the second joint, or the only joint).
-            If None, low and high are the quantiles MIDDLE of the distance between end effector and shoulder in random
+            If None, low and high are the quantiles MIDDLE of the end effector's distance from the shoulder in random
             postures.
         height: lowest goal, m. azimuth: rad, largest horizontal angle between a goal's direction and straight ahead.
         speed_noise: rad/s, see `Task`. If None, the value is SPEED_NOISE for models with measurement noise, such as
-            identified arms, and 0 for other models. A policy trained with noise does not react to noise, and thus
-            does not excite oscillations of elastic gears, which rigid models do not show
+            identified arms, and 0 for other models. A policy trained with speed noise does not react to this noise.
+            Such a policy therefore does not excite oscillations of elastic gears, which rigid models lack
             (benchmarks/results/transfer.md).
     """
 
@@ -101,7 +101,7 @@ class ReachTask(BaseTask):
         self._check_region()
 
     def _check_region(self) -> None:
-        """Raise UserError unless `reach` is None or 0 <= low <= high, and `height` and `azimuth` are numbers."""
+        """Raise UserError if `reach`, `height` or `azimuth` is invalid."""
         check_number("task.height", self.height, "[-inf, inf]")
         check_number("task.azimuth", self.azimuth, "[0, inf]")
         if self.reach is None:
@@ -120,7 +120,7 @@ class ReachTask(BaseTask):
         return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the controller's torque limit; without a limit, the torque that an action of 1 commands."""
+        """Return (n,) Nm, the controller's torque limit; if it has none, the torque for an action of 1."""
         if self.controller is not None and self.controller.torque_limit is not None:
             return self.controller.torque_limit
         share = np.array(self.torque_fraction, dtype=float)
@@ -138,7 +138,7 @@ class ReachTask(BaseTask):
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """Weights (5,) of the reward terms in eq. (2) of the paper."""
+        """Weights (5,) with which the reward terms add up to the paper's reward."""
         return rewards.PAPER
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -151,7 +151,7 @@ class ReachTask(BaseTask):
             return self.reach
         postures = zip(range(POSTURES), _postures(robot, np.random.default_rng(0)), strict=False)
         low, high = np.quantile([away for _, (_, away) in postures], MIDDLE)
-        return float(low) - 1e-6, float(high) + 1e-6  # widen the range: with one joint, all distances are equal
+        return float(low) - 1e-6, float(high) + 1e-6  # wider: a one-joint arm has only one distance
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
         """Return (count, 3) m: end-effector positions of random joint angles, so that every goal is reachable.
@@ -178,7 +178,7 @@ class ReachTask(BaseTask):
         return goals
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (6 n + 12,) that normalize observations, both constants of the task.
+        """Return fixed mean and standard deviation (6 n + 12,) that normalize observations.
 
         Scales from random motion would be too large: random torques spin the wrist at 10 rad/s, but near a goal even
         0.1 rad/s matters.
@@ -232,7 +232,7 @@ def observation_terms(torque: np.ndarray) -> list[ObservationTerm]:
 
 
 def _postures(robot: Robot, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, float]]:
-    """Yield end-effector positions (3,) m of random postures and their distances from the shoulder, m."""
+    """Yield the end-effector position (3,) m of random postures, and its distance from the shoulder, m."""
     model = robot.model(gravity=False)
     data, site = mujoco.MjData(model), model.site(robot.ee_site).id
     data.qpos = robot.q_home
@@ -259,10 +259,10 @@ def observe(
 ) -> np.ndarray:
     """Return the observation (m, 6 n + 12) float32 in SI units; arms and simulators share this function.
 
-    Terms: q; dq; ee; goal; error; effort / torque; tanh(error / 2 cm); J^T error; tanh(J^T error / 1.5 cm);
-    tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector toward the goal; without J^T error, a
-    network would have to learn the Jacobian. The observation contains the effort, from which the torque can change by
-    at most 1 Nm per ms.
+    Terms: q; dq; ee; goal; error; effort / torque; tanh(error / 2 cm); J^T error; tanh(J^T error / 1.5 cm); tanh(dq /
+    0.1 rad/s). J^T error shows which joints move the end effector toward the goal; a network without this term would
+    have to learn the Jacobian. The policy observes the effort because the torque can change from the effort by at
+    most 1 Nm per ms.
 
     Args:
         q, dq: (m, n) rad, rad/s, joint angles and speeds.

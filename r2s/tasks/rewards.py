@@ -1,8 +1,8 @@
-"""The paper's reward, eq. (2), and a curriculum that approaches this reward.
+"""The paper's reward, equation (2), and a curriculum that approaches this reward.
 
 A reward is a weighted sum of named terms. The replay buffer stores the terms without weights, and each update applies
-the current weights, so that stored transitions stay valid when a curriculum changes the weights. r2s adds three terms
-to the paper's terms: a bonus for precision, and penalties for motion near the goal and for a high filter rate.
+the current weights. Stored transitions therefore remain valid when a curriculum changes the weights. r2s adds three
+terms to the paper's terms: a bonus for precision, and penalties for motion near the goal and for a high filter rate.
 """
 
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 def terms(
     distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray, limited: np.ndarray
 ) -> np.ndarray:
-    """Return five reward terms (m, 5): the sum of the first two is eq. (2) of the paper; r2s adds the last three.
+    """Return five reward terms (m, 5): the first two add up to the paper's reward; r2s adds the other three.
 
-    Terms, with d = distance / distance0: distance = -k1 d;
+    Terms, with d = distance / distance0 and the paper's constants k1 to k6: distance = -k1 d;
     smoothness = -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d);
     precision = 1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2;
     stillness = -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2);
@@ -59,17 +59,17 @@ PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms in eq. (2)
 
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
-PATIENCE = 50_000  # env steps in which the penalty factor grows e-fold while the filter rate is twice the maximum
+PATIENCE = 50_000  # env steps in which the penalty factor grows e-fold while the filter rate is twice its limit
 MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2; at 4, ddpg and td3 learn not to move
 
 
 class Reward:
     """Reward with the terms and weights of the task, `reward=task`; subclasses change weights or terms.
 
-    `reward._target_` names the class of the reward; the remaining keys in conf/reward/*.yaml are its arguments.
+    In conf/reward/*.yaml, `_target_` names the class of the reward; the other keys are arguments of this class.
 
     Attributes:
-        factor: number or array, the first value that `weights` and `adapt` receive as `factor`.
+        factor: number or array, initial value of the argument `factor` of `weights` and `adapt`.
     """
 
     factor: Any = 1.0
@@ -101,20 +101,20 @@ class Reward:
 class Curriculum(Reward):
     """A reward whose weights change during a training.
 
-    Eq. (2) of the paper alone makes exploration difficult, because its acceleration terms reward early stopping.
-    Trainings with a curriculum start with a small smoothness weight and a bonus for precision, and the weights then
-    change linearly toward eq. (2). With reward=paper, the weights are constant: 1 for distance and smoothness, 0 for
-    other terms.
+    The paper's reward alone makes exploration difficult, because its acceleration terms reward early stopping. A
+    training with a curriculum starts with a small smoothness weight and a bonus for precision. The weights then
+    change linearly toward those of the paper. With reward=paper, the weights are constant: 1 for distance and
+    smoothness, 0 for other terms.
 
     Attributes:
-        smoothness, precision, stillness, filter_penalty: (before, after), weight of the term before and after the
-            curriculum's change. anneal: fractions of the budget at which the weights start and stop changing.
-        max_filter_rate: intended upper limit of the filter rate in training, exploration included; if None, no limit.
-            Once the weights have started to change, a filter rate above `max_filter_rate` raises the weight of the
-            filter penalty. A filter rate below `max_filter_rate` lowers the penalty weight, but not below the
-            curriculum's weight. With a fixed penalty, the filter rate is 1 to 6 %, depending on the seed
-            (benchmarks/results/minutes.md). Integral control of the filter rate adapts the logarithm of the penalty
-            weight, as for a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
+        smoothness, precision, stillness, filter_penalty: (before, after), weights of the term before and after the
+            linear change. anneal: fractions of the budget at which the weights start and stop changing.
+        max_filter_rate: intended upper limit of the filter rate in training, including exploration; if None, no
+            limit. Once the weights have started to change, a filter rate above `max_filter_rate` raises the weight of
+            the filter penalty. A lower filter rate reduces the weight of the penalty, but not below the curriculum's
+            weight. With a fixed weight of the penalty, the filter rate is 1 to 6 %, depending on the seed
+            (benchmarks/results/minutes.md). The logarithm of the weight integrates the excess of the filter rate,
+            like a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.

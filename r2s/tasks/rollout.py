@@ -1,4 +1,4 @@
-"""Run policies in simulators and on arms with one function; compute the measures of `task=reach`."""
+"""Run policies in simulators and on arms (`rollout`), and compute the measures of `task=reach`."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -28,7 +28,7 @@ class Arms(Protocol):
 
     Attributes:
         robot: model of each arm. width: number of episodes that run at the same time.
-        speeds: (width, T, n) rad/s, joint speeds of the finished episodes after each control step, smoothed to remove
+        speeds: (width, T, n) rad/s, joint speeds after each control step of the finished episodes, smoothed to remove
             measurement noise; None if the measured speeds have no noise.
     """
 
@@ -40,7 +40,7 @@ class Arms(Protocol):
     def speeds(self) -> np.ndarray | None: ...  # noqa: D102
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Begin the episodes `first`, `first` + 1, ... at rest in `starts` (width, n) rad; return the state."""
+        """Start the episodes `first`, `first` + 1, ... at rest in `starts` (width, n) rad; return the state."""
         ...
 
     def step(self, command: np.ndarray) -> State:
@@ -63,9 +63,9 @@ def rollout(
 ) -> Episodes:
     """Run one episode for each goal, and return the `Episodes`.
 
-    An episode ends early if the arm stops, or if it touches itself or the table (r2s/physics/collision.py) and
-    `task.may_touch` does not allow this contact. `rollout` checks contacts after every control step. The record of an
-    episode that ended early repeats the last state; the last distance is infinite.
+    An episode ends early if the arm stops, or if it has a contact with itself or the table that `task.may_touch` does
+    not allow (r2s/physics/collision.py). `rollout` checks contacts after every control step. After an early end, the
+    record repeats the last state, and its last distance is infinite.
 
     Args:
         policy: maps observations to actions. arms: simulated or real arms. task: the task with its controller.
@@ -150,7 +150,7 @@ def _run(
 
 
 def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
-    """Return the state; arms whose episode has ended (`over`, (m,) bool) have q, dq, ee and tau from `last`."""
+    """Return `state`, with q, dq, ee and tau from `last` for arms whose episode has ended (`over`, (m,) bool)."""
     names, here = ("q", "dq", "ee", "tau"), over[:, None]
     kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
     return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
@@ -159,15 +159,15 @@ def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
 def measures(episodes: Episodes) -> dict[str, float]:
     """Return the measures of `task=reach`, one row of evaluations.csv.
 
-    success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: median over goals
-    of the mean distance in the last 0.5 s. return_paper: mean over episodes of the sum of eq. (2). return_smooth:
-    return_paper computed from speeds without noise, because noise causes false accelerations in eq. (2).
+    success_x: share of episodes within x of the goal throughout the last 0.5 s. distance_median_m: mean distance in
+    the last 0.5 s, median over goals. return_paper: sum of the paper's reward in an episode, mean over episodes.
+    return_smooth: return_paper from smoothed speeds, because speed noise appears as acceleration in the reward.
     time_to_reach_s: time after which the end effector stays within 2 cm, median over the episodes that end within 2
-    cm. overshoot_m: largest distance minus 2 cm after the end effector has first come within 2 cm, mean over
-    episodes. rest: share of episodes without a stop in which every joint is slower than REST throughout the last 0.5
-    s; joints can move although the end effector is at rest. q_left_rad: smallest distance of a joint from its
-    position limits, 5 % quantile over episodes. limited: mean filter rate. collision: share of episodes that a
-    contact ended.
+    cm. overshoot_m: largest distance beyond 2 cm after the end effector has first come within 2 cm, mean over the
+    episodes that come within 2 cm. rest: share of episodes without a stop in which every joint is slower than REST
+    throughout the last 0.5 s; joints can move while the end effector is at rest. q_left_rad: smallest distance of a
+    joint from its position limits, 5 % quantile over episodes. limited: mean filter rate. collision: share of
+    episodes that a contact ended.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)

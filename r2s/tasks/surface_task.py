@@ -1,8 +1,8 @@
 """Base class of tasks on a surface: nominal plane, approach, force estimate, and functions for reward terms.
 
 The task contains only the nominal plane. The true plane, stiffness and friction of the surface are part of the
-dynamics (`dr=contact`, `arm.surface`). The policy observes a force estimate from q, dq and the commanded torque.
-Neither observation nor controller uses the true force.
+dynamics (`dr=contact`, `arm.surface`). The policy observes a contact force that is estimated from q, dq and the
+commanded torque. Neither observation nor controller uses the true force.
 """
 
 from dataclasses import dataclass, field, replace
@@ -25,13 +25,13 @@ from r2s.tasks.task import ObservationTerm, State
 from r2s.tasks.tip_task import TipTask
 
 POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8, 9  # columns of a goal
-LAG_M = 0.01  # m, lag of the tip behind its target, from damping at approach_speed and a friction error of 2 N
-# Force that an action of 1 adds under the default controller, divided by the largest force: 2 N of 20 N. On the model
-# of elastic twin 0, policies wipe equally well with 1 N; with 5 N, they wipe worse than the controller alone
+LAG_M = 0.01  # m, lag of the tip behind its target, caused by damping at approach_speed and a friction error of 2 N
+# With the default controller, an action of 1 adds this share of the largest force: 2 N of 20 N. On the model of
+# elastic twin 0, policies wipe equally well with 1 N; with 5 N, they wipe worse than the controller alone
 RESIDUAL = 0.1
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
 # 1/rad, see `cartesian_impedance`; low, because a null-space torque pushes the tip if joints stick. On models of
-# twins 0 and 1, the reference controller has similar force errors from 0.02 to 0.05, and up to twice as large at 0.2
+# twins 0 and 1, force errors of the reference controller are similar from 0.02 to 0.05, up to twice as large at 0.2
 NULL_STIFFNESS = 0.05
 REGULAR = 1e-3  # m^2/rad^2, regularization: the force estimate is 0 in directions in which no joint moves the tip
 EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: mid-range of conf/dr/contact.yaml
@@ -40,7 +40,7 @@ POSTURES = 12  # approximate number of points per path for which r2s checks the 
 
 @dataclass(frozen=True)
 class SurfaceTask(TipTask):
-    """A task that presses a tool's tip on a surface whose position is known roughly.
+    """A task that presses the tip of a tool on a surface of roughly known position.
 
     A goal begins with 9 + n numbers: point of the nominal plane that the tip touches first, m; normal of the plane;
     two forces, N; start height of the tip's center above the touched point, m; start posture, rad.
@@ -48,9 +48,9 @@ class SurfaceTask(TipTask):
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         force: (low, high) N, range of the requested forces. force_rate: N/s, rate of change of a requested force.
-        approach_speed: m/s, speed of the target against the nominal normal; the tip meets the surface at this
-            speed or slower.
-        clearance: m, start height of the tip above the nominal plane. spread: m, largest distance of a touched point
+        approach_speed: m/s, speed of the target against the nominal normal; at the first touch, the tip is at most as
+            fast.
+        clearance: m, gap between tip and nominal plane at the start. spread: m, largest distance of a touched point
             from `point`. place, tilt: m and degrees, largest shift and tilt of the true plane from the nominal plane.
         point, normal: point, m, and normal of the nominal plane in the base frame; if None, those of a work table
             below the tip in home posture.
@@ -87,7 +87,7 @@ class SurfaceTask(TipTask):
     target_size: ClassVar[int] = 6
 
     def __post_init__(self):
-        self.as_reach()  # raises for a wrong rate
+        self.as_reach()  # raises UserError for a wrong rate
         for name, low in (("force_rate", 1e-3), ("approach_speed", 1e-4), ("clearance", 1e-4)):
             check_number(f"task.{name}", getattr(self, name), f"[{low:g}, inf)")
         check_number("task.pool", self.pool, "[1, inf)", whole=True)
@@ -114,7 +114,7 @@ class SurfaceTask(TipTask):
         return self.place + self.spread * float(np.tan(np.radians(self.tilt)))
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
-        """Return the task with the model of one arm, which the default controller and the force estimate use.
+        """Return the task with one arm's model, for the default controller and the force estimate.
 
         Raises:
             UserError: the robot has no tool, or cannot exert the largest force.
@@ -140,7 +140,7 @@ class SurfaceTask(TipTask):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> Self:
-        """Return the task with limits of force and speed at the nominal plane; they allow the requested forces."""
+        """Return the task with limits of speed and force at the nominal plane; the limits allow requested forces."""
         limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1], self.stop)
         if limit is not None:
             limit = replace(limit, place=self.place, tilt=float(np.radians(self.tilt)))
@@ -216,7 +216,7 @@ class SurfaceTask(TipTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return the numbers after the start posture in a goal, computed from `path` (k, 3) m; by default none."""
+        """Return the numbers after a goal's start posture, computed from `path` (k, 3) m; by default none."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -224,13 +224,13 @@ class SurfaceTask(TipTask):
         return goals[:, POINT]
 
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, how deep the target of the tip's center is below the nominal plane at the times t (m,) s.
+        """Return (m,) m, the depth of the tip center's target below the nominal plane at the times t (m,) s.
 
         The depth grows at `approach_speed` until the tip touches even the lowest allowed surface, then at
         `force_rate` / `spring` m/s.
         """
         height, K = goals[:, HEIGHT], self.spring
-        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth; `height` is that of the tip's center
+        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth at the first touch
         slow, late = self.approach_speed * t - height, (t - self.down_s).clip(0.0)
         return np.minimum(
             slow.clip(None, touched) + self.force_rate / K * late, touched + goals[:, FORCES].max(1) / K
@@ -250,7 +250,7 @@ class SurfaceTask(TipTask):
         raise UserError(f"task: {type(self).__name__} needs a model of the arm; call with_model first")
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 12,) that normalize observations: fixed scales of the task."""
+        """Return fixed mean and standard deviation (3 n + 12,) that normalize observations."""
         n = robot.n
         low, high = robot.q_range
         mean = np.zeros(3 * n + 12)
@@ -292,8 +292,9 @@ class SurfaceTask(TipTask):
     def estimate(self, state: State, normal: np.ndarray, jacobian: np.ndarray | None = None) -> np.ndarray:
         """Return (m,) N, the contact force against `normal` (m, 3), estimated from q, dq and the last command.
 
-        The estimate is quasi-static: the force F solves J^T F = tau - model(q, dq) by least squares. At rest, joint
-        friction causes an error of up to friction / lever arm. Errors of the arm's model bias the force estimate.
+        The estimate neglects accelerations: the force F is the least-squares solution of J^T F = tau - model(q, dq).
+        At rest, joint friction causes an error of up to friction / lever arm. Errors of the arm's model bias the
+        force estimate.
         """
         jacobian = self.tip(state.q)[1] if jacobian is None else jacobian
         q, dq = np.ascontiguousarray(state.q), np.ascontiguousarray(state.dq)

@@ -1,7 +1,7 @@
 """The protocol `Task`: the interface through which environment, rollout and policies use a task.
 
 A task defines start postures, goals, observations, reward terms, and the measures of episodes. To add a task, write
-one file next to reach.py and one yaml (docs/how_to/extending.md).
+one Python file next to reach.py and one YAML file (docs/how_to/extending.md).
 """
 
 import copy
@@ -19,9 +19,9 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.rewards import TERMS
 
-# the score penalizes only filter rates above this value; lower rates do not make policies better
+# the score penalizes only filter rates above this value, because lower rates do not make policies better
 MAX_FILTER_RATE = 0.04
-TORQUE_STD = 0.3  # scale of observed torques, as a share of the torque limit
+TORQUE_STD = 0.3  # standard deviation of observed controller torques / torque limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class State:
 
     @staticmethod
     def at_home(robot: Robot) -> "State":
-        """Return the state of an arm at rest in the home posture, with zero ee and Jacobian, to compile functions."""
+        """Return a state at rest in the home posture, with zero ee and Jacobian, for calls that compile functions."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
         none = np.zeros(1, dtype=bool), np.zeros(1)
         return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
@@ -69,13 +69,13 @@ class State:
 
 @dataclass(frozen=True)
 class Episodes:
-    """E finished episodes of T control steps; index k along T means the state after step k.
+    """E finished episodes of T control steps; arrays with a dimension T contain the values after each step.
 
     Attributes:
         t: (T,) s, time. q, dq: (E, T, n) rad, rad/s, angles and speeds. ee: (E, T, 3) m, end effector. goal: goal
             positions, (E, 3) m, or (E, T, 3) m if goals move. tau: (E, T, n) Nm, command at the end of each step.
         distance: (E, T), distance in m, or force error in N for `task=press`. reward: (E, T), weighted by
-            `Task.paper_weights`; for `task=reach`, eq. (2).
+            `Task.paper_weights`; for `task=reach`, the paper's reward.
         reward_smooth: (E, T), the reward computed from speeds without measurement noise.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
@@ -131,8 +131,8 @@ class Task(Protocol):
         reward_terms: names of the reward terms. paper_weights: (k,), weights of the reward terms in
             `Episodes.reward`.
         pool: number of different goals in a training.
-        speed_noise: rad/s. In training, the standard deviation of each arm's speed noise is at least a random value ~
-            U(0, speed_noise). If None or 0, there is no lower bound.
+        speed_noise: rad/s. In training, each arm gets a random value ~ U(0, speed_noise); the standard deviation of
+            the arm's speed noise is at least this value. None and 0 set no lower bound.
         measure_table: the measures that `measures` returns, with their presentation (r2s/tasks/measures.py).
         may_touch: pairs of bodies that may touch each other: two names, or a name and "table". Other contacts end an
             episode.
@@ -175,7 +175,7 @@ class Task(Protocol):
         ...
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "Task":
-        """Return the task with the defaults that depend on the identified model of one arm."""
+        """Return the task with the attributes that depend on the model `dynamics` of one arm."""
         ...
 
     def controlled_by(self, controller: Controller) -> "Task":
@@ -185,7 +185,7 @@ class Task(Protocol):
     def pushing_within(
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "Task":
-        """Return the task with limits of contact force N and contact speed m/s; friction: (n,) Nm, joint friction."""
+        """Return the task with limits of contact force (N) and speed (m/s); friction: (n,) Nm, joint friction."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -205,7 +205,7 @@ class Task(Protocol):
         ...
 
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
-        """Return goal positions to plot: (m, 3) m, or for moving goals (m, steps, 3) m, after each step."""
+        """Return goal positions to plot: (m, 3) m, or (m, steps, 3) m after each step for moving goals."""
         ...
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +240,7 @@ class Task(Protocol):
         ...
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
-        """Return the dynamics with the nominal surface or box around the arm, for predictions."""
+        """Return the dynamics with the task's nominal surface or box, for predictions of episodes."""
         ...
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
@@ -256,8 +256,8 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: terms of the task, then terms of the controller.
 
     Args:
-        task, controller: the task and its controller. goals: (m, ...). state: state to which `observe` adds
-            `State.noise`.
+        task, controller: the task and its controller. goals: (m, ...). state: true state; this function adds its
+            `noise`.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()

@@ -25,7 +25,7 @@ FAR_M, NEAR_M, FINE_M = 0.03, 0.01, 0.003  # m, tanh scales of the reward
 SPEED, ACCELERATION = 1.0, 10.0  # rad/s, rad/s^2, tanh scales of deviations from the plan
 NEAR_RAD = 0.02  # rad, scale of observed joint errors
 CHECKED = 12  # approximate number of postures per path that r2s checks for contacts
-TRIES = 60  # largest number of attempts per path, on average
+TRIES = 60  # largest mean number of attempts per path
 JERK_S = 0.1  # s, window of the fitted cubic whose third derivative is the jerk
 
 TRACK = MeasureTable(
@@ -95,7 +95,7 @@ class TrackTask(BaseTask):
         if not isinstance(self.ctrl_hz, int) or not 50 <= self.ctrl_hz <= 200 or cycles % self.ctrl_hz:
             raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; 50, 100, 125 and 200 are")
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
-        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # 60 s: r2s stores whole plans
+        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # 60 s: plans need memory
         check_number("task.boost", self.boost, "(0, inf)")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.pool", self.pool, "[1, inf)", whole=True)
@@ -112,7 +112,7 @@ class TrackTask(BaseTask):
         for kind in self.kinds or ("",):
             if kind not in KINDS:
                 raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
-        replace(self._region)  # raises if the region or the torque is invalid
+        replace(self._region)  # raises UserError if the region or the torque is invalid
 
     @property
     def _region(self) -> ReachTask:
@@ -144,7 +144,7 @@ class TrackTask(BaseTask):
         return np.minimum(self.boost * fraction, robot.tau_max)
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> "TrackTask":
-        """Return the task with the model of one arm, which the default controller uses."""
+        """Return the task with one arm's model, for the default controller."""
         return replace(self, model=dynamics)
 
     def control(self, robot: Robot) -> Controller:
@@ -169,7 +169,7 @@ class TrackTask(BaseTask):
         """Return plans (count, steps + 1 + preview, 6 + 3 n) of random paths that the arm can follow.
 
         Raises:
-            UserError: hardly any random path is within the arm's reach and limits and free of collisions.
+            UserError: hardly any random path is reachable, within the arm's limits and free of collisions.
         """
         paths = self._paths(robot)
         space, inside = Space(robot, table=-np.inf, z_min=self.height, deviation=0.0), _Inside(robot, self._region)
@@ -202,7 +202,7 @@ class TrackTask(BaseTask):
     def plan(self, robot: Robot, start: Sequence[float], shape: Curve, pace: float) -> np.ndarray:
         """Return the plan (steps + 1 + preview, 6 + 3 n) of a custom curve.
 
-        This method does not check for contacts. It does not check whether the curve resembles the training paths.
+        This method checks neither contacts nor whether the curve resembles the training paths.
 
         Args:
             robot: the arm. start: (3,) m, first end-effector position. shape: function from the path parameter u (T,)
@@ -225,7 +225,7 @@ class TrackTask(BaseTask):
         return Paths(robot, self.torque_limit(robot), self.episode_s, self.ramp_s)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (d,) that normalize observations: fixed scales of the task."""
+        """Return fixed mean and standard deviation (d,) that normalize observations."""
         n = robot.n
         centre, scale = self._region.observation_scale(robot)
         ahead = np.repeat(self.speed[1] * np.arange(1, self.preview + 1) / self.ctrl_hz, 3)
@@ -292,9 +292,9 @@ class TrackTask(BaseTask):
 
         path_rmse_mm: RMS distance between end effector and reference over the steps of the paths without a stop.
         path_max_mm: largest distance on a path, mean over the paths without a stop. within_x: share of steps with a
-        distance below x; steps of stopped paths are misses. return_track: sum of the reward over a path, mean over
-        paths. torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector, from cubic
-        fits over JERK_S. stopped: share of stopped paths. q_left_rad, limited, collision: see
+        distance below x, where all steps of a stopped path are failures. return_track: sum of the reward over a path,
+        mean over paths. torque_rms_Nm: RMS torque over joints and time. jerk: m/s^3, RMS jerk of the end effector,
+        from cubic fits over JERK_S. stopped: share of stopped paths. q_left_rad, limited, collision: see
         `r2s.tasks.rollout.measures`.
         """
         ended = ~np.isfinite(episodes.distance).all(1)

@@ -1,10 +1,10 @@
-"""End-effector trajectories: curves, joint postures along the curves, and the fastest feasible timing.
+"""End-effector trajectories: curves, joint postures along the curves, and a timing that the arm can follow.
 
-A curve is a function x(u) from a path parameter u, in m, to a position, in m, with |dx/du| <= 1. Inverse kinematics
-on a grid of u and a cubic spline yield the postures q(u). The pace du/dt rises from 0 to its peak along a
-minimum-jerk polynomial and falls likewise to 0 at the end. Position, velocity and acceleration of end effector and
-joints are thus continuous. `Paths` reduces the pace until torque, speed and acceleration are well within the limits
-of the arm and of its safety filter.
+A curve x(u) maps a path parameter u (m) to a position (m), with |dx/du| <= 1. Inverse kinematics yields postures on a
+grid of u, which a cubic spline q(u) interpolates. The pace du/dt rises from 0 to its peak along a minimum-jerk
+polynomial and falls likewise to 0 at the end. Position, velocity and acceleration of end effector and joints are thus
+continuous. `Paths` reduces the pace until torque, speed and acceleration are well within the limits of the arm and of
+its safety filter.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ KINDS = ("fourier", "eight", "circle", "waypoints")
 SPACE = np.eye(3)
 GRID_M = 0.01  # m, step of u between two postures of the inverse kinematics
 HARMONICS = 3  # harmonics of a random Fourier curve
-LEADS = 60  # points from home to the start of a path; then LEADS times the start, so that the posture converges
+LEADS = 60  # number of points from home to a path's start, and of repeated start points that let the posture converge
 OFF_M = 1e-4  # m, largest position error of a posture
 INSIDE = 0.05  # rad, smallest allowed distance of a path from the position limits of the safety filter
 # A path may use these shares of the largest target torque, and of the safety filter's limits of speed and
@@ -33,7 +33,7 @@ SLOWEST = 0.02  # smallest share of the requested pace; `plan` rejects a path th
 CHECK_HZ = 50  # Hz, rate at which a path is checked against limits
 TRIES = 20  # largest number of paces tried for a path
 PEAK = 1.875  # peak speed / mean speed of a minimum-jerk motion
-X, V = slice(0, 3), slice(3, 6)  # columns of a plan, followed by q, dq, ddq
+X, V = slice(0, 3), slice(3, 6)  # columns of position and velocity in a plan; q, dq, ddq follow
 
 Curve = Callable[[np.ndarray], np.ndarray]
 
@@ -71,14 +71,14 @@ def _waypoints(rng: np.random.Generator, size: float, axes: np.ndarray) -> Curve
     """Return a curve of minimum-jerk motions between random points of a ball, or of a disc for two axes."""
     points = [np.zeros(3)]
     length = 0.0
-    while length < 8.0:  # m, length in u: more than an episode can cover
+    while length < 8.0:  # m, length in u, longer than the path of any episode
         direction = rng.standard_normal(len(axes)) @ axes
         point = size * rng.uniform(0.3, 1.0) * direction / np.linalg.norm(direction)
         if len(points) == 1 or np.linalg.norm(point - points[-1]) > 0.3 * size:
             length += PEAK * float(np.linalg.norm(point - points[-1]))
             points.append(point)
     legs = np.diff(points, axis=0)
-    ends = np.cumsum(PEAK * np.linalg.norm(legs, axis=1))  # the peak speed of each leg is 1
+    ends = np.cumsum(PEAK * np.linalg.norm(legs, axis=1))  # |dx/du| peaks at 1 on each leg
 
     def along(u: np.ndarray) -> np.ndarray:
         k = np.minimum(np.searchsorted(ends, u), len(legs) - 1)
@@ -94,9 +94,10 @@ def smooth(s: np.ndarray) -> np.ndarray:
 
 
 def clock(t: np.ndarray, seconds: float, ramp: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return u, du/dt and d2u/dt2 at t (T,) s for a path parameter u(t) that moves at pace 1 from 0 s to `seconds`.
+    """Return u, du/dt and d2u/dt2 at t (T,) s for a path parameter u(t) with a peak pace of 1.
 
-    The pace du/dt rises as `smooth` in the first `ramp` s, falls in the last `ramp` s, and is 0 outside the motion.
+    The motion lasts from 0 s to `seconds`. The pace du/dt rises along `smooth` in the first `ramp` s, and falls
+    likewise in the last `ramp` s.
     """
 
     def integral(s: np.ndarray) -> np.ndarray:
@@ -154,7 +155,7 @@ class Paths:
         return q(u[:, 0]), along * rate, q(u[:, 0], 2) * rate**2 + along * slope
 
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
-        """Return the largest ratio of torque or motion to its allowed value on a path; a feasible path has at most 1.
+        """Return the largest ratio of torque or motion to its allowed value on a path: at most 1 if feasible.
 
         The nominal model predicts the path's torque. The safety filter requires -RATE (v + dq) <= ddq and
         ddq <= RATE (v - dq), where v is the speed limit in the posture q.

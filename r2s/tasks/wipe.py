@@ -21,7 +21,7 @@ from r2s.tasks.trajectory import KINDS, V, X, clock, curve
 from r2s.tasks.wipe_measures import GOOD_M, GOOD_N, WIPE, wipe_measures
 
 A = slice(6, 9)  # columns of the acceleration in a path, after position and velocity
-SLOW_V = 0.01  # m/s, tip speed at which the expected friction of the surface reaches its level
+SLOW_V = 0.01  # m/s, tip speed from which the expected friction of the surface is constant
 FAR_M = 0.01  # m, tanh scale of the path error
 REST_S = 0.3  # s, pause at full force before the path, and pause after the path
 STEADY = 0.25  # integral rate as a share of its stability limit: a gain margin of 12 dB
@@ -31,8 +31,9 @@ STEADY = 0.25  # integral rate as a share of its stability limit: a gain margin 
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal begins as in `SurfaceTask`; random goals have equal forces at the start and the end of the path. A goal
-    ends with the path, as rows (9,) of position, velocity and acceleration, at the start and after each step.
+    A goal begins as in `SurfaceTask`; its two forces, at the start and the end of the path, are equal in random
+    goals. A goal ends with the path: one row (9,) of position, velocity and acceleration for the start and for each
+    step.
 
     Attributes:
         speed: (low, high) m/s, range of random peak speeds. size: (low, high) m, range of random path radii. kinds:
@@ -66,21 +67,21 @@ class WipeTask(SurfaceTask):
                 raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
         check_number(
             "task.size", self.size[1], f"(0, {self.spread / np.sqrt(2):.3g}]"
-        )  # `path` centers the path's bounding box
+        )  # `path` centers the bounding box, whose corners are up to sqrt(2) size away
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
         check_number("task.friction", self.friction, "[0, inf)")
         check_number("task.episode_s", self.episode_s, f"[{self.begin_s + 2 * self.ramp_s + REST_S:g}, 60]")
 
     @property
     def begin_s(self) -> float:
-        """Start time, s, of the path: the tip then presses with full force even on the lowest allowed surface."""
+        """Start time, s, of the path; by then, the tip presses with full force even on the lowest allowed surface."""
         return self.down_s + self.force[1] / self.force_rate + REST_S
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
         """Return the task with the model `dynamics` of one arm, and with `inertia`; see `SurfaceTask.with_model`."""
         tip = Tip(robot)
         q = tip.posture(self.plane(robot)[0])
-        q = robot.q_home if q is None else q  # if out of reach, `goals` raises an error
+        q = robot.q_home if q is None else q  # if the point is out of reach, `goals` raises an error
         jacobian, mass = tip(q)[1], InverseDynamics(robot, dynamics).mass(q[None])[0]
         inertia = np.linalg.inv(jacobian @ np.linalg.solve(mass, jacobian.T))
         return super(WipeTask, replace(self, inertia=inertia)).with_model(robot, dynamics)
@@ -90,7 +91,7 @@ class WipeTask(SurfaceTask):
         """Stiffness K, N/m, and integral rate r, 1/s, of the default controller, derived from the tip's inertia.
 
         To follow a path, the spring is as stiff as latency allows: K = m w^2, where m is the smallest effective mass
-        and w the result of `fastest_spring`. With critical damping, the largest effective mass M has the
+        and w the result of `fastest_spring`. With critical damping, the loop of the largest effective mass M has the
         characteristic equation M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0. The loop is stable for r < r0 = 2
         (K/M)^(1/2) (Routh, Hurwitz); r2s sets r = STEADY r0.
         """
@@ -104,7 +105,7 @@ class WipeTask(SurfaceTask):
         shape = curve(self.kinds[rng.integers(len(self.kinds))], rng, size, axes)
         t = np.arange(self.steps + 1) / self.ctrl_hz - self.begin_s
         path = shape(speed * clock(t.clip(0.0), self.episode_s - REST_S - self.begin_s, self.ramp_s)[0])
-        flat = path @ axes.T  # the path must stay in the plane, so it is centered in the plane's axes
+        flat = path @ axes.T  # centered in the plane's axes, so that the path stays in the plane
         flat -= 0.5 * (flat.max(0) + flat.min(0))
         free = self.spread - np.linalg.norm(flat, axis=1).max()
         about, away = rng.uniform(0, 2 * np.pi), free * np.sqrt(rng.uniform())
@@ -156,13 +157,13 @@ class WipeTask(SurfaceTask):
         return np.concatenate([now[:, X] - down, now[:, V]], axis=1)
 
     def pull(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the feedforward force (m, 3) N that accelerates the tip along the path against expected friction."""
+        """Return the feedforward force (m, 3) N: inertial force along the path plus expected friction."""
         now, force = self.now(t + 0.5 / self.ctrl_hz, goals), self.contact(t, goals)[:, 3:]
         speed = np.linalg.norm(now[:, V], axis=1, keepdims=True)
         return now[:, A] @ self.inertia + self.friction * force * now[:, V] / np.maximum(speed, SLOW_V)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (3 n + 18,) that normalize observations: fixed scales of the task."""
+        """Return fixed mean and standard deviation (3 n + 18,) that normalize observations."""
         mean, std = super().observation_scale(robot)
         return np.append(mean, np.zeros(6)), np.concatenate([std, np.ones(3), np.full(3, 0.5 * self.speed[1])])
 
@@ -191,9 +192,9 @@ class WipeTask(SurfaceTask):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance d (m,) m from the path along the nominal plane, and the reward terms (m, 6).
 
-        Terms, with the force error e: force = -tanh(|e| / 5 N); path = -tanh(d / 1 cm); precision =
-        `near`(|e|, 5 N, 2 N) `near`(d, 1 cm, 3 mm); excess = -tanh(max(e, 0) / 10 N);
-        smoothness = -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty = -`State.limited`.
+        Terms, with the force error e = exerted - requested force: force = -tanh(|e| / 5 N); path = -tanh(d / 1 cm);
+        precision = `near`(|e|, 5 N, 2 N) `near`(d, 1 cm, 3 mm); excess = -tanh(max(e, 0) / 10 N); smoothness = -0.03
+        sum tanh(|ddq| / 10 rad/s^2); filter_penalty = -`State.limited`.
         """
         beyond, normal = -np.diff(self.forces(state, goals))[:, 0], goals[:, NORMAL]
         offset = self.tip(state.q)[0] - self.at(state.t, goals)

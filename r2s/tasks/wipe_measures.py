@@ -7,7 +7,7 @@ from r2s.tasks.press_measures import TOUCH_N, impact_of
 from r2s.tasks.task import Episodes
 
 GOOD_N, GOOD_M = 2.0, 0.003  # N, m: a step is wiped if force error and path error are within these limits
-SUCCESS = 0.95  # share of a path that must be wiped
+SUCCESS = 0.95  # share of a path that must be wiped for success
 
 WIPE = MeasureTable(
     measures=(
@@ -38,13 +38,13 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv: measures of `task=wipe` over the steps from `begin`, where the path starts.
+    """Return the measures of `task=wipe`, one row of evaluations.csv; begin: number of steps before the path starts.
 
     within_2N: share of steps with a force error <= 2 N. within_3mm: share of steps with a path error <= 3 mm. wiped:
-    share of steps within 2 N and 3 mm. contact: share of steps with a force above TOUCH_N. Steps of stopped episodes
-    are misses. success: share of episodes with `wiped` >= SUCCESS. The following exclude stopped episodes.
-    force_rmse_N, path_rmse_mm: RMS errors. impact_N: peak force within IMPACT_S of the first touch, which may precede
-    `begin`; mean over episodes.
+    share of steps within 2 N and 3 mm. contact: share of steps with a force above TOUCH_N. In these shares, all steps
+    of a stopped episode are failures. success: share of episodes with `wiped` >= SUCCESS. The errors and the impact
+    exclude stopped episodes. force_rmse_N, path_rmse_mm: RMS errors. impact_N: peak force within IMPACT_S of the
+    first touch, which may precede `begin`; mean over episodes.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = ~ended[:, None]

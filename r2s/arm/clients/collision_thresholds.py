@@ -14,8 +14,9 @@ from r2s.tasks.surface_task import RESIDUAL, SurfaceTask
 from r2s.tasks.task import Task
 
 OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to this value, so that no reflex acts
-# Share of the cautious thresholds reserved for the apparent external torque of friction and model errors.
-# On a Panda, it is up to 3.7 Nm in joints 1 to 4 (threshold 20 Nm), and up to 2.2 Nm in the wrist (threshold 12 Nm).
+# Share of CAUTIOUS added to the thresholds for friction and model errors, which the arm reports as external torque.
+# On a Panda, this false torque is up to 3.7 Nm in joints 1 to 4 (CAUTIOUS: 18 to 20 Nm), and up to 2.2 Nm in the
+# wrist (12 to 16 Nm).
 ERROR = 0.2
 FRICTION = 0.5  # friction coefficient of a surface, the largest in conf/dr/contact.yaml
 
@@ -48,10 +49,11 @@ CAUTIOUS = CollisionThresholds()
 
 
 def thresholds_for(robot: Robot, task: Task | None) -> CollisionThresholds:
-    """Return collision thresholds above every contact force that a task expects; without a task, CAUTIOUS.
+    """Return thresholds above the largest contact force of a task; CAUTIOUS without a task or without contact.
 
-    Without safety.force_max, the largest expected push is the sum of the requested force, the force that an action
-    may add, and twice the force that joint friction may hide. The tip meets the surface at the task's approach speed.
+    Without safety.force_max, the largest push is the sum of the requested force, the force that an action may add,
+    and twice the force that joint friction may hide. The function assumes that the tip meets the surface at the
+    task's approach speed.
 
     Raises:
         UserError: as `thresholds_of`.
@@ -69,9 +71,9 @@ def thresholds_for(robot: Robot, task: Task | None) -> CollisionThresholds:
 def thresholds_of(robot: Robot, limit: PushLimit | None, cause: str | None = None) -> CollisionThresholds:
     """Return collision thresholds above every contact force that the push limit allows; without a limit, CAUTIOUS.
 
-    On a rigid surface, the tip exerts at most the normal force F that the push limit allows, and the tangential force
-    FRICTION * F. The thresholds are the resulting torques and forces plus ERROR * CAUTIOUS for model errors, but at
-    least CAUTIOUS.
+    The push limit allows at most the normal force F on a rigid surface, so the tangential force is at most FRICTION *
+    F. The thresholds are the resulting torques and forces plus ERROR * CAUTIOUS for model errors, but at least
+    CAUTIOUS.
 
     cause: setting that the error message names; if None, safety.force_max.
 

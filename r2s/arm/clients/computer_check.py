@@ -9,8 +9,8 @@ import numpy as np
 from r2s.arm.clients.connection_check import Finding
 from r2s.physics.robot import SIM_DT
 
-LOST_SHARE = 0.01  # largest share of lost states; equal to the limit for lost commands, which use the same cable
-GAP_S = 0.02  # s, longest gap: 20 cycles without an answer stop the arm
+LOST_SHARE = 0.01  # largest allowed share of lost states; as for lost commands, which use the same cable
+GAP_S = 0.02  # s, longest allowed time between two states: the arm stops after 20 cycles without an answer
 REALTIME = Path("/sys/kernel/realtime")  # where libfranka looks for a real-time kernel
 LIMITS = resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK
 
@@ -30,7 +30,10 @@ def computer_findings(realtime: bool) -> list[Finding]:
 
 
 def network_findings(arm: np.ndarray, here: np.ndarray) -> list[Finding]:
-    """Check for lost or late states; arm, here: (k,) s, times of the states by the clocks of arm and computer."""
+    """Check for lost or late states.
+
+    arm, here: (k,) s, time of each state by the arm's clock and by the computer's clock.
+    """
     if len(arm) < 2:
         return [Finding("states", "one per ms", f"{len(arm)} in all", True)]
     cycles, gaps = np.rint(np.diff(arm) / SIM_DT), np.diff(here)

@@ -13,12 +13,12 @@ from r2s.physics.payload import LoadTorque, Payload, ee_pose
 from r2s.physics.rigid_body import nominal_torque
 from r2s.physics.robot import Robot
 
-# At equal joint angles, poses of arm and model differ only by rounding (single precision, 1e-7 m, and robot files)
-PLACE_M, ANGLE_DEG = 1e-3, 0.2  # a tenth of a policy's position error; 0.2 deg turn a point at 0.3 m by 1 mm
-LOAD_KG = 0.01  # 0.08 Nm at full reach: less than the friction of any joint, so the arm does not sink
-GRAVITY = 0.1  # m/s^2: 0.6 deg of tilt, 1 % of gravity compensation
+# At equal joint angles, poses of arm and model differ only by rounding: single precision (1e-7 m) and robot files
+PLACE_M, ANGLE_DEG = 1e-3, 0.2  # 1 mm: a tenth of a policy's position error; 0.2 deg move a point 0.3 m away by 1 mm
+LOAD_KG = 0.01  # weight torque 0.08 Nm at full reach: less than the friction of any joint, so the arm does not sink
+GRAVITY = 0.1  # m/s^2: equals a tilt of 0.6 deg, or an error of 1 % in gravity compensation
 # Without the arm's gravity vector O_ddP_O, r2s compares gravity torques.
-# Link models differ, so the comparison detects only tilts above 5 to 12 deg.
+# The link models of r2s and the arm differ, so the comparison detects only tilts above 5 to 12 deg.
 GRAVITY_SHARE, GRAVITY_NM = 0.1, 1.0  # allowed error: a share of the posture's largest gravity torque, plus 1 Nm
 BEYOND = 0.1  # rad, accepted distance of a joint beyond its limit: a person may have guided it there
 
@@ -96,7 +96,7 @@ class Connection:
     moves: bool = True
 
     def findings(self, robot: Robot, version: int, state: Any) -> list[Finding]:
-        """Compare the robot model with the FCI version of the arm and with the arm's RobotState at rest."""
+        """Compare the robot model and the expected properties with the arm's FCI version and RobotState at rest."""
         return [
             Finding(
                 "FCI version", f"{self.arm.version} ({self.arm.name})", f"{version}", version != self.arm.version
@@ -136,7 +136,7 @@ def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
 
 
 def _load_of(robot: Robot, s: Any) -> np.ndarray:
-    """Return mass, kg, and first moment, kg m, of end effector plus load in the RobotState `s`, as one array (4,)."""
+    """Return mass (kg) and first moment (kg m) of end effector plus load in the RobotState `s`, as one array (4,)."""
     place, axes = ee_pose(robot)
     tool = np.array(s.F_T_EE).reshape(4, 4).T
     flange = axes @ tool[:3, :3].T
@@ -157,7 +157,7 @@ def _posture(arm: ArmType, q: np.ndarray) -> Finding:
 
 
 def _limits(arm: ArmType, robot: Robot) -> list[Finding]:
-    """Check that the robot's torque and rate limits do not exceed the arm's, and that home is within limits."""
+    """Check that the model's torque and torque rate limits do not exceed the arm's, and that home is in range."""
     step, torque = robot.dtau_max / arm.dtau_max, robot.tau_max / arm.tau_max
     i, j, home = int(torque.argmax()), int(step.argmax()), robot.q_home
     k = int(np.maximum(robot.q_min - home, home - robot.q_max).argmax())
@@ -183,7 +183,7 @@ def _end_effector(robot: Robot, s: Any) -> Finding:
     arm, tool = (np.array(x).reshape(4, 4).T for x in (s.O_T_EE, s.F_T_EE))  # by columns
     place, rotation = data.site_xpos[site], data.site_xmat[site].reshape(3, 3)
     apart = float(np.linalg.norm(place - arm[:3, 3]))
-    relative = rotation.T @ arm[:3, :3]  # the next line computes sine and cosine of its angle
+    relative = rotation.T @ arm[:3, :3]  # the next line computes sine and cosine of this rotation's angle
     sine, cosine = np.linalg.norm(relative - relative.T) / np.sqrt(8), (np.trace(relative) - 1) / 2
     turned = float(np.degrees(np.arctan2(sine, cosine)))
     found = f"{_row(arm[:3, 3], 4)} m (O_T_EE, with F_T_EE at {_row(tool[:3, 3], 4)} m)"
@@ -192,7 +192,7 @@ def _end_effector(robot: Robot, s: Any) -> Finding:
 
 
 def _external(s: Any) -> Finding:
-    """Report the external torque, but never forbid motion: an adapter may compensate an undeclared payload."""
+    """Report the external torque. A large one forbids no motion: an adapter may compensate an undeclared load."""
     return Finding("external torque at rest", "about 0 Nm", f"{_row(np.array(s.tau_ext_hat_filtered), 1)} Nm")
 
 

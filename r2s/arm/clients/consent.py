@@ -34,7 +34,7 @@ def operator_agrees(reason: str) -> bool:
     question = f"check the arm; type '{CONSENT}' to let it move again, anything else ends the run:"
     print(
         f"\nthe arm was stopped: {reason}\n{question}", file=sys.stderr
-    )  # a whole line, so that a pipeline shows the question at once
+    )  # `print` ends the line, because a pipeline relays only whole lines
     try:
         answer = input()
     except EOFError:

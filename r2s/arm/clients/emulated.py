@@ -58,5 +58,5 @@ def emulated_arm(
 @contextmanager
 def _opened(make_arm: Callable[[str], Franka], emulator: Emulator, realtime: bool) -> Iterator[Franka]:
     with emulator as address, closing(make_arm(address)) as arm:
-        arm.realtime = realtime  # set here, as the argument `realtime` would require a real-time kernel
+        arm.realtime = realtime  # set here, because the argument `realtime` would require a real-time kernel
         yield arm

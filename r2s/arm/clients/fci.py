@@ -9,12 +9,12 @@ Source: the public headers of libfranka-common (service_types.h, rbk_types.h), c
 
 import numpy as np
 
-PORT = 1337  # fixed in libfranka: several robots need several addresses
+PORT = 1337  # libfranka uses only this port, so each robot needs its own address
 VERSIONS = (5, 10)
 HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
 CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
-MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # without the allowed deviations
-COLLISION = np.dtype(  # our clients use equal thresholds with and without acceleration
+MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # the emulator ignores further fields
+COLLISION = np.dtype(  # our clients set equal thresholds for motion with and without acceleration
     [
         ("torque_acceleration", "<f8", (2, 7)),
         ("lower_torque", "<f8", 7),
@@ -25,7 +25,7 @@ COLLISION = np.dtype(  # our clients use equal thresholds with and without accel
     ]
 )
 LOAD = np.dtype([("m_load", "<f8"), ("F_x_Cload", "<f8", 3), ("I_load", "<f8", 9)])
-SETTINGS = {  # requests that change the RobotState, with the type of their data; the emulator ignores others
+SETTINGS = {  # requests that change the RobotState, and types of their data; the emulator ignores other settings
     "SetCollisionBehavior": COLLISION,
     "SetLoad": LOAD,
     "SetEEToK": np.dtype([("EE_T_K", "<f8", 16)]),
@@ -52,7 +52,7 @@ MOVE_STATUS = {
         "ReflexAborted": 8, "EmergencyAborted": 9,
     },
 }  # fmt: skip
-DONE, NOT_POSSIBLE, EMERGENCY = 0, 1, 5  # status of all other requests; NOT_POSSIBLE also means a wrong version
+DONE, NOT_POSSIBLE, EMERGENCY = 0, 1, 5  # status of requests other than Move; NOT_POSSIBLE: also a wrong version
 
 
 # codes of torque control in a Move request and in a motion's RobotState

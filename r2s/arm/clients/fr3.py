@@ -14,14 +14,15 @@ from r2s.arm.clients.libfranka import Client
 from r2s.arm.clients.panda import Panda
 from r2s.physics.robot import Robot
 
-# rad, braking distance of a joint from 0.2 rad/s; at the limits of `within_fr3`, an FR3 allows 0.16 to 0.48 rad/s
+# rad, braking distance from 0.2 rad/s. At the position limits of `within_fr3`, an FR3 allows 0.16 to 0.48 rad/s.
 STOP_DISTANCE = 0.02
 
 
 def within_fr3(robot: Robot) -> Robot:
-    """Return the robot with its limits clipped to an FR3's and with an FR3's position-dependent velocity limit.
+    """Return the robot with its limits clipped to those of an FR3, and with an FR3's velocity limit.
 
-    The new position limits exclude the margin in which an FR3 allows no speed, and a further STOP_DISTANCE.
+    The velocity limit depends on the position. Near a position limit, an FR3 allows no speed. The new position limits
+    exclude this region and a further STOP_DISTANCE.
     """
     margin = fr3_limits.VELOCITY_OFFSET**2 / (2 * fr3_limits.DECELERATION) + STOP_DISTANCE
     return replace(
@@ -69,7 +70,7 @@ class _FR3Client(Client):
         self._control, self._last = self._robot.start_torque_control(), [0.0] * 7
         while True:
             state, _ = self._control.readOnce()
-            # the arm may ignore commands until its success rate is above 0, so send zero torque until then
+            # while control_command_success_rate is 0, the arm may ignore commands, so send zero torque
             if state.control_command_success_rate > 0:
                 return state
             self._control.writeOnce(self._package.Torques(self._last))
@@ -80,7 +81,7 @@ class _FR3Client(Client):
         return self._control.readOnce()[0]
 
     def _finish(self) -> None:
-        torques = self._package.Torques(self._last)  # not zero: a step to zero could trigger a reflex
+        torques = self._package.Torques(self._last)  # the last torque, because a step to zero could trigger a reflex
         torques.motion_finished = True
         self._control.writeOnce(torques)
 

@@ -1,4 +1,4 @@
-"""Joint limits of an FR3, which differ from a Panda's, and the FR3's position-dependent velocity limit.
+"""Limits of the position and velocity of an FR3's joints; the velocity limit depends on the position.
 
 Source: Franka's FCI documentation, limits for FR3 with system version 5.9 or later.
 """

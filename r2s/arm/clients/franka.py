@@ -36,7 +36,7 @@ from r2s.recordings.recording import SIGNALS
 SPEED = 0.2  # share of dq_max
 ACCELERATION = 0.2  # share of ddq_max
 TORQUE_SHARE = 0.2  # share of tau_max that the driver allows
-MAX_DEVIATION = 0.1  # rad; `move_to` ends at a larger deviation from its path; smaller near obstacles
+MAX_DEVIATION = 0.1  # rad, largest deviation from the path of `move_to`; near obstacles, this limit is lower
 SETTLE_S = 3.0  # s, longest time to settle at the end of the path
 INTEGRAL_GAIN = 15.0  # share of tau_max per rad s; overcomes breakaway torque at the end of the path
 INTEGRAL_SHARE = 0.15  # share of tau_max, limit of the integral's torque
@@ -55,8 +55,8 @@ class Franka:
     Attributes:
         operator, blocked, hold: see `Operated` and `Holds`. `blocked` is set by a reflex, the stop button (even after
             its release), a stop by the driver, a rejected command, and a `move_to` that failed in motion. The method
-            `stop` sets `blocked` only if it cannot end the motion without an error.
-        findings: results of comparing the arm with `connection`.
+            `stop` sets `blocked` only if an error occurs while the motion ends.
+        findings: results of comparing the arm's properties with `connection`.
         realtime: whether motions run in a `realtime_section`. In real time, r2s rejects recordings and episodes in
             which less than 99 % of the commands arrive in time.
 
@@ -64,8 +64,8 @@ class Franka:
         robot: limits and nominal model.
         client: connection to the arm through libfranka.
         operator: function that receives a stop's reason and returns whether the arm may move again. Without an
-            operator (None), `move_to` raises NotCleared after a stop; only a new connection to a ready arm can move
-            the arm again.
+            operator (None), `move_to` raises NotCleared after a stop; further motion needs a new connection to a
+            ready arm.
         collision: external torque and force at which the arm stops itself.
         connection: properties that the arm must have; if None, r2s does not check the arm.
         speed_share: factor on all allowed speeds in every motion.
@@ -108,15 +108,15 @@ class Franka:
     def move_to(self, q: np.ndarray) -> ArmState:
         """Bring the arm to rest at q (7,) rad at up to a fifth of the speed limits.
 
-        The arm follows the first path of r2s/excitation/paths.py that respects the limits and clearances. If the arm
-        is already within 2 mrad of q, the arm does not move.
+        The arm follows the first path from r2s/excitation/paths.py that respects limits and clearances. An arm that
+        is already within 2 mrad of q does not move.
 
         Raises:
             NotCleared: after an earlier stop, no operator agreed that the arm may move.
             StopRequested: a signal requested a stop, or the policy's process ended; the arm is at rest.
-            ArmStopped: before the motion, q is outside the limits, the arm is not ready, or no path exists; in the
-                motion, the arm stopped itself, the driver stopped the arm, the arm deviated from the path by 0.1 rad
-                (less near obstacles), or the arm came to rest over 10 mrad from q.
+            ArmStopped: before the motion, q is outside the limits, the arm is not ready, or no path exists. During
+                the motion, arm or driver stopped the motion, or the arm deviated from the path by 0.1 rad (less near
+                obstacles) or came to rest over 10 mrad from q.
 
         """
         q = np.array(q, dtype=float)
@@ -172,7 +172,7 @@ class Franka:
             self._stopped = "stop was called"
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of a resting arm for `seconds`; return their times (k,) s by the clocks of arm and computer."""
+        """Read a resting arm's states for `seconds`; return their times (k,) s by arm clock and computer clock."""
         return self._client.watch(seconds)
 
     def close(self) -> None:
@@ -234,7 +234,7 @@ class Franka:
         return found
 
     def _read_idle(self) -> None:
-        """Read the state between motions, and replace tau_J_d, a torque of the arm's own controller, by 0."""
+        """Read the state between motions; set tau_J_d to 0, because the arm's own controller sent this torque."""
         s = self._client.idle()
         self._begun = _ms(s)
         sample = self._sample(s)
@@ -297,7 +297,7 @@ class Franka:
                     loop.halt(reason)
                 if k >= moving:
                     # Clegg integrator (1958): the integral resets when the error changes sign.
-                    # Otherwise, the torque that broke a joint away would carry the joint past its target.
+                    # Without the reset, the torque that overcame stiction would move the joint past its target.
                     integral = np.clip(integral + INTEGRAL_GAIN * SIM_DT * self.robot.tau_max * error, -limit, limit)
                     integral = np.where(error * last_error < 0, 0, integral)
                     last_error = error

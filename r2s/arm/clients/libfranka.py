@@ -1,4 +1,4 @@
-"""Use libfranka through panda-python or pylibfranka: base class of the clients, connection, error messages."""
+"""Base class of the clients that use libfranka, and functions that open a connection and format error messages."""
 
 import socket
 import time
@@ -14,7 +14,7 @@ from r2s.arm.realtime import kept_scheduler
 from r2s.errors import UserError, optional_import
 
 DESK_PORT = 443  # https, Franka's web interface "Desk"
-CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in ms; libfranka waits about 60 s
+CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers within ms; libfranka waits about 60 s
 
 
 class Client:
@@ -23,7 +23,7 @@ class Client:
     If libfranka reports an error, the called method raises ArmStopped with libfranka's message.
 
     Attributes:
-        name: value of the setting `arm=`, and name of the extra to install. package: name of the Python module.
+        name: value of the setting `arm=`, and name of the pip extra. package: name of the Python module.
         version: version of the arm's FCI.
 
     Args:
@@ -58,7 +58,7 @@ class Client:
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
 
     def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read states of a resting arm for `seconds`; return their times (k,) s by the clocks of arm and computer."""
+        """Read a resting arm's states for `seconds`; return their times (k,) s by arm clock and computer clock."""
         times, begun = [], time.perf_counter()
         while time.perf_counter() < begun + seconds:
             times.append((self._call(self._robot.read_once).time.to_sec(), time.perf_counter()))

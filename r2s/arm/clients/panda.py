@@ -1,8 +1,8 @@
 """Connect to a Panda (FER) through panda-python (libfranka 0.9): hardware, or the emulator in FCI version 5.
 
-libfranka's control loop calls a callback once per millisecond, but r2s itself calls `Arm.command`. libfranka's loop
-therefore runs in a separate thread: its callback passes each state to r2s and waits for a command. r2s switches
-libfranka's rate limiter and low-pass off, so the arm receives unchanged commands.
+libfranka's control loop calls a callback once per millisecond, but r2s itself calls `Arm.command`. Therefore,
+libfranka's loop runs in a separate thread. The callback passes each state to r2s and waits for a command. r2s
+switches libfranka's rate limiter and low-pass off, so the arm receives unchanged commands.
 """
 
 import threading
@@ -22,7 +22,7 @@ from r2s.physics.payload import payload_of
 from r2s.physics.robot import Robot
 
 NO_FILTER_HZ = 1000.0  # libfranka's kMaxCutoffFrequency: switches the low-pass off
-OWNER_CHECK_S = 0.1  # period of the check that the commanding thread is alive
+OWNER_CHECK_S = 0.1  # s between two checks that the commanding thread is alive
 
 
 class _PandaClient(Client):
@@ -74,7 +74,7 @@ class _Motion:
         if isinstance(state, Exception):
             self._thread.join()
             raise ArmStopped(one_line(state)) from state
-        return state  # the state is None only after the answer None
+        return state  # None only after `answer(None)`
 
     def answer(self, tau: np.ndarray | None) -> None:
         """Answer the last state from `next` with the command tau (7,) Nm; if tau is None, end the motion."""
@@ -98,7 +98,7 @@ class _Motion:
         self._states.put(end)
 
     def _callback(self, state: Any, _: Any) -> Any:
-        # the arm may ignore commands until its success rate is above 0, so send zero torque until then
+        # while control_command_success_rate is 0, the arm may ignore commands, so send zero torque
         self._started = self._started or state.control_command_success_rate > 0
         if not self._started:
             return self._libfranka.Torques(self._last)

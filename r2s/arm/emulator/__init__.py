@@ -1,1 +1,1 @@
-"""An emulated Franka control box, to which libfranka's clients connect as to a real box."""
+"""An emulated Franka control box; libfranka's clients connect to this box as to a real one."""

@@ -19,11 +19,11 @@ from r2s.physics.robot import SIM_DT
 FAULT_KINDS = ("late", "drop", "discontinuity", "joint_limit", "estop", "press", "hold")
 MAX_MISSED = 20  # consecutive cycles without an answer, after which Franka's arms stop themselves
 SUCCESS_WINDOW = 100  # commands over which control_command_success_rate is computed
-HOLD = 5e3, 100.0  # Nm/rad, Nm s/rad, of the fault 'hold': stiffer than a person's hand, and stable at 1 kHz
-CUTOFF_HZ = 15.0  # low-pass of the external torque; our choice, Franka does not publish it
+HOLD = 5e3, 100.0  # Nm/rad, Nm s/rad: stiffness and damping of 'hold'; stiffer than a hand, stable at 1 kHz
+CUTOFF_HZ = 15.0  # low-pass of the external torque; our choice, because Franka publishes no value
 FRAMES = ("F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE")
-DESK = ("F_T_EE", "m_ee", "F_x_Cee", "m_load", "F_x_Cload", "O_ddP_O")  # what an operator sets in Franka's Desk
-INSIDE = 0.02  # rad; recovery moves a joint that is beyond a position limit this far inside the limit
+DESK = ("F_T_EE", "m_ee", "F_x_Cee", "m_load", "F_x_Cload", "O_ddP_O")  # settings of the web interface Desk
+INSIDE = 0.02  # rad, distance from a position limit to which recovery moves a joint that is beyond this limit
 _ERRORS = (  # parts of the messages of `Reflexes`, and libfranka's index of the same error
     ("steps", fci.TORQUE_DISCONTINUITY),
     ("torque", fci.TORQUE_RANGE),
@@ -42,8 +42,8 @@ class Fault:
             'joint_limit': the arm stops and reports a position limit. 'estop': the stop button is pressed and stays
             pressed. 'press': the stop button is pressed for `cycles` ms. 'hold': an external force stops the first
             link; the arm needs the attribute `external`.
-        cycle: index, from 0, of the control cycle in which the fault begins.
-        motion: index, from 0, of the motion with the fault; `move_to` makes one motion per straight path segment.
+        cycle: index (from 0) of the control cycle in which the fault begins.
+        motion: index (from 0) of the motion with the fault; `move_to` makes one motion per straight path segment.
         cycles: number of consecutive cycles with the fault; 20 late or dropped cycles stop the arm.
 
     """
@@ -72,7 +72,7 @@ class Control:
         stopped_by: reason why the last motion was aborted; None: no abort.
 
     Args:
-        arm: the arm. If the arm's state has no `tau_ext_hat_filtered`, the box reports zero external torque.
+        arm: the arm. If the arm's state has no `tau_ext_hat_filtered`, the control box reports zero external torque.
         version: version of the FCI. faults, max_missed: see `Emulator`.
         desk: values of settings in `DESK`, such as {"m_ee": 0.73}; they change only the arm model in the control box.
     """
@@ -201,7 +201,7 @@ class Control:
             for name in settings.dtype.names or ():
                 self.state[name] = settings[name]
             f = {name: self.state[name].reshape(4, 4) for name in FRAMES}
-            self.state["F_T_EE"] = (f["NE_T_EE"] @ f["F_T_NE"]).ravel()  # column-major: factors in reverse order
+            self.state["F_T_EE"] = (f["NE_T_EE"] @ f["F_T_NE"]).ravel()  # by columns, so factors in reverse order
         self._feel(1.0)
         self._sense()
 
@@ -262,8 +262,8 @@ class Control:
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
         """Filter the external torque, set wrench and contact flags; in a collision, return error index and message.
 
-        As in libfranka, external torque is tau_J minus the torque of the box's arm model with the `DESK` settings.
-        Unlike on a real arm, friction and model errors have no effect on the emulated external torque.
+        As in libfranka, external torque is tau_J minus the torque of the control box's arm model with the `DESK`
+        settings. Unlike on a real arm, friction and model errors have no effect on the emulated external torque.
 
         Args:
             gain: gain of the low-pass; 1 (no filtering) for an arm at rest.
@@ -275,7 +275,7 @@ class Control:
         self._external = s["tau_ext_hat_filtered"] = self._external + gain * (raw - self._external)
         force = np.zeros(6)
         if self._external.any():
-            at_k = s["EE_T_K"].reshape(4, 4) @ s["F_T_EE"].reshape(4, 4)  # column-major: factors in reverse order
+            at_k = s["EE_T_K"].reshape(4, 4) @ s["F_T_EE"].reshape(4, 4)  # by columns, so factors in reverse order
             force = self._model.wrench(arm.q, at_k.T, self._external)
             rotation = self._model.pose(arm.q, at_k.T)[:3, :3]
             s["K_F_ext_hat_K"] = np.concatenate([rotation.T @ force[:3], rotation.T @ force[3:]])
@@ -300,7 +300,7 @@ class Control:
         arm, s, version = self._arm.read(), self.state, self._version
         s["q"] = s["q_d"] = s["theta"] = arm.q
         s["dq"] = s["dtheta"] = arm.dq
-        # at rest the box's own controller holds the arm, even where a simulated arm would sink
+        # at rest, the control box holds the arm, even where a simulated arm would sink
         s["tau_J"] = arm.tau_J if self.running else self._model.compensation(arm.q, s) + self._external
         s["tau_J_d"] = arm.tau_J_d
         pose = self._model.pose(arm.q, s["F_T_EE"].reshape(4, 4).T)

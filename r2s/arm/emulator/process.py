@@ -3,9 +3,9 @@
     with Emulator(partial(RigidTwin, robot, 3), version=5) as address:
         arm = Panda(robot, address, operator=lambda reason: True)
 
-The emulated box can control any `Arm` of 7 joints. In lock-step, the default, the arm's clock advances only with a
-command. Equal commands then cause bit-identical motions, even on a slow computer. In real time, the arm's clock runs
-at 1 kHz, and the client misses a cycle if its answer arrives after that cycle.
+The emulated control box can control any `Arm` of 7 joints. In lock-step, the default, the arm's clock advances only
+with a command. Equal commands then cause bit-identical motions, even on a slow computer. In real time, the arm's
+clock runs at 1 kHz, and the client misses a cycle if its answer arrives after that cycle.
 
 The emulator simulates neither network jitter nor brakes. A test on the emulator does not prove that a motion is safe
 beside a person.
@@ -33,7 +33,7 @@ class Emulator:
 
     Args:
         make_arm: picklable function that creates the arm in the child process, like `partial(RigidTwin, robot, 3)`.
-        version: FCI version: 5 for libfranka 0.9 (Panda), 10 for libfranka 0.18 and later (FR3).
+        version: FCI version, 5 for libfranka 0.9 (Panda), 10 for libfranka 0.18 and later (FR3).
         realtime: whether the emulator runs at 1 kHz; if False, the emulator waits for each command (lock-step).
         faults: faults that the emulator injects.
         max_missed: consecutive unanswered cycles after which the arm stops. desk: settings of the box, see `Control`.

@@ -12,7 +12,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import LoadTorque, ee_pose
 from r2s.physics.robot import Robot
 
-SINGULAR = 0.03  # least singular value of a regular pose's Jacobian (rows in m and 1); our choice; ready pose: 0.22
+SINGULAR = 0.03  # smallest singular value of a regular Jacobian (rows in m and 1); our choice; 0.22 in the ready pose
 
 
 def urdf(robot: Robot) -> str:
@@ -34,7 +34,7 @@ class BoxModel:
         self._place, self._axes = ee_pose(robot)
 
     def pose(self, q: np.ndarray, tool: np.ndarray) -> np.ndarray:
-        """Return the base-frame pose (4, 4), at q (n,) rad, of a frame with the flange-frame pose `tool` (4, 4)."""
+        """Return the base pose (4, 4) at q (n,) rad of the frame whose pose in the flange frame is `tool` (4, 4)."""
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         flange = np.eye(4)
@@ -43,7 +43,7 @@ class BoxModel:
         return flange @ tool
 
     def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that best explains joint torque (n,) Nm.
+        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that best explains the torque (n,) Nm.
 
         The wrench F minimizes |J^T F - torque| with the frame's Jacobian J. Near a singularity the wrench is zero, as
         in libfranka.
@@ -62,6 +62,6 @@ class BoxModel:
         return self._data.qfrc_bias + self._load(q, self._carried(s), s["O_ddP_O"])
 
     def _carried(self, s: np.ndarray) -> np.ndarray:
-        """Return mass, kg, and first moment, kg m, of end effector plus load in the last link's frame, as (4,)."""
+        """Return mass (kg) and first moment (kg m) of end effector plus load in the last link's frame, as (4,)."""
         parts = ((s["m_ee"], s["F_x_Cee"]), (s["m_load"], s["F_x_Cload"]))
         return np.sum([np.append(m, m * (self._place + self._axes @ x)) for m, x in parts], axis=0)

@@ -16,17 +16,17 @@ from r2s.physics.robot import SIM_DT
 
 LOOPBACK = "127.0.0"
 IDLE_MS = 20  # ms between states of an idle arm in lock-step; clients do not need 1 kHz at rest
-ANSWER_S = 0.9 * SIM_DT  # s, least time between two states in real time; our choice, a real box allows 1 ms
-BACKOFF_S = (1e-3, 0.4)  # s, time between states before the first answer, doubles in this range; client timeout: 1 s
+ANSWER_S = 0.9 * SIM_DT  # s, least time between two states in real time; our choice (1 ms on a real control box)
+BACKOFF_S = (1e-3, 0.4)  # s, range of the time between states, which doubles until the first answer; clients wait 1 s
 
 
 class Server:
     """Serves one client at a time, in one thread.
 
     A motion begins when the client answers the newest state. Before the client's first answer, the arm stands still,
-    and the server keeps sending states, because a starting client may skip states. The server does not execute the
-    command in the first answer. The first executed command answers the first state whose control_command_success_rate
-    is above 0.
+    and the server continues to send states, because a starting client may skip states. The server does not execute
+    the command in the first answer. The first executed command answers the first state whose
+    control_command_success_rate is above 0.
     """
 
     def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
@@ -184,7 +184,7 @@ class Server:
                     self._send()
                 elif not self._realtime:
                     self._cycle(command["tau_J_d"].copy())
-                elif not self._ahead:  # at once, like a real box, which computes in parallel with the client
+                elif not self._ahead:  # at once, because a real box also computes in parallel with the client
                     self._control.cycle(command["tau_J_d"].copy())
                     self._ahead = True
 
@@ -204,7 +204,7 @@ class Server:
             self._finish(self._control.aborted_as)
 
     def _tick(self) -> None:
-        """Send the state that is due, and schedule the next state; in real time, first run an unanswered cycle."""
+        """Send the state that is due, and schedule the next; in real time without an answer, first run the cycle."""
         assert self._due is not None
         if self._started and self._realtime:
             if not self._ahead:
@@ -214,7 +214,7 @@ class Server:
         else:
             self._send()
         if self._realtime:
-            # this process, unlike a box, may wake late; the client must still have time to answer
+            # this process, unlike a control box, may wake late; the client must still have time to answer
             self._due = max(self._due + SIM_DT, time.monotonic() + ANSWER_S)
         elif self._move is None:
             self._due = time.monotonic() + IDLE_MS * SIM_DT
@@ -241,7 +241,7 @@ class Server:
         """Report the end of the motion by TCP, and by UDP with the next state."""
         assert self._move is not None
         move, self._move, self._started = self._move, None, False
-        self._due = time.monotonic()  # the state of an arm at rest
+        self._due = time.monotonic()  # send the state of the arm at rest at once
         self._reply("Move", move, fci.MOVE_STATUS[self._version][status])
 
 

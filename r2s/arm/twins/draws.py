@@ -16,7 +16,7 @@ def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
     small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # scale for joints weaker than a Panda's wrist
     masses = model.body_mass[bodies] * rng.uniform(0.98, 1.02, n)  # U(0.98, 1.02) of the nominal mass
     coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
-    scale = rng.uniform(0.73, 1.37, n)  # range of the ratios NEW / OLD in the paper; a scaled tensor stays physical
+    scale = rng.uniform(0.73, 1.37, n)  # range of the paper's ratios NEW / OLD; a scaled tensor remains physical
     return masses, coms, robot.inertia * scale[:, None, None]
 
 
@@ -62,5 +62,5 @@ def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, 
 
 @njit(cache=True)
 def drag(own, along, waves, phase, q, q_next):
-    """Return a cable's torque, Nm, on a joint with angle q, rad; the next joint has the angle q_next, rad."""
+    """Return a cable's torque (Nm) on a joint at the angle q (rad); the next joint is at q_next (rad)."""
     return own * np.sin(waves * q + phase) + along * np.sin(q_next - phase)

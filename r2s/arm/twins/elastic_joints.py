@@ -5,9 +5,14 @@ velocity v:
     rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v + J'F
     s = K (theta - q) + D (w - v)
     f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c has a value per direction
-s is the gear torque, and F the contact force of a surface (r2s/physics/contact.py). The drive's torque loop damps the
-gear by L (w - v). A resting motor stays at rest while the net torque on it is below the breakaway torque f(w = 0).
-The factor warm is 1 - fall (1 - exp(-heat / 0.6)). The factor ripple is 1 plus three sines of theta, whose periods
+
+s: gear torque; K, D: stiffness and damping of the gear; L: damping by the drive's torque loop; d: damping of the
+joint; F: contact force of a surface; J: Jacobian of the contact (r2s/physics/contact.py). c: Coulomb friction; b:
+ratio of breakaway torque to Coulomb friction; vs, a: speed and exponent of the Stribeck curve; mu: load friction;
+coefficient r and exponent e of viscous friction.
+
+A resting motor stays at rest while the net torque on it is below the breakaway torque f(w = 0). Heat lowers friction
+by the factor warm = 1 - fall (1 - exp(-heat / 0.6)). The factor ripple is 1 plus three sines of theta, whose periods
 are one joint revolution, one motor revolution and half a motor revolution (the two lobes of a strain wave gear).
 
 A step follows position Verlet: positions advance by half a step, velocities by a whole step with the forces at
@@ -30,7 +35,7 @@ from r2s.physics.robot import SIM_DT
 # Rows of the joint parameters (ROWS, n)
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, SHAPE, VISCOUS, POWER, RATIO = range(9)
 RIPPLE, PHASE = 9, 12  # three rows each: per joint revolution, motor revolution and half motor revolution
-FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: friction power, W, at which heat settles at 1
+FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: friction power (W) at which heat settles at 1
 HELP, HELP_VISCOUS, HELP_WIDTH = range(18, 21)  # the arm's own friction compensation: Nm, Nm s/rad, rad/s
 ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
 OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
@@ -59,7 +64,7 @@ def ripple(p, theta, i):
 
 @njit(cache=True)
 def level(p, w, load, side, i):
-    """Return a cold joint's friction without ripple, Nm, at w rad/s in direction `side`; w = 0: breakaway torque."""
+    """Return a cold joint's friction (Nm) without ripple at w rad/s in direction `side`; w = 0: breakaway torque."""
     coulomb = p[C_POS, i] if side > 0 else p[C_NEG, i]
     speed = abs(w)
     rise = (p[BREAK, i] - 1.0) / (1.0 + (speed / p[V_STRIBECK, i]) ** p[SHAPE, i])
@@ -68,11 +73,11 @@ def level(p, w, load, side, i):
 
 @njit(cache=True)
 def _next_velocity(p, w, middle, push, load, factor, h, i):
-    """Return a motor's velocity, rad/s, after h s under friction and `push`, Nm, the sum of all other torques.
+    """Return a motor's velocity (rad/s) after h s under friction and `push` (Nm), the sum of all other torques.
 
     Args:
-        p: parameters. i: joint index. w: present velocity, rad/s. middle: mid-step velocity, rad/s, at which
-            friction is computed if the motor moves in the direction of `middle`. load: gear torque, Nm.
+        p: parameters. i: joint index. w: present velocity, rad/s. middle: predicted mid-step velocity, rad/s;
+            friction is computed at `middle` if the motor moves in this direction. load: gear torque, Nm.
         factor: factor on the friction.
     """
     side = np.sign(w)
@@ -92,7 +97,7 @@ def _next_velocity(p, w, middle, push, load, factor, h, i):
 
 @njit(cache=True)
 def _active(line, cycle, t, delay):
-    """Return the row in `line` of the newest command in effect at time t, in cycles, or -1 if none is in effect."""
+    """Return the row in `line` of the newest command in effect at time t (cycles), or -1 if none is in effect."""
     slots, arrival = len(line), line.shape[1] - 1
     for k in range(cycle, max(cycle - slots, -1), -1):
         if line[k % slots, arrival] + delay <= t:
@@ -102,7 +107,7 @@ def _active(line, cycle, t, delay):
 
 @njit(cache=True)
 def _commanded(line, cycle, begin, end, delay, i):
-    """Return joint i's delayed command, Nm, averaged from the time `begin` to the time `end`, both in cycles."""
+    """Return the mean delayed command (Nm) of joint i between the times `begin` and `end` (cycles)."""
     older, newer = _active(line, cycle, begin, delay), _active(line, cycle, end, delay)
     after = line[newer, i] if newer >= 0 else 0.0
     if older == newer:
@@ -125,9 +130,9 @@ def advance(p, s, arm, line, cycle, steps, age):
 
     Args:
         p: joint parameters (ROWS, n). s: joint states (STATES, n), updated in place.
-        arm: (links, gravity, touch) of the true arm; touch contains the attributes contact, jacobian, frames, axes
-            and there of `Touch`.
-        line: (slots, n + 1), the last commands, Nm, and their arrival times in cycles. cycle: index of this cycle.
+        arm: (links, gravity, touch) of the true arm; touch: the attributes `contact`, `jacobian`, `frames`, `axes`
+            and `there` of `Touch`.
+        line: (slots, n + 1), the last commands (Nm) and their arrival times (cycles). cycle: index of this cycle.
     """
     links, gravity, touch = arm
     n, h = s.shape[1], SIM_DT / steps
@@ -184,7 +189,7 @@ def _touch(s, links, touch, h, out):
 
 @njit(cache=True)
 def _external_forces(p, s, f, line, cycle, begin, end, h):
-    """Write to `f` a step's motor and spring torques, friction factors and velocities; begin, end: times, cycles."""
+    """Write a step's torques, friction factors and velocities to `f`; the step is from `begin` to `end`, cycles."""
     for i in range(s.shape[1]):
         target = s[ADDED, i] + _commanded(line, cycle, begin, end, p[DELAY, i], i)
         change = (target - s[MOTOR, i]) * -np.expm1(-h / p[LAG, i])

@@ -1,10 +1,11 @@
 """The elastic variant of the hidden twin, with effects that the identification's models lack.
 
-The gears are elastic and oscillate. Friction holds a resting motor without creep, follows a different Stribeck curve
-than in the rigid variant, decreases with heat, and ripples with the gear angle (elastic_joints.py). The control box
-compensates part of the friction, has a clock that jitters, and occasionally loses a command. Delay and lag differ
-between joints. Links, offsets, cable drag, noise and quantization are as in the rigid variant. The seed determines
-the robot's parameters, which only the twin reads. Seeds 0-9 are for development, seeds >= 200 for evaluation.
+The gears are elastic and oscillate. Friction holds a resting motor without creep. The Stribeck curve differs from
+that of the rigid variant. Friction decreases with heat, and varies periodically with the gear angle
+(elastic_joints.py). The control box compensates part of the friction, has a clock that jitters, and occasionally
+loses a command. Delay and lag differ between joints. Links, offsets, cable drag, noise and quantization are as in the
+rigid variant. The seed determines the robot's parameters, which only the twin reads. Seeds 0-9 are for development,
+seeds >= 200 for evaluation.
 
 In each 1 ms cycle the control box adds gravity and friction compensation to the command. The code in
 elastic_joints.py then integrates rotors and links in steps of at most 0.05 ms. The sensors measure the motors up to
@@ -27,7 +28,7 @@ MIN_STEPS = 20  # per cycle; finer steps change an open-loop motion of 1 s by le
 MAX_STEPS = 200
 PHASE_STEP = 0.1  # rad, largest phase change per step of the fastest gear oscillation in the home posture
 SLOTS = 8  # number of stored commands, one per cycle
-WARM_SPEED = 0.25  # share of dq_max, speed at which heat settles at 1
+WARM_SPEED = 0.25  # speed at which heat settles at 1, as a share of dq_max
 STATIC_ROUNDS = 50  # fixed-point iterations that find the posture in which the gears balance gravity
 
 
@@ -141,7 +142,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, while the other joints are free to move
     p = np.zeros((ej.ROWS, n))
     size = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
-    coulomb = 0.75 * size  # viscous friction adds to this; the control box compensates about a quarter of both
+    coulomb = 0.75 * size  # viscous friction comes on top; the control box compensates about a quarter of both
     asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[ej.C_NEG] = coulomb - asymmetry + model.dof_frictionloss
     p[ej.C_POS] = coulomb + asymmetry + model.dof_frictionloss
@@ -175,7 +176,7 @@ def _critical_damping(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
 
 def _steps(p: np.ndarray, inertia: np.ndarray) -> int:
     """Return the number of steps per cycle that resolve the fastest oscillation of the gears."""
-    mobility = np.linalg.inv(inertia) + np.diag(1 / p[ej.ROTOR])  # of the gears' deflections
+    mobility = np.linalg.inv(inertia) + np.diag(1 / p[ej.ROTOR])  # inverse inertia of the gears' deflections
     root = np.sqrt(p[ej.STIFF])
     fastest = np.sqrt(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
     steps = int(np.ceil(fastest * SIM_DT / PHASE_STEP))

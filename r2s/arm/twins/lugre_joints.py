@@ -1,8 +1,11 @@
 """Compute the implicit LuGre friction and the sensor values of the rigid twin in an engine step (compiled).
 
-Friction f of a joint with velocity v and bristle deflection z, rad (Canudas de Wit et al., IEEE TAC 40(3), 1995):
+Friction f of a joint with velocity v and bristle deflection z in rad (Canudas de Wit et al., IEEE TAC 40(3), 1995):
     dz/dt = v - s0 |v| z / g(v),   f = s0 z + s1(v) dz/dt + s2 v,   s1(v) = s1 exp(-(v / vd)^2)
     g(v) = c (1 + (b - 1) exp(-(v / vs)^2)) + mu |load|,   c has a value per direction
+
+s0 and s1 are stiffness and damping of the bristle, s2 is viscous friction per speed, g the friction level, c Coulomb
+friction, b the ratio of breakaway to Coulomb friction, and vs the Stribeck speed. DQ_BRISTLE explains vd.
 """
 
 import numpy as np
@@ -17,18 +20,18 @@ from r2s.physics.robot import SIM_DT
 # Rows of the joint parameters (ROWS, n)
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, S0, S1, S2, OFFSET = range(9)
 DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE, COMPLIANCE = range(9, 18)
-DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; LAG, DQ_FILTER: gains per cycle of torque lag and speed filter
+DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # DELAY: cycles; LAG, DQ_FILTER: filter gains per cycle
 # Rows of the joint states (STATES, n)
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED, TAU_MEASURED, BENT = range(12)
 Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, joint torque of the contact with a surface
 
-DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, else each reversal would cause a torque pulse
+DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades above this speed, else each reversal would cause a torque pulse
 SWEEPS, CONVERGED = 50, 1e-9  # largest number of Gauss-Seidel sweeps; velocity change, rad/s, that ends the sweeps
 
 
 @njit(cache=True)
 def _stribeck(p, z, v, load, i):
-    """Return the friction level g(v), Nm, of joint i in the direction of the bristle deflection z."""
+    """Return the friction level g(v) (Nm) of joint i in the direction of the bristle deflection z."""
     coulomb = p[C_POS, i] if z >= 0 else p[C_NEG, i]
     fade = np.exp(-((v / p[V_STRIBECK, i]) ** 2))
     return coulomb * (1 + (p[BREAK, i] - 1) * fade) + p[MU, i] * abs(load)
@@ -62,9 +65,10 @@ def drive(p, s, line, cycle, tau, compensation, mass, touch):
     """Apply a command; return passive torque (n,) Nm and implicit damping (n,) Nm s/rad for the engine's step.
 
     Gauss-Seidel iteration solves the coupled implicit equation mass (w - v) / h + bias + f(w) = drive for the next
-    velocity w; v is the present velocity, h the time step and f the friction. With k = h s0 / g,
-    the bristle's backward Euler step z' = (z + h w) / (1 + k |w|) makes each joint's equation quadratic in w. One of
-    its two roots has the right sign, so each joint's solution is exact.
+    velocity w; v is the present velocity, h the time step, f the friction, and drive the sum of motor torque, gravity
+    compensation, offset and cable drag. With k = h s0 / g, the bristle's backward Euler step z' = (z + h w) / (1 + k
+    |w|) makes each joint's equation quadratic in w. Only one of the two roots has the direction of the torque at w =
+    0, so each joint's solution is exact.
 
     Args:
         p: joint parameters. s: joint states. line: (slots, n) Nm, the last commands. cycle: index of this cycle.
@@ -171,7 +175,7 @@ def sense(p, s, mass, noise):
         for j in range(n):
             inertial += mass[i, j] * (v[j] - before[j]) / h
         s[BIAS, i] = link + s[TOUCH, i] - inertial
-        rotor = p[ARMATURE, i] * (v[i] - before[i]) / h  # on the motor's side of gear and sensor
+        rotor = p[ARMATURE, i] * (v[i] - before[i]) / h  # accelerates the rotor; acts neither on gear nor on sensor
         bent = p[COMPLIANCE, i] * (link - rotor)
         motor_q, motor_v = s[Q, i] + bent, v[i] + (bent - s[BENT, i]) / h
         s[BENT, i] = bent

@@ -36,7 +36,7 @@ from r2s.physics.tip import Tip, default_plane, tilted
 
 PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, largest distance and tilt of the surface from its nominal place
 STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
-CAMERA = 33, 1e-3, np.radians(0.5)  # cycles between two images, and noise of a box's pose, m and rad
+CAMERA = 33, 1e-3, np.radians(0.5)  # cycles between two camera images; noise of a box's measured pose, m and rad
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Touch:
         self._first = self.contact.copy()
 
     def start(self, q: np.ndarray, seed: list[int]) -> float:
-        """Reset the contact, draw a random pose of a box, and return the tip's penetration depth, m, at q (n,) rad.
+        """Reset the contact, draw a box's random pose, and return the tip's penetration depth (m) at q (n,) rad.
 
         `seed` is the episode's seed. Far from the surface the depth is -inf. The friction bristle starts undeflected.
         """
@@ -121,9 +121,10 @@ class Touch:
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
     """Draw a random surface near the nominal pose that the setting `surface` describes.
 
-    False: no surface. True: a work table below the tip in the home posture. {point: (3,) m, normal: (3,)}: a plane
-    through the point. box: a box with edges `r2s.physics.box.SIZE` on a work table ahead of the tip. {box: (3,) m}: a
-    box with the given edges; if point and normal are also given, the box stands at the point.
+    False means no surface. True means a work table below the tip in the home posture. {point: (3,) m, normal: (3,)}
+    means a plane through the point. `box` means a box with edges `r2s.physics.box.SIZE` on a work table ahead of the
+    tip. {box: (3,) m} means a box with the given edges; if point and normal are also given, the box stands at the
+    point.
 
     Raises:
         UserError: `surface` is invalid, the robot has no tool, or in the home posture the tip is inside the surface.
@@ -167,7 +168,7 @@ def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) 
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point, m, and the unit normal of the nominal plane that the setting `surface` describes."""
+    """Return a point (m) and the unit normal of the nominal plane that the setting `surface` describes."""
     if not isinstance(surface, Mapping):
         raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):

@@ -1,7 +1,7 @@
 """Implement the base of both twin variants: settings, reflexes, payload, surface, extra delay and episodes.
 
-Each variant (rigid_twin.py, elastic_twin.py) draws, from the seed, a random robot near the nominal robot. A
-variant adds a model of drives and friction. No code outside the variant reads the drawn parameters.
+Each variant (rigid_twin.py, elastic_twin.py) uses the seed to draw a random robot near the nominal robot. Each
+variant also has its own model of drives and friction. No code outside the variant reads the drawn parameters.
 """
 
 from collections import deque
@@ -23,7 +23,7 @@ STAYS = 2e-3  # rad; a `move_to` that moves each joint by less may leave the tip
 class TwinBase:
     """An `Arm` (r2s/arm/interface.py) with hidden parameters, of which only the random seed is known.
 
-    The same seed, noise stream and calls produce bit-identical states. Each `move_to` begins an episode with its own
+    Equal seeds, noise streams and calls produce bit-identical states. Each `move_to` begins an episode with its own
     random numbers, so the noise of the k-th episode does not depend on earlier episodes.
 
     A variant implements `_start(q)` (place the arm), `_advance(tau)` (run a cycle with a command), `_attach(payload)`
@@ -43,9 +43,9 @@ class TwinBase:
         noise: stream number of the sensor noise; two recordings of one robot need different numbers.
         friction_scale: factor on the drawn friction, except on its load-dependent part; below 1 for a warm arm.
         extra_delay_s: s, delay of commands in addition to the twin's own delay; a whole number of ms.
-        surface: a surface for the tool, drawn from the seed. False: no surface. True: a work table below the tip in
-            the home posture. {point: (3,) m, normal: (3,)}: a random plane within 5 mm and 5 degrees of the given
-            plane (base frame). box: a box on a work table. See `draw_surface`.
+        surface: a surface for the tool, drawn from the seed. False means no surface. True means a work table below
+            the tip in the home posture. {point: (3,) m, normal: (3,)} means a random plane within 5 mm and 5 degrees
+            of the given plane (base frame). `box` means a box on a work table. See `draw_surface`.
 
     Raises:
         UserError: an argument is out of its range.
@@ -83,19 +83,19 @@ class TwinBase:
         self._stopped: str | None = "no motion was started; call move_to first"
         self._cycle, self._tau_J_d = 0, np.zeros(robot.n)
         self._q, self._dq = robot.q_home, np.zeros(robot.n)
-        self._pending: deque[np.ndarray] = deque()  # commands that wait for the extra delay
+        self._pending: deque[np.ndarray] = deque()  # commands that the extra delay still holds back
         self._sent = np.zeros(robot.n)
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad, where friction balances the error of the gravity compensation.
+        """Place the arm at rest at q (n,) rad; friction balances the error of the gravity compensation.
 
-        The tip must not be inside the surface at q, unless the arm is already at q and presses on the surface.
+        The tip may be inside the surface at q only if the arm is already at q and presses on the surface.
         """
         q = np.array(q, dtype=float)
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
             raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
         self._reflexes.state(q, np.zeros(self.robot.n))
-        stays = np.abs(q - self._q).max() < STAYS  # the tip may press, as under a real arm's position control
+        stays = np.abs(q - self._q).max() < STAYS  # here the tip may press, as on a real arm in position control
         if (depth := self._touch.start(q, [self._seed, 5, self._episode, self._stream])) > 0 and not stays:
             raise ArmStopped(f"move_to: the tool's tip would be {1e3 * depth:.1f} mm inside the surface")
         self._cycle = 0
@@ -184,7 +184,7 @@ class TwinBase:
 
 
 def _delay_cycles(extra_delay_s: float) -> int:
-    """Return the extra delay in cycles; raise UserError unless it is a whole number of ms up to MAX_EXTRA_DELAY_S."""
+    """Return the extra delay in cycles; raise UserError unless the delay is whole ms up to MAX_EXTRA_DELAY_S."""
     check_number("arm.extra_delay_s", extra_delay_s, f"[0, {MAX_EXTRA_DELAY_S}]")
     cycles = round(extra_delay_s / SIM_DT)
     if abs(extra_delay_s / SIM_DT - cycles) > 1e-6:

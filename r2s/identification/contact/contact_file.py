@@ -33,7 +33,7 @@ class IdentifiedSurface:
             (N/m at 10 N), height (m along the normal) and tilt_deg (angle from the normal).
         identifiable: {name: whether the recording determines this value}; names include plane and slope.
         draws: surfaces drawn from the posterior.
-        rigid_gears: the surface for simulations with rigid gears, such as those of r2s; see `ContactEstimate`.
+        rigid_gears: the surface for simulators with rigid gears, such as r2s; see `ContactEstimate`.
     """
 
     surface: Surface
@@ -68,7 +68,7 @@ def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mappi
     document["mujoco"] = mujoco_contact(simulated.surface, inverse_mass(robot))
     document["sdf"] = sdf_surface(simulated.surface)
     draws = found.draws | {f"{RIGID_GEARS}_{name}": values for name, values in simulated.draws.items()}
-    with atomic_write(path.with_name("contact_posterior.npz")) as part:  # before contact.yaml, which needs it
+    with atomic_write(path.with_name("contact_posterior.npz")) as part:  # first, as contact.yaml needs it
         np.savez_compressed(part, **draws)  # type: ignore[arg-type]
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
@@ -113,7 +113,7 @@ def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurfac
         with np.load(path.with_name("contact_posterior.npz"), allow_pickle=False) as file:
             draws = {name: file[name] for name in file.files}
         found = _parse(document, draws)
-        if RIGID_GEARS not in document:  # an older file, without estimated gears
+        if RIGID_GEARS not in document:  # file of an older r2s, which did not estimate gears
             return found
         own = {name.removeprefix(f"{RIGID_GEARS}_"): values for name, values in draws.items() if RIGID_GEARS in name}
         return replace(found, rigid_gears=_parse(document[RIGID_GEARS], own))

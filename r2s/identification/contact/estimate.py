@@ -1,8 +1,8 @@
 """Identify a surface that an arm has pressed: stiffness, exponent, damping, friction and plane, with intervals.
 
-If an arm's encoders are on the motors, the gears' deflection adds to the penetration of the surface. r2s estimates
-the surface first with rigid gears, then with compliant gears. If the user gives the gears' stiffness, the prior of
-the compliance uses this stiffness.
+If an arm's encoders are on the motors, the measured penetration includes the gears' deflection. r2s estimates the
+surface first with rigid gears, then with compliant gears. If the user gives the gears' stiffness, the prior of the
+compliance uses this stiffness.
 """
 
 from collections.abc import Callable
@@ -30,11 +30,11 @@ from r2s.identification.result import SHARPER
 from r2s.physics.surface import UNIT_DEPTH, Surface
 from r2s.recordings.recording import Recording
 
-STEPS, ROUNDS = 25, 4  # largest number of Jacobians per search; number of searches, each after a reweighting
-AT_BOUND = 0.02  # a stiffness is at a bound if its distance from the bound is below this share of the log range
+STEPS, ROUNDS = 25, 4  # most Jacobians per search; number of searches, each after a reweighting
+AT_BOUND = 0.02  # a stiffness is at a bound if it is closer to the bound than this share of the logarithmic range
 COVERED = (2.5, 97.5)  # %, percentiles of a 95 % interval
-# Standard deviations of errors that more data do not reduce (friction laws, time steps): slope and bristle relative,
-# damping s/m, height m, tilt rad; measured on simulated arms and surfaces (benchmarks/contact_identification.py).
+# Standard deviations of errors that more data do not reduce, due to friction laws and time steps: slope and bristle
+# relative, damping in s/m, height in m, tilt in rad. Source: simulations in benchmarks/contact_identification.py.
 SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
 SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
 Fit = Callable[[ContactProblem, np.ndarray], tuple[ContactProblem, np.ndarray]]
@@ -46,15 +46,15 @@ class ContactEstimate:
 
     Attributes:
         surface: the estimate; `surface.point` is the mean of the tip centers in contact, projected onto the plane.
-        draws: posterior draws {name: (S, ...)}. The names are parameters, point and normal of `Surface`; slope, N/m,
-            of the force curve at LOAD; gears, rad/Nm, the compliance (S, n).
+        draws: posterior draws {name: (S, ...)}. The names are parameters, point and normal of `Surface`, "slope"
+            (N/m, of the force curve at LOAD) and "gears" (compliance (S, n) in rad/Nm).
         identifiable: {name: whether the data determine this value}.
         penetration: (2,) m, smallest and largest penetration depth in the recording.
         training: predicted and measured forces of fitted presses. validation: forces of presses that were not fitted;
-            None if there are no such presses.
+            None if all were fitted.
         gears: (n,) rad/Nm, compliance of the gears between encoders and links; near 0 for rigid gears or encoders on
-            the links. If a joint bears little load, the ratio of its gear's deflection to the mean deflection stays
-            at the prior mean.
+            the links. If a joint bears little load, its gear's ratio deflection / mean deflection stays near the
+            prior mean.
         stated: whether the stiffness of the gears was known, see `Gears.stated`.
         tau_max: (n,) Nm, largest torques of the joints.
         rigid_gears: the estimate for simulations with rigid gears; its surface includes the compliance of the gears.
@@ -138,9 +138,10 @@ def identify_contact(
 
 
 def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | None, refit: Fit) -> Press | None:
-    """Return the forces of held-out presses: all in `other` or, if None, the last press after a refit without it.
+    """Return predicted and measured forces of all presses in `other`, or of the last press if `other` is None.
 
-    Return None if `other` is None and there are fewer than two presses.
+    Without `other`, the prediction comes from a refit without the last press, and the result is None for fewer than
+    two presses.
     """
     if other is not None:
         return press_errors(other.reweighted(u), u, presses(other, u))
@@ -154,9 +155,9 @@ def _held_out(problem: ContactProblem, u: np.ndarray, other: ContactProblem | No
 def with_gears(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
     """Return the problem and its solution (8 + 1 + n,) for elastic gears, given the solution u (8,) for rigid gears.
 
-    The weights remain those of the fit with rigid gears. A fit with elastic gears has a smaller residual, which hides
-    the friction law's error. Weights from this residual would make intervals too narrow: on the elastic twins 0 to 9,
-    23 instead of 9 of 80 intervals would miss the true value.
+    The weights remain those of the fit with rigid gears. Elastic gears also fit errors of the friction law, so their
+    residual is smaller. Weights from this residual would make intervals too narrow: on the elastic twins 0 to 9, 23
+    of 80 intervals would miss the true value, instead of 9.
     """
     return _fitted(problem, problem.space.with_gears(u))
 
@@ -174,7 +175,7 @@ def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.
 
 
 def _check(problem: ContactProblem, u: np.ndarray) -> None:
-    """Raise UserError if joints slide for too short a time in contact, or if the stiffness is at a bound."""
+    """Raise UserError if joints slide too briefly in contact, or if the stiffness is at a bound."""
     rows = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum()
     if (touched := problem.torque.row_s * rows) < LEAST_S:
         raise UserError(
@@ -203,7 +204,7 @@ def _concluded(problem: ContactProblem, u: np.ndarray, validation: Press | None,
     half = np.percentile(draws, COVERED[1], axis=0) - np.percentile(draws, COVERED[0], axis=0)
     known = half / 2 < 1 / np.sqrt(12.0) / SHARPER
     identifiable = dict(zip(NAMES[3:], known[3:SURFACE].tolist(), strict=True))
-    identifiable["slope"] &= bool(AT_BOUND < u[3] < 1 - AT_BOUND)  # gears may hide a stiff surface
+    identifiable["slope"] &= bool(AT_BOUND < u[3] < 1 - AT_BOUND)  # soft gears may hide the stiffness
     identifiable |= {"plane": bool(known[:3].all()), "stiffness": identifiable["slope"] and identifiable["exponent"]}
     if len(u) > SURFACE:  # compare the mean deflection with its prior
         sure = half[SURFACE] / 2 < space.gears.width / SOFTEST / SHARPER

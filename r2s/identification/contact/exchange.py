@@ -44,7 +44,7 @@ def inverse_mass(robot: Robot) -> float:
 def mujoco_contact(surface: Surface, inverse_mass: float) -> dict[str, Any]:
     """Return MuJoCo's parameters of the contact between the plane and a body with `inverse_mass`, 1/kg.
 
-    solref is (-stiffness, -damping). The plane must be fixed, and both geoms, of body and plane, must have these
+    solref is (-stiffness, -damping). The plane must be fixed. The geoms of body and plane must both have these
     contact parameters.
     """
     slope, damping, deeper = linearized(surface)
@@ -75,7 +75,8 @@ def sdf_surface(surface: Surface) -> str:
 def write_surface(folder: Path, robot: Robot, surface: Surface) -> None:
     """Write a surface and the tool's tip into arm.xml, the surface into surface.sdf, and the tip into arm.sdf.
 
-    The surface is a plane or a box. In arm.xml, only surface and tip can touch. A missing arm.sdf is not created.
+    The surface is a plane or a box. In arm.xml, only surface and tip can touch. If arm.sdf is missing, the function
+    does not create it.
 
     Args:
         folder: output of `write_description`. robot: an arm with a tool. surface: the surface, without batch axes.

@@ -18,26 +18,27 @@ from r2s.recordings.recording import Recording
 
 SLOWEST = 0.01  # rad/s, slowest sliding; slower joints may stick and slip, which increases the residual
 DRIFT = 0.02  # standard deviation of friction and offset drift since calibration, relative to a joint's friction
-EXACT = 1e-4  # least sigma of a row, relative to the joint's friction, also for noise-free simulations
-SEEN = 0.03  # model errors of the arm are dropped if they change all rows together by fewer standard deviations
+EXACT = 1e-4  # least sigma of a row, relative to the joint's friction; effective for noise-free simulations
+# a model error of the arm is dropped if the norm of its effect on all rows, in standard deviations, is at most this
+SEEN = 0.03
 FTOL = 1e-6  # a search ends when a step reduces the cost by less than this share
 STEP = 1e-5  # finite-difference step on the unit cube
 REACH = 10.0  # half-width of the unit cube along w, in standard deviations of w
-PLAY = 3.0  # `TipMotion.play` / standard deviation of the tip's position due to encoder noise below 40 Hz
+PLAY = 3.0  # `TipMotion.play`, in standard deviations of the tip's position due to encoder noise below 40 Hz
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Least-squares problem for a vector u (U,) of surface and gears, and the arm's model errors w (r,) ~ N(0, I).
+    """Least-squares problem for u (U,), which describes surface and gears, and the arm's model errors w (r,).
 
     Each of the residual's R rows is a mean over a window in which a joint slides in one direction (see
     `TorqueResidual`). Resting joints have no rows, because their friction may have any value between the breakaway
-    torques. Because the residual is linear in the model errors w, a closed form eliminates w (variable projection:
-    Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+    torques. Because the residual is linear in the model errors w ~ N(0, I), a closed form eliminates w (variable
+    projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 
-    Encoders on the motors do not measure how far gravity (`sag`) and contact deflect the gears. In contact, gears and
-    surface are springs in series. Presses with different lever arms distinguish the gears' stiffness from the
-    surface's.
+    Encoders on the motors do not measure the gears' deflection due to gravity (`sag`) and contact. In contact, gears
+    and surface are springs in series. Presses with different lever arms distinguish the stiffness of the gears from
+    that of the surface.
 
     Attributes:
         torque: torque residual without contact. x: (P,) the arm's parameters. tip: tip motion at F instants.
@@ -121,12 +122,12 @@ class ContactProblem:
         return np.concatenate([self._projected(self.slope(u)), np.diag(self.space.prior(len(u))[1])])
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-        """Return the vector u (U,) of a local minimum near the given u, and the sum of squares at this minimum."""
+        """Return the u (U,) of a local minimum near the given u, and the sum of squares at this minimum."""
         u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
-        """Return the problem with row weights from the size and correlation of the residual at a vector u (U,)."""
+        """Return the problem with new row weights, from the size and correlation of the residual at u (U,)."""
         explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
         own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
         return replace(self, sigma=_sigma(own, self.x))

@@ -1,4 +1,4 @@
-"""Guess an unknown surface from the position, direction and increase of the external force on the tip."""
+"""Guess an unknown surface from the external force on the tip: its place, direction and increase with depth."""
 
 from collections.abc import Iterator
 
@@ -15,7 +15,7 @@ MOVING = 0.02  # rad/s, speed below which a joint's friction is treated as unkno
 KNOWN = 0.1  # standard error of a moving joint's friction, as a share of this friction
 SURE = 4.0  # a force indicates contact if it exceeds this number of standard deviations
 LEAST_S = 0.2  # s, least duration of contact
-STIFFNESS = (5e2, 2e5)  # N/m, range of first guesses
+STIFFNESS = (5e2, 2e5)  # N/m, range of the first guess of the stiffness
 FLAT = 3.0  # positions determine the normal if they spread FLAT times more along the plane than across it
 
 
@@ -56,7 +56,7 @@ def first_guesses(
 def _starts(
     surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield a start vector u for each normal (3,) and exponent; a line fit of height to force gives the stiffness."""
+    """Yield a start vector u per normal (3,) and exponent; its stiffness comes from a line fit of height to force."""
     for normal in normals:
         height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
         slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0

@@ -10,13 +10,14 @@ from r2s.physics.robot import per_joint
 from r2s.physics.surface import UNIT_DEPTH, Surface
 
 LOAD = 10.0  # N, load at which slope and height are defined, so that slope and height depend little on the exponent
-# bounds from foam to steel; the entries for slope of the force at LOAD (N/m) and bristle (m) are logarithms
-TILT = 0.6  # rad, largest tilt from the first guess of the plane, whose error is at most the friction angle
+# rad, largest tilt from the first guess of the plane; the tilt error of this guess is at most the friction angle
+TILT = 0.6
 HEIGHT = 0.02  # m, largest distance from the first guess of the plane
+# bounds from foam to steel; the entries for slope of the force at LOAD (N/m) and bristle (m) are logarithms
 BOUNDS = {
     "tilt_a": (-TILT, TILT),
     "tilt_b": (-TILT, TILT),
-    "height": (-HEIGHT, HEIGHT),  # position of the tip under LOAD
+    "height": (-HEIGHT, HEIGHT),  # position of the tip under the force LOAD
     "slope": (np.log(1e2), np.log(1e6)),
     "exponent": (1.0, 2.0),  # linear 1, Hertz 1.5, cone 2
     "damping": (0.0, 50.0),
@@ -28,12 +29,12 @@ LOWER, UPPER = np.array(list(BOUNDS.values())).T
 WIDTH = UPPER - LOWER
 SURFACE = len(NAMES)  # number of values of a surface; u has 1 + n further values if the gears are elastic
 FLAT = np.sqrt(12.0)  # 1 / standard deviation of a uniform distribution over the unit interval
-# Deflection of gears, rad, at the largest torques: standard deviation of a normal prior about 0; upper bound. Strain
-# wave gears deflect by 0.003 to 0.01 rad (a Panda's strong joints by 87 Nm / 15,000 Nm/rad = 0.006 rad).
+# Deflection of gears at the largest torques, rad. DEFLECTION: standard deviation of a normal prior about 0. SOFTEST:
+# upper bound. Strain wave gears deflect by 0.003 to 0.01 rad (a Panda's large joints: 87 Nm / 15,000 Nm/rad = 0.006).
 DEFLECTION, SOFTEST = 0.01, 0.05
 SCATTER, FARTHEST = 0.2, 0.6  # prior sigma and limit of (a gear's deflection / (mean deflection * `shape`) - 1)
 WIDEST = 0.25  # largest relative standard deviation of an identified gear's deflection
-LEAST_ACCURATE = 0.4  # largest allowed `accuracy`; two standard deviations then stay within FARTHEST and SOFTEST
+LEAST_ACCURATE = 0.4  # largest allowed `accuracy`; intervals of two sigma then stay within FARTHEST and SOFTEST
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Gears:
     Attributes:
         shape: (n,) prior mean of each gear's deflection, relative to the mean over all gears.
         center, width: rad, prior mean and standard deviation of the mean deflection over all gears.
-        scatter: (n,) or one number, standard deviation of a gear's deflection / (mean deflection * `shape`).
+        scatter: (n,) or one number, standard deviation of the ratio: gear deflection / (mean deflection * `shape`).
         stated: whether the stiffness of the gears is known, from the user or from an identification of the gears.
     """
 
@@ -62,7 +63,7 @@ def unknown_gears(n: int) -> Gears:
 def stated_gears(tau_max: np.ndarray, *, stiffness: Any = None, accuracy: float = 0.1) -> Gears | None:
     """Return the prior of the deflections of gears with known stiffness, or None if `stiffness` is None.
 
-    Half of the variance of the stiffness is common to all gears, for example due to an error in the data sheet.
+    Half of the stiffness variance is due to an error that all gears share, for example an error in the data sheet.
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints.
@@ -104,16 +105,16 @@ def identified_gears(
 ) -> Gears:
     """Return the prior of the deflections of gears whose stiffness was identified.
 
-    A gear that the slides did not determine deflects like the mean of the others. Half of the least variance among
-    the gears is common to all gears.
+    A gear of undetermined stiffness gets the mean deflection of the other gears. Half of the smallest variance among
+    the gears is due to an error that all gears share.
 
     Args:
         tau_max: (n,) Nm, largest torques of the joints. stiffness: (n,) Nm/rad. spread: (n,) relative standard
-            deviation of the stiffness; WIDEST replaces larger values, because deflections are bounded by FARTHEST.
-            determined: (n,) bool.
+            deviation of the stiffness; values above WIDEST are set to WIDEST, because FARTHEST limits the deflection.
+            determined: (n,) bool, whether slides determined the stiffness.
 
     Raises:
-        UserError: slides determined fewer than half of the gears, or the gears are too soft.
+        UserError: the stiffness of more than half of the gears is undetermined, or the gears are too soft.
     """
     if 2 * determined.sum() < len(determined):
         raise UserError(
@@ -176,7 +177,7 @@ class SurfaceSpace:
         return np.concatenate([u, [self.gears.center / SOFTEST], np.full(len(self.tau_max), 0.5)])
 
     def prior(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean and 1 / standard deviation, each (count,), of the normal prior of a vector u (count,)."""
+        """Return mean and 1 / standard deviation, each (count,), of the Gaussian prior of a vector u (count,)."""
         joints = np.broadcast_to(2.0 * FARTHEST / self.gears.scatter, len(self.tau_max))
         weight = np.concatenate([np.full(SURFACE, FLAT), [SOFTEST / self.gears.width], joints])
         return self.with_gears(np.full(SURFACE, 0.5))[:count], weight[:count]

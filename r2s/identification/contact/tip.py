@@ -13,7 +13,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface, normal_force
 
 NEWTON = 10  # iterations for two springs in series; relative error below 1e-6 for exponents of 1 to 2
-SHALLOW = 1e-6  # least share of the surface in the total deflection, so that the force curve has a slope
+SHALLOW = 1e-6  # least surface depth / total deflection; at depth 0, the force curve would have no slope
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,10 @@ def _frames(links, q, frames, axes):
 def _contact(motion, settings, point, normal, law, tau, out):
     """Write joint torque into tau (F, n); write normal force, penetration depth and depth rate into out (3, F).
 
-    The friction of a normal force F is mu F z, with friction coefficient mu and bristle deflection z (Dahl 1968 in
-    two dimensions): dz = (dx - |dx| z) / bristle, where x is the tip's deepest point, projected onto the surface.
-    Encoder noise of a resting tip adds up in the path |dx| and would relax the bristles, so a path shorter than
-    `play` only bends bristles elastically.
+    Friction is mu F z, with friction coefficient mu, normal force F and bristle deflection z (Dahl 1968 in two
+    dimensions). z follows dz = (dx - |dx| z) / bristle; x is the tip's deepest point, projected onto the surface.
+    Encoder noise lengthens the path |dx| of a resting tip, which would relax the bristles. A path shorter than `play`
+    therefore only bends bristles elastically.
 
     Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
     with Jacobian J, normal n, compliances C and contact force F g = F (n - mu z). `bristle` includes the gears'
@@ -157,8 +157,8 @@ def _contact(motion, settings, point, normal, law, tau, out):
 def _in_series(soft, K, exponent, damping, depth, rate):
     """Compute force, depth and depth rate of a surface in series with a spring (`soft`, m/N) by Newton's method.
 
-    depth, rate: m, m/s, total deflection of spring and surface, and its rate. The returned rate of the surface's
-    depth neglects damping.
+    depth, rate: m, m/s, total deflection of spring and surface, and the rate of this total. The returned rate of the
+    surface's depth neglects damping.
     """
     if soft <= 0.0 or depth <= 0.0:
         return normal_force(K, exponent, damping, depth, rate), depth, rate

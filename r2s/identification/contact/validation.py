@@ -6,9 +6,9 @@ import numpy as np
 
 from r2s.identification.contact.problem import ContactProblem
 
-PAUSE_S = 1.0  # s; a longer time without contact separates two presses; a slide may lose contact for less
-GUARD_S = 0.2  # s, time added before and after a press; it is longer than a window
-KNOWN = 0.05  # largest standard error of a measured force, as a share of the largest force (1 N of a Panda's 20 N)
+PAUSE_S = 1.0  # s; a longer time without contact separates two presses; a single slide may lose contact for less
+GUARD_S = 0.2  # s, time added before and after a press, longer than an averaging window
+KNOWN = 0.05  # largest standard error of a measured force / largest force (1 N for a press of 20 N)
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Press:
         return {"seconds": len(self.t) * self.row_s, "force_rmse_N": self.rmse(), **errors}
 
     def rmse(self, side: float = 0.0) -> float:
-        """Return the force RMSE, N, for loading (side 1), unloading (-1) or both (0); nan if no moment qualifies."""
+        """Return the force RMSE, N, for loading (side 1), unloading (-1) or both (0); nan without such moments."""
         some = self.rate * side > 0 if side else np.ones(len(self.t), dtype=bool)
         return float(np.sqrt(np.mean((self.force - self.seen)[some] ** 2))) if some.any() else float("nan")
 
 
 def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
-    """Return a mask (T,) for each press on a surface u (U,), in order of time, extended by GUARD_S at both ends."""
+    """Return one mask (T,) per press on a surface u (U,), in order of time; masks include GUARD_S at both ends."""
     motion = problem.motion
     at = motion.instants[_depth(problem, u) > 0]
     if not len(at):

@@ -2,17 +2,17 @@
 
 A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). At the end of a ramp, the
 joint has accelerated for 10 to 150 ms, and the command exceeds the breakaway command. Before breakaway, a physical
-joint also creeps: bristles bend by millirads, at a growing rate. Neither a threshold nor a parabola separates creep
-from breakaway. In the model that r2s fits, a joint at position x creeps at first, and slides when the command u
-exceeds the breakaway command U:
+joint also creeps: bristles bend by millirads, at a growing rate. Neither a threshold of motion nor a fitted parabola
+can separate creep from breakaway. In the model that r2s fits, a joint at position x creeps at first, and slides when
+the command u exceeds the breakaway command U:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
 The command u, after delay and lag, is positive in the ramp's direction; kappa is the inverse inertia. Below the
 breakaway command U, stiction balances the command u, and bristles bend over the creep length z (Dahl, J. Dyn. Sys.
 Meas. Control 98(4), 1976). At breakaway, friction falls from U to a lower value; `jump` is this decrease times kappa.
-In the paper's eq. 6, z and the lower value are 0. The fit without `Slide` estimates all parameters of the equation
-and needs no model of the arm.
+In eq. 6 of the paper, the creep length z and the lower value are 0. The fit without `Slide` estimates all parameters
+of the equation and needs no model of the arm.
 
 If friction falls over a range of velocities (Stribeck), motion begins slowly. The sudden `jump` then makes the fit
 without `Slide` overestimate U, by 4 to 22 mNm on an arm with known U. The fit with `Slide` uses parameters of an
@@ -32,7 +32,7 @@ from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.recordings.ramps import Ramps
 
-MOVED = 5e-3  # rad; a fit uses rows up to this motion; joints creep 1 to 3 mrad before breakaway, also on the twin
+MOVED = 5e-3  # rad, motion up to which rows are fitted; before breakaway, joints creep 1 to 3 mrad, also on the twin
 MIN_ROWS = 10  # least number of rows in a fit
 ENCODER = 2e-5  # rad, standard deviation of position residuals: encoder noise of a Panda
 DIFFERENCE = 1e-3  # finite-difference step, relative to the scale of each parameter
@@ -42,13 +42,13 @@ STEP = 1e-3  # s, longest integration step
 LOW = np.log(1e-5), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
 HIGH = np.log(1e4), np.log(3e-3), np.log(1e3), 1e3, 0.1, 0.1
 RIGID = 1e-8  # rad, creep length of a joint that does not creep
-DRIFT = 3e-4  # rad/s, prior sigma of a slow drift: a resting joint may still settle
+DRIFT = 3e-4  # rad/s, prior sigma of a slow drift, because a resting joint may still settle
 SIDES = "negative", "positive"
 KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
-WORSE = 1.01  # the fit with `Slide` is used if its misfit is at most this multiple of that without `Slide`
+WORSE = 1.01  # r2s uses the fit with `Slide` if its misfit / misfit without `Slide` is at most this
 BACK = 0.0, 0.03, 0.1  # initial values of U: last command minus these multiples of the ramp's rise
 DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, which a short motion does not determine
-# initial values: creep length, rad; sliding time / time guessed from quadratic motion
+# initial values: creep length, rad; sliding time, relative to the sliding time of quadratic motion
 STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))
 
 
@@ -98,7 +98,7 @@ class Slide:
 
     Attributes:
         kappa: (K,) rad/s^2 per Nm, inverse inertia of the ramped joint while the other joints rest.
-        level: (K,) Nm, command that sustains slow sliding above `fall`: Coulomb friction minus other torques.
+        level: (K,) Nm, command that sustains sliding just above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad, viscous friction.
         fall: (K,) rad/s, Stribeck velocity: friction falls to `level` as exp(-(v / fall)^2) with the speed v.
         misfit: (K,) rad, `Breakaway.misfit` of the fits without `Slide`, see WORSE.
@@ -198,12 +198,15 @@ def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarr
 
 
 def _fit_breakaway(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
-    """Fit motion x (T,) rad to command u (T,) Nm; return breakaway command, Nm (NaN near u[0]), and misfit, rad."""
+    """Fit motion x (T,) rad to command u (T,) Nm; return breakaway command, Nm, and misfit, rad.
+
+    The breakaway command is NaN if it is close to u[0].
+    """
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
     near, used = _parts(x)
-    guess = 1.5 * (t[-1] - t[near])  # time since breakaway if x grew quadratically
+    guess = 1.5 * (t[-1] - t[near])  # time since breakaway, for quadratic motion
     low, high = np.array([u[0] + 1e-3 * span, *LOW]), np.array([u[-1], *HIGH])
 
     def residuals(p: np.ndarray) -> np.ndarray:
@@ -291,7 +294,7 @@ def _slides(t, u, U, kappa, z, damping, jump, fall):
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Return positions x (T,) rad from the module docstring's equation; if fall = 0, friction falls at once.
+    """Integrate the module docstring's equation to positions x (T,) rad; if fall = 0, friction falls at once.
 
     The integration is implicit in velocity, and therefore stable even for creep lengths far below the encoder noise.
     """

@@ -2,9 +2,9 @@
 
 The torque residual omits samples at which bristles bend, so the torque fit determines all parameters except the
 presliding distance. r2s estimates this distance from replays of short windows, which include reversals. But reversals
-also contain information on other parameters: only reversals separate offset from asymmetry. The last steps of the
-search therefore vary the parameters in WITH and the presliding distance together. r2s uses only the resulting
-distance.
+also contain information on other parameters; for example, only reversals separate offset from asymmetry. The last
+steps of the search therefore vary the parameters in WITH and the presliding distance together. r2s uses only the
+resulting distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,14 +28,14 @@ from r2s.recordings.recording import Recording
 NAME = "presliding"  # the parameter
 WINDOW_S, STRIDE = 0.2, 5  # length (s) and averaging time (ms) of replays; friction reverses within about 50 ms
 TRIED = 9  # number of log-spaced distances; within the usual bounds, neighbors differ by a factor of 1.8
-STEPS, FTOL = 4, 1e-2  # search for the distance alone: most steps; least relative gain of a step
+STEPS, FTOL = 4, 1e-2  # search for the distance alone: most steps; relative decrease of cost below which it ends
 JOINT_STEPS, SMALL = 4, 0.05  # search that also varies WITH: most steps; relative change of the distance that ends it
 # parameters whose errors change the estimated distance; viscous friction, inertia and delay change it by 1 % or less
 WITH = ("coulomb", "asymmetry", "rise", "offset")
 # Least sigma of the log distance. A window's first bristle state comes from smoothed velocity. In tests, estimates of
 # known distances therefore erred by up to 1.5 %, although all other parameters had their true values.
 MIN_SIGMA = 0.02
-RIDGE = 1e-6  # information added to every value on the unit cube, because a distance may lack both prior and data
+RIDGE = 1e-6  # information added to every value on the unit cube, because a distance may have neither prior nor data
 
 
 def estimate_presliding(
@@ -81,10 +81,9 @@ def estimate_presliding(
 
 
 def nearest_distance(data: ReplayResidual) -> np.ndarray:
-    """Simulate TRIED presliding distances, each in all joints; return each joint's best distance (n,), unit cube.
+    """Simulate TRIED presliding distances, each in all joints; return the joints' best (n,) on the unit cube.
 
-    A search must not start at a distance that is several times too small, because the residual's weights would then
-    suppress all reversals.
+    If a search started at a distance several times too small, the residual's weights would suppress all reversals.
     """
     u = np.tile(np.linspace(0.0, 1.0, TRIED)[:, None], data.space.n)
     cost = (data(data.space.from_unit(u)) ** 2).reshape(TRIED, -1, data.space.n).sum(1)
@@ -119,7 +118,7 @@ class GaussNewton:
 
 
 def _part(space: ParameterSpace, dynamics: Dynamics, names: Sequence[str]) -> ParameterSpace:
-    """Return the space of only the parameters `names`, with bounds of `space` and nominal values of `dynamics`."""
+    """Return a space with only the parameters `names`, the bounds of `space` and the nominal values of `dynamics`."""
     at = {name: space.where(name) for name in names}
     bounds = {name: [space.lower[k], space.upper[k]] for name, k in at.items()}
     return replace(parameter_space(space.robot, dynamics, bounds), fixed=space.fixed)

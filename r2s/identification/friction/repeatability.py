@@ -1,11 +1,11 @@
 """Compute the standard error of breakaway commands from repeated ramps.
 
 Friction varies between ramps, because of posture, load and cables. Two ramps per joint and direction hardly determine
-a variance: by Student's t with one degree of freedom, a 95 % interval is +-12.7 standard errors. r2s therefore
+a variance: with one degree of freedom, Student's t makes the 95 % interval +-12.7 standard errors. r2s therefore
 averages a joint's variance with the mean variance of all joints with the same tau_max (the same size). This mean has
 the weight of PRIOR_REPEATS repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004). PRIOR_REPEATS is small, because
-the scatter differs between joints of the same size: on twins by factors of 3 and more. If no ramp is repeated, r2s
-assumes the standard deviation REPEATS, relative to tau_max.
+joints of the same size differ in scatter, on twins by factors of 3 and more. If no ramp is repeated, r2s assumes the
+standard deviation REPEATS, relative to tau_max.
 """
 
 from typing import NamedTuple

@@ -9,9 +9,9 @@ from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 
-# standard deviation of (net torque minus friction) / command; creep and the onset of sliding cause these errors
+# standard deviation of (net torque - friction) / command, due to creep and the onset of sliding
 SIGMA = 0.03
-LEAST = 1e-3  # relative to tau_max; below this command, SIGMA is relative to LEAST * tau_max
+LEAST = 1e-3  # least command / tau_max to which SIGMA refers
 
 
 class StaticFriction:
@@ -37,7 +37,7 @@ class StaticFriction:
         self._inertia = regressor(robot, q, still, unit)[own, self.joint].reshape(len(kept), -1)
 
     def net_torque(self, d: Dynamics) -> np.ndarray:
-        """Return the torque (..., K) Nm, without friction, that acts on the joint at each of the K breakaways."""
+        """Return the net torque (..., K) Nm, friction excluded, on the joint at each of the K breakaways."""
         standard = LinkInertia(d.mass, d.com, d.inertia).standard()
         left = (standard.reshape(*standard.shape[:-2], -1) - self._nominal) @ self._gravity.T
         drag = d.drag[..., self.joint, :]

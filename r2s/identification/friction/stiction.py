@@ -20,7 +20,7 @@ HORIZON, WINDOWS = 0.5, 60  # length (s, enough for stops) and number of the rep
 SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # in `scan_breakaway`: windows, passes, and how many passes are coarse
 SCAN_BATCH = 12  # candidates replayed at once, with 50 windows each; 36 would need three times the memory
 LEAST = 5e-4  # the scan range assumes at least this friction, relative to tau_max
-POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # coarse pass: points; fine pass: points per side, and divisor of the step
+POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points of a coarse pass; points per side and step divisor of a fine pass
 
 
 def choose_stiction(
@@ -36,9 +36,9 @@ def choose_stiction(
 ) -> dict[str, np.ndarray | float]:
     """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm}, fitted to replayed stops.
 
-    largest: largest breakaway torque of the scan, relative to the identified friction. If None, r2s does not scan,
-    because ramps determine the breakaway torques. If all trajectories are shorter than a window, the values of
-    `dynamics` are returned.
+    largest: largest breakaway torque of the scan, relative to the identified friction. If `largest` is None, r2s does
+    not scan, because ramps determine the breakaway torques. If all trajectories are shorter than a window, the values
+    of `dynamics` are returned.
     """
     windows = windows_or_none(recording, HORIZON, WINDOWS)
     scanned = largest is None or windows_or_none(recording, window_s, 1) is not None
@@ -50,7 +50,7 @@ def choose_stiction(
     for model in STICTION_MODELS:
         dq_min = dynamics.dq_min if model == "command" else min(dynamics.dq_min, CREEP)
         trial = replace(dynamics, stiction_model=model, dq_min=dq_min)
-        if largest is not None:  # each stiction model fits other breakaway torques
+        if largest is not None:  # the best breakaway torques depend on the stiction model
             friction = np.maximum(dynamics.level, np.abs(dynamics.family.at_rest(dynamics.phi)).max(-1))
             limit = largest * np.maximum(friction, LEAST * robot.tau_max)
             trial = replace(trial, breakaway=scan(robot, trial, recording, limit))
@@ -74,10 +74,10 @@ def scan_breakaway(
 ) -> np.ndarray:
     """Return the breakaway torques (n, 2) Nm with which `dynamics` replays the recording best.
 
-    A gradient search would fail: the replay error jumps if a joint starts to slide one step sooner. In each pass, a
-    candidate changes the breakaway torque of one joint, and r2s minimizes the replay error of this joint. Coarse
-    passes scan from 0 to `largest` (n,) Nm; fine passes refine the best value. The second coarse pass is necessary,
-    because joints affect each other.
+    A gradient search would fail, because the replay error jumps if a joint starts to slide one step sooner. In each
+    pass, a candidate changes the breakaway torque of one joint, and r2s minimizes the replay error of this joint.
+    Coarse passes scan from 0 to `largest` (n,) Nm; fine passes refine the best value. The second coarse pass is
+    necessary, because joints affect each other.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

@@ -1,8 +1,8 @@
 """Identify the stiffness of an arm's gears from slow slides under a multisine torque, with intervals.
 
-The encoders must be on the motors. The rotor, gear and link of each joint are a chain of two inertias: below the
-resonance, rotor and link move together; above the resonance, the rotor moves alone. The response between these two
-ranges determines the stiffness, even if the links' inertia tensors are uncertain.
+The encoders must be on the motors. In each joint, the gear is a spring between rotor and link. Below the resonance,
+rotor and link move together; far above the resonance, only the rotor moves. The response around the resonance
+determines the stiffness, even if the links' inertia tensors are uncertain.
 """
 
 from collections.abc import Callable
@@ -20,21 +20,22 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 DRAWS = 400  # posterior draws
-BLOCKS, STIFFNESS = 8, 1  # values per joint in a vector x (fields of `Drives`, link's tensor); index of the stiffness
+BLOCKS, STIFFNESS = 8, 1  # values per joint in x (fields of `Drives`, scale of link tensor); index of the stiffness
 FTOL, XTOL = 1e-5, 1e-4  # a search ends when a step changes the cost or x by less than this share
-MODEL = 0.02  # relative standard deviation of a stiffness that more data do not reduce, from the elastic twins 0 to 4
-# if the data do not determine a gear, a second search starts at 20 times the stiffness: resonance above all lines
+MODEL = 0.02  # relative error of a stiffness that more data do not reduce: standard deviation on elastic twins 0 to 4
+# if the data do not determine every gear, a second search starts with gears that are 20 times stiffer, so that all
+# resonances are above the lines of the multisine
 STIFF = np.log(20.0)
 # Prior: median, and standard deviation of the logarithm unless stated otherwise. The priors are wide, because no
 # source gives these values for a robot. They matter only for light wrists, whose links hardly load the motors.
 DEFLECTION = 0.0055, 0.6  # rad, of a strain wave gear at the joint's largest torque (contact/surface_space.py)
-ROTOR = 0.2, 0.7  # rotor inertia that the model's armature lacks, relative to the inertia of the joint's links
+ROTOR = 0.2, 0.7  # rotor inertia missing in the model's armature / inertia of the joint's links
 GEAR_DAMPING = 0.04, 0.7  # relative to critical damping; 0.01 to 0.1 for metal gears
 LOOP_DAMPING = 0.3, 1.0  # relative to critical damping
 DELAY = 3e-3, 2e-3  # s, not logarithmic
 LAG = 1.2e-3, 0.6  # s
 TENSOR = 0.3  # scale of a link's inertia tensor, which slow motion hardly determines (paper, Table IV: 0.73 to 1.37)
-VISCOUS = 0.3  # slope of friction over speed, in friction level / sliding speed; mean 0, not logarithmic
+VISCOUS = 0.3  # slope of friction over speed, relative to friction level / sliding speed; mean 0, not logarithmic
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +66,12 @@ class GearEstimate:
 
 @dataclass(frozen=True, eq=False)
 class GearProblem:
-    """Least-squares problem of a vector x (8 n,): values of all joints in standard deviations of the prior.
+    """Least-squares problem for x (8 n,), eight values per joint, each in standard deviations of its prior.
 
     Attributes:
         slides: measured spectra. mass: (W, n, n) kg m^2, mass matrices of the links. tensors: (n, W, n, n) kg m^2,
             parts of `mass` due to each link's inertia tensor.
-        rotor: (n,) kg m^2, stiffness: (n,) Nm/rad, prior medians.
+        rotor: (n,) kg m^2, prior median. stiffness: (n,) Nm/rad, prior median.
         critical: (n,) critical damping of a gear / sqrt(stiffness). viscous: (n,) Nm s/rad, prior standard deviation
             of `Drives.viscous`.
         noise: factor (W, 1) on `slides.sigma`.
@@ -127,7 +128,7 @@ def gear_problem(robot: Robot, dynamics: Dynamics, slides: Slides) -> GearProble
         inertia = np.array(dynamics.inertia)
         inertia[link] *= 2.0
         tensors.append(masses(replace(dynamics, inertia=inertia), slides.q) - mass)
-    # kg m^2, if all other joints move freely
+    # kg m^2, inertia of the links at each joint if all other joints move freely
     own = 1 / np.diag(np.linalg.inv(masses(dynamics, robot.q_home[None])[0]))
     rotor = dynamics.armature + ROTOR[0] * own
     stiffness = robot.tau_max / DEFLECTION[0]
@@ -161,7 +162,7 @@ def identify_gears(
         again = _minimum(problem, stiff.ravel())
         x = again[0] if again[2] < cost else x
     report(0.6, "intervals")
-    # the model's error may exceed the noise beside the lines: a misfit above 1 widens sigma
+    # the model's error may exceed the measured noise; a misfit above 1 therefore widens sigma
     size = np.abs(problem.misfit(x)) ** 2
     misfit = np.sqrt(0.5 * np.array([size[slides.joint == i].mean() for i in range(n)]))
     problem = replace(problem, noise=np.maximum(misfit, 1.0)[slides.joint, None])
@@ -190,13 +191,13 @@ def _determined(covariance: np.ndarray) -> np.ndarray:
 def _minimum(problem: GearProblem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the minimum x (8 n,) near `start`, its covariance (8 n, 8 n) and its cost.
 
-    The loss grows linearly with large residuals of the data, because a revolving motor's friction ripple may have the
-    frequency of a line.
+    The loss grows linearly with large residuals of the data, because the friction ripple of a revolving motor may
+    have the frequency of a multisine line.
     """
     count = problem.slides.sigma.size * 2
 
     def loss(z: np.ndarray, /) -> np.ndarray:
-        """Return the loss of squared residuals z and two derivatives: soft l1 for the data, z for the prior."""
+        """Return the loss of squared residuals z (soft l1 for data, z for the prior) and its two derivatives."""
         root = np.sqrt(1.0 + z[:count])
         rest = np.stack([z[count:], np.ones(len(start)), np.zeros(len(start))])
         return np.concatenate([np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3]), rest], 1)

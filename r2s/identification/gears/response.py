@@ -9,12 +9,12 @@ from r2s.excitation.multisine import LINES_HZ, PERIOD_S
 from r2s.recordings.recording import Recording
 
 RATE = 2.5  # least number of samples per period of the fastest line
-EXCITED = 3.0  # least median ratio of the torque's lines to their unexcited neighbors
+EXCITED = 3.0  # least median ratio of the torque's excited lines to their unexcited neighbors
 GAP = 0.5  # longest gap between samples, in periods of the fastest line
 MOVED = 3.0  # another motor is treated as moving at a line if amplitude / noise exceeds this ratio
 NEIGHBORS = 6  # number of neighboring unexcited lines that determine the noise of an excited line
-LOWEST = 4  # lowest neighbor, in periods per slide; ramps and drift leak into lower lines
-# least relative standard deviation of a response, because friction is not exactly constant (elastic twins 1 to 3)
+LOWEST = 4  # periods per slide of the lowest unexcited neighbor; ramps and drift leak into lower lines
+# least relative standard deviation of a response, because friction varies (value from the elastic twins 1 to 3)
 LINEAR = 0.06
 
 
@@ -25,7 +25,7 @@ class Slides:
     Attributes:
         joint: (W,) index of the sliding joint. q: (W, n) rad, mean angles. speed: (W,) rad/s, mean speed.
         angles: (W, F, n) rad, amplitudes of all motor angles. torque: (W, F) Nm, amplitudes of the sliding joint's
-            command. Another motor's amplitude is 0 if it hardly exceeds noise (MOVED).
+            command. Amplitudes of other motors that hardly exceed noise (MOVED) are set to 0.
         sigma: (W, F) rad/Nm, standard deviation of the real and of the imaginary part of `response`.
     """
 
@@ -144,7 +144,7 @@ def motor_response(slides: Slides, mass: np.ndarray, drives: Drives) -> np.ndarr
     others[each, :, j] = 0.0
     own = np.zeros_like(others)
     own[each, :, j] = gear[:, j].T
-    # link angles per rad of the motor; due to other motors
+    # link angles: per rad of the sliding joint's motor; due to the other motors
     moved = np.linalg.solve(links, np.stack([own, others], -1))
     moved = moved[each, :, j]  # (W, F, 2)
     coupling = gear[:, j].T + drives.loop[j, None] * s

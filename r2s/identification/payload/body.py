@@ -8,10 +8,10 @@ from r2s.physics.payload import WATER
 from r2s.physics.rigid_body import LinkInertia
 
 NAMES = ("mass", "x", "y", "z", "d1", "d2", "d3", "s12", "s13", "s23")
-# prior standard deviations: SIZE, of the logarithm of a body's size along an axis, relative to a ball of water of the
-# same mass (a steel block is half as large, an empty box of 2 kg three times as large); SHEAR, of s12, s13, s23
+# Prior standard deviations. SIZE: of log(size of a body along an axis / size of a ball of water of the same mass); a
+# steel block is half as large as this ball, an empty box of 2 kg three times as large. SHEAR: of s12, s13, s23.
 SIZE, SHEAR = 0.7, 0.5
-HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: mass over rated mass; distance and shape over their prior sigma
+HEAVIEST, FARTHEST, WIDEST = 3.0, 6.0, 6.0  # bounds: mass / rated mass; distance, shape / prior sigma
 STEP = 1e-6  # finite-difference step, relative to the width of the bounds
 
 

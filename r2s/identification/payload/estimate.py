@@ -109,8 +109,8 @@ def identify_payload(
     """Estimate the payload of an arm from a recording of the arm with the payload.
 
     Args:
-        arm: the arm, identified without payload from the recording's kind of torque; errors of its model widen
-            intervals.
+        arm: the arm, identified without payload from the recording's kind of torque. Errors of the arm's model widen
+            the intervals.
         recording: motion of the arm with the payload.
         declared: payload declared to gravity compensation (only for commanded torque).
         cutoff_hz: cutoff of the low-pass for measured or motor torque. seed: seed of the random posterior draws.
@@ -165,7 +165,7 @@ def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEsti
     drawn = np.clip(u + posterior(fit, u, seed).steps, 0.0, 1.0)[:, :10] * (high - low) + low
     mass, centre, tensor = fit.space.body(drawn)
     draws = {"mass": mass, "centre": centre, "inertia": tensor_elements(tensor)}
-    # draws of the prior at this mass: a value is identifiable if its interval is far narrower than their spread
+    # prior draws at the fitted mass; a value is identifiable if its interval is far narrower than their spread
     alone = np.where(
         np.isinf(fit.space.sigma), fit.z, rng.normal(size=drawn.shape) * np.nan_to_num(fit.space.sigma, posinf=0.0)
     )

@@ -40,7 +40,7 @@ def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mappi
     document["payload"] = {name: np.asarray(value).tolist() for name, value in found.values.items()}
     columns = found.tensor.T.ravel().tolist()
     document["libfranka"] = {"load_mass": found.mass, "F_x_Cload": found.centre.tolist(), "load_inertia": columns}
-    with atomic_write(path.with_name("payload_posterior.npz")) as part:  # before payload.yaml, which needs it
+    with atomic_write(path.with_name("payload_posterior.npz")) as part:  # first, as payload.yaml needs it
         np.savez_compressed(part, **found.draws)  # type: ignore[arg-type]
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))

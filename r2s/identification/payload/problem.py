@@ -14,11 +14,11 @@ from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass
 from r2s.physics.rigid_body import LinkInertia, nominal_torque
 from r2s.recordings.recording import Recording
 
-# Standard deviations of drift since the calibration: of friction, relative (warming within minutes, WARMED in
-# adaptation); of offsets, relative to friction; of link-side offsets, relative to the largest torque (conf/identify)
+# Standard deviations of drift since the calibration. FRICTION_DRIFT: relative, from warming within minutes (WARMED in
+# adaptation). OFFSET_DRIFT: relative to friction. SENSOR_DRIFT: link-side offsets / largest torque (conf/identify).
 FRICTION_DRIFT, OFFSET_DRIFT, SENSOR_DRIFT = 0.07, 0.02, 7e-4
 LOAD_FRICTION = 0.015  # standard deviation of friction, Nm per Nm of load (adaptation/tuning.py: PAYLOAD_FRICTION)
-RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; recordings longer than LONG_S (s) have fewer
+RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; fewer for recordings longer than LONG_S (s)
 REACH = 10.0  # half-width of the unit cube along w, in standard deviations of w
 
 
@@ -57,7 +57,7 @@ class Rows:
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Slope (K, 10), constant (K,): a payload phi costs |slope @ phi + constant|^2 plus a fixed term, or more."""
+        """Slope (K, 10), constant (K,): the cost of a payload phi is |slope @ phi + constant|^2 plus a fixed term."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -100,7 +100,7 @@ class LoadedTorque:
     def with_payload(self, payload: Payload | None, unexplained: np.ndarray | float = 0.0) -> TorqueResidual:
         """Return the residual of the arm with a payload, each row divided by its estimated standard deviation.
 
-        unexplained: (T, n) Nm, torque due to the arm's errors, which is subtracted from the residual.
+        unexplained: (T, n) Nm, torque due to errors of the arm's model, to subtract from the residual.
         """
         own = self.torque.on(replace(self._space, payload=payload)).with_external(self._declared + unexplained)
         return own.reweighted(self.arm.x, fitted=True)
@@ -122,14 +122,14 @@ class LoadedTorque:
         return np.stack(moved, -1) @ np.linalg.inv(LinkInertia(np.ones(10), centre, tensor).standard()).T
 
     def load_friction(self, payload: Payload | None) -> np.ndarray:
-        """Return the change of friction (T, n) Nm due to a payload's weight if 1 Nm of load adds 1 Nm of friction."""
+        """Return the change of friction (T, n) Nm due to a payload's weight, for 1 Nm of friction per Nm of load."""
         m = self.torque.motion
         carried = mass_and_moment(self.arm.robot, payload)
         loaded = self._weight + np.array([self._load(q, carried) for q in m.q])
         return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
 
     def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
-        """Linearize the residual at `payload` (phi (10,)). Weights ignore torque explained by model errors w (r,)."""
+        """Linearize the residual at `payload`, phi (10,); weights exclude torque explained by model errors w (r,)."""
         torque, x = self.with_payload(payload), self.arm.x
         d = self.arm.space.dynamics(x)
         offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level

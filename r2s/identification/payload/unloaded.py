@@ -34,7 +34,7 @@ def without_payload(robot: Robot, recording: Recording, payload: Payload, cutoff
         loaded += sign * mujoco_inverse_dynamics(model, smooth.q, smooth.dq, ddq)
     tau, of_grid = recording.tau.copy(), {int(grid.trajectory[s.start]): s for s in grid.stretches}
     for s in recording.stretches:
-        if (rows := of_grid.get(int(recording.trajectory[s.start]))) is None:  # a trajectory shorter than a step
+        if (rows := of_grid.get(int(recording.trajectory[s.start]))) is None:  # trajectory shorter than a step
             continue
         for j in range(robot.n):
             tau[s, j] -= np.interp(recording.t[s], grid.t[rows], loaded[rows, j])

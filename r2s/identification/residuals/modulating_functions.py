@@ -21,12 +21,12 @@ from r2s.recordings.parts import joined_arrays
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 250  # rate at which torques are evaluated before averaging
-CUTOFF_HZ = 40.0  # cutoff for angles before differentiation: velocity noise would bias the mean of curved friction
-NORMAL = 0.6745  # median magnitude of a normal variable over its standard deviation
+CUTOFF_HZ = 40.0  # cutoff of angles before differentiation: noisy velocities would bias mean friction
+NORMAL = 0.6745  # median magnitude of a normal variable / its standard deviation
 SHORTEST, LONGEST = 0.024, 0.1  # s, limits of half the length of a window
 GUARD = 8e-3  # s between a window and a stop, because the low-pass spreads the stop over this time
 STEADY = 0.2  # largest relative change of velocity over the distance PRESLIDING, for a friction law with memory
-STEADY_ROWS = 101  # rows of the polynomial that tests STEADY; with only five rows, noise looks like acceleration
+STEADY_ROWS = 101  # rows per polynomial in the test of STEADY; with only five rows, noise looks like acceleration
 MAX_LATENCY = 0.04  # s, longest latency of a command
 HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of eight equal parts of a command's hold, in steps
 # Gauss-Laguerre quadrature for a first-order lag; the omitted four points have less than 1e-10 of the weight
@@ -189,8 +189,8 @@ def _weights(half: int) -> np.ndarray:
 def _noise(half: int) -> float:
     """Return the standard deviation of the mean acceleration, 1/s^2, for white angle noise of 1 rad.
 
-    Integration by parts moves the angle's two time derivatives to the weights. Each weight covers 1 / (RATE_HZ
-    SIM_DT) samples of the angle, whose mean has less noise.
+    Integration by parts moves the angle's two time derivatives to the weights. Each weight multiplies the mean of 1 /
+    (RATE_HZ SIM_DT) angle samples, which has less noise than one sample.
     """
     second = np.diff(np.pad(_weights(half), 2), 2) * RATE_HZ**2
     return float(np.linalg.norm(second) * np.sqrt(SIM_DT * RATE_HZ))

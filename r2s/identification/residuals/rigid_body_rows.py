@@ -18,8 +18,8 @@ class RigidBodyRows:
 
     Attributes:
         q: (T, n) rad, joint angles.
-        rest: (T, n) Nm, torque of the damping, the springs and the welded bodies in the robot's file; for commanded
-            torque, minus the links' nominal gravity torque, which the arm's gravity compensation adds.
+        rest: (T, n) Nm, torque of damping, springs and welded bodies in the robot's file. For commanded torque, the
+            links' nominal gravity torque is subtracted, because the arm's gravity compensation adds it.
         y: (T, n, 10 n), regressor of rigid-body torque, gravity included, for the links' standard parameters.
         load: (T, n) Nm, magnitude of the nominal gravity torque.
         rotors: (T, n) rad/s^2, rotor acceleration; 0 if recorded torque excludes the torque on the rotors.
@@ -43,7 +43,7 @@ class RigidBodyRows:
         nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         weight = m.rows(regressor(robot, m.q, still, still, robot.gravity).reshape(shape))
         y = m.rows(y.reshape(shape))
-        if commanded:  # in place, because an hour of these rows takes hundreds of MB
+        if commanded:  # in place, as rows of an hour occupy hundreds of MB
             rest -= weight @ nominal
             y += weight
         encoder = np.zeros_like(rest)

@@ -27,13 +27,13 @@ from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # finite-difference step on the unit cube: far above round-off, too small for curvature to matter
-MAX_CORRELATION = 40  # rows, limit of the correlation length, so that a slowly drifting error has some weight
+MAX_CORRELATION = 40  # rows, limit of the correlation length, so that rows with slow drift have some weight
 MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 30_000  # recordings above 5 min (at 100 Hz) get fewer rows per s; for a cutoff of 10 Hz, 20 per s suffice
 PIECE_S = 60.0  # s, pieces of a recording that are filtered one after another
 AT_ONCE = 8  # candidates whose link torques are computed in one pass over the regressor
 PART = 2048  # number of moments whose Jacobian is in memory at once
-# presliding distances; after this slide, bristles are bent to 98 % from rest, to 96 % after a reversal
+# slide, in presliding distances, after which bristles are bent to 98 % (from rest) or 96 % (from a reversal)
 FULLY_BENT = 4.0
 
 
@@ -86,7 +86,7 @@ class TorqueResidual:
         self._sharp = bool(slowest)
         self._mean_sign = {memory: m.filtered(self._sign(memory, slice(None))) for memory in (False, True)}
         self.block = blocks_of(m.t, self._rigid.q, self._period)
-        # blocks of held-out rows; rows at equal times share a block, so that short trajectories do not dominate
+        # blocks of held-out rows; trajectories share blocks of equal time, so that short ones do not dominate
         self.half_second: np.ndarray = np.unique(np.floor(m.t / BLOCK_S), return_inverse=True)[1]
         self.lead_s, self._external = 0.0, np.zeros(1)
         self._weights = self._weights_at(self._seen_errors(space.start), fitted=False)
@@ -240,10 +240,10 @@ class TorqueResidual:
     ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
         """Return the torque error (T, n) at x, and a list of (parameter block, indices in x, change).
 
-        Each change is due to a step of the block from x to `stepped`: a change of torque (T, n) or, for L link
-        parameters, of standard parameters (n, 10 n, L). Link parameters need no further evaluation of torque, because
-        torque is linear in standard parameters. Other parameters of a joint, such as its friction, affect only this
-        joint's torque, so one evaluation steps all joints at once.
+        A step of one block from x to `stepped` changes torque (T, n) or, for L link parameters, standard parameters
+        (n, 10 n, L). Link parameters need no further evaluation of torque, because torque is linear in standard
+        parameters. Other parameters of a joint, such as its friction, affect only this joint's torque, so one
+        evaluation steps all joints at once.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]

@@ -1,7 +1,7 @@
 """Cut a recording of commands into windows, and replay each window from its measured start state (paper, eq. (8)).
 
-A simulated arm without feedback departs from the recorded motion. Windows are short, because after some seconds the
-accumulated error hides the effect of wrong parameters.
+A simulated arm without feedback departs from the recorded motion. Windows are short, because the accumulated error
+hides the effect of wrong parameters after some seconds.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ SHORTEST = 0.25  # least share of the full window length; shorter windows contai
 MOVED = 0.02  # rad, least range of motion of a moving joint
 # scatter of breakaway commands between postures, relative to the largest tau_max (a Panda: 0.1 Nm of 87 Nm)
 SCATTER = 0.1 / 87.0
-MAX_LATENCY_STEPS = 11  # ms, odd: longest latency of a command
+MAX_LATENCY_STEPS = 11  # ms, longest latency of a command; odd, as a filter length
 HISTORY = 40  # ms, length of the commands before a window; delay and lag shift them into the window
 
 

@@ -16,7 +16,7 @@ from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
 HOLD_STEPS = 0.5  # in steps, mean latency of a command that is constant over a step
-FRICTION_CUTOFF = 4.0  # cutoff of velocity for friction / cutoff of torque; high, so that reversals stay sharp
+FRICTION_CUTOFF = 4.0  # cutoff of friction's velocity / cutoff of torque; large, so that reversals stay sharp
 SHIFT = 0.05  # step between stored time shifts, in cutoff periods; cubic interpolation then errs by 2e-4
 SHIFTS = -0.03, 0.05  # s, range of the stored time shifts of torque
 MOST_SHIFT = 20  # ms, largest step between shifts; interpolation needs four shifts within SHIFTS

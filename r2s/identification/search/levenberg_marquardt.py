@@ -1,7 +1,7 @@
 """Solve bounded least squares on the unit cube by Levenberg-Marquardt, with several damping factors tried in a batch.
 
-scipy's trust-region solver would be slower: it tries one step at a time, and at every step it factors the whole
-Jacobian (14,000 rows, 110 columns) by SVD, which takes longer than the simulation.
+scipy's trust-region solver would be slower, because it tries one step at a time. At every step, it decomposes the
+whole Jacobian (14,000 rows, 110 columns) by SVD, which takes longer than the simulation.
 """
 
 import time
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 DAMPING = 1e-3  # first damping factor, relative to the diagonal of J^T J (Marquardt's scaling)
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # lower limit: a pure Gauss-Newton step; upper limit: almost no step
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # at the lower limit, a step is Gauss-Newton; at the upper limit, almost 0
 TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful factor
 RETRIES = 3  # batches of trials per Jacobian
 

@@ -22,8 +22,8 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
     r2s selects a family with more parameters only if it predicts torque clearly better. Rows of slow motion show
     whether friction falls with velocity, but the low-pass mixes friction at rest into these rows. If `slowest` > 0
     (rad/s) and the best family has no memory, r2s therefore compares the families without memory again. The second
-    comparison uses windows in which a joint is faster than `slowest` (modulating_functions.py). Its errors and best
-    family replace those of the first; each comparison divides by its least error. CLOSE applies only to the second.
+    comparison uses windows in which a joint is faster than `slowest` (modulating_functions.py), and CLOSE. Its
+    results replace those of the first comparison. Each comparison divides the errors by the least one.
 
     Raises:
         UserError: the recording is too short to hold out motion.

@@ -25,9 +25,9 @@ def select_terms(
     """Return {"entered": list of bool}: whether forward selection adds each of the `candidates` to `terms`.
 
     Each round considers the candidates that lower the mean error over half-second blocks by more than CLEARLY
-    standard errors, and adds the one with the smallest error. The selection ends if there is no such candidate. Each
-    fold is fitted once without candidates. One Gauss-Newton step from this fit then evaluates a set of candidates,
-    because torque is linear in most parameters.
+    standard errors, and adds the one with the smallest error. Without such a candidate, the selection ends. Each fold
+    is fitted once without candidates. One Gauss-Newton step from this fit then evaluates a set of candidates, because
+    torque is linear in most parameters.
     """
     space, folds = cv.space(terms), []
     for k, fold in enumerate(cv.split(space, blocks=BLOCKS, slowest=slowest)):

@@ -20,9 +20,9 @@ from r2s.identification.structure.cross_validation import RATE_HZ, CrossValidati
 from r2s.recordings.lateness import LATE_S, lateness
 
 DELAY = "signal_delay"
-# standard deviations of a clear delay: 3, plus a third, because model error made 95 % intervals cover only 85 %
+# a delay above this many standard deviations is clear; 3 plus a third, as model error made 95 % intervals cover 85 %
 SURE = 4.0
-UNCLEAR = 2.0  # standard deviations between an estimated delay and the largest plausible one
+UNCLEAR = 2.0  # largest plausible delay minus estimated delay, in standard deviations
 BLOCKS = 4  # held-out blocks per fold; with several blocks, held-out and fitted motion have similar speeds
 
 
@@ -31,9 +31,9 @@ def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
 
     If dq is on time or has an unknown lateness, r2s estimates the delay of torque, because a delay fixed at 0 would
     have no uncertainty. r2s fixes this delay only if it is clearly below LATE_S. If dq is late, r2s first fits torque
-    with corrected dq. If this fit shows a clear delay of torque, r2s corrects torque and dq; otherwise only dq. If
-    correcting only dq hardly lowers the error of held-out torque (by one standard error or less), r2s treats torque
-    and dq as equally late. With fewer than 2 folds, r2s skips this comparison.
+    with corrected dq. If this fit shows a clear delay of torque, r2s corrects both torque and dq; otherwise, r2s
+    corrects only dq. If correcting only dq hardly lowers the error of held-out torque (by one standard error or
+    less), r2s treats torque and dq as equally late. With fewer than 2 folds, r2s skips this comparison.
     """
     on_time = not np.nan_to_num(lateness(cv.recording, cv.cutoff_hz).sure).any()
     if DELAY in terms:

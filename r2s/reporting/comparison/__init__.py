@@ -1,1 +1,1 @@
-"""Compare trainings with several seeds, and adapters in several transfers."""
+"""Compare trainings by their scores over several seeds, and adapters by their measures in several transfers."""

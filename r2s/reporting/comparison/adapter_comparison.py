@@ -1,7 +1,7 @@
-"""Compare adapters by their transfers, in tables with a row per adapter and a column per condition of the arm.
+"""Compare adapters by their transfers, in tables with a row per adapter and a column per test condition.
 
-Each mean is taken over arms and episodes. The bootstrap is paired: each draw resamples the arms and the episodes of
-each arm, and all rows of a condition use the same resampled episodes.
+Each mean is taken over arms and episodes. The bootstrap is paired. Each draw resamples the arms, then the episodes of
+each arm; all rows of a condition use the same sample.
 """
 
 import os
@@ -24,18 +24,19 @@ COUNTS = ["stopped", "asked", "episodes", "arms"]
 
 @dataclass(frozen=True)
 class AdapterComparison:
-    """Scores of adapters; a row stands for one adapter, or for one adapter with one policy (see `rows_of`).
+    """Scores of adapters; each row describes one adapter, or one adapter with one policy (see `rows_of`).
 
     Attributes:
         measures: {key: compared measure}. headline: the measure that summarizes a row.
-        scores: a line per measure, condition and row. `low` to `high` is the 95 % interval of `mean`. `difference` is
-            the mean minus that of the row `reference` (None: no reference); `worse_low` to `worse_high` is the 95 %
-            interval of how much worse the row is. Counts: `stopped` episodes, `asked` (episodes common to all rows),
-            `episodes` in the mean, `arms`.
-        losses: table with a line per condition and row. The column `value` is the mean of the headline measure in the
-            condition; the column `nominal` is its mean over the same arms and episodes in the nominal condition.
-        costs: table with a line per row. The column `us` is the adapter's computing time per cycle, microseconds.
-        runs: {row: its transfers}. key: lines that explain policy names. left_out: lines on omitted episodes.
+        scores: table with a line per measure, condition and row. `low` to `high` is the 95 % interval of `mean`.
+            `difference` is the row's mean minus the mean of the row `reference` (None: no reference). `worse_low` to
+            `worse_high` is the 95 % interval of this difference, positive if the row is worse.
+            `asked` is the number of episodes common to all rows, `episodes` the number of these in the mean,
+            `stopped` the number of stopped episodes, `arms` the number of arms.
+        losses: table with a line per condition and row. The column `value` is the mean of the headline measure; the
+            column `nominal` is this mean over the same arms and episodes in the nominal condition.
+        costs: table with a line per row. The column `us` is the adapter's computing time per cycle in microseconds.
+        runs: {row: its transfers}. key: lines that explain policy names. left_out: lines about omitted episodes.
     """
 
     measures: Mapping[str, Measure]
@@ -49,7 +50,7 @@ class AdapterComparison:
 
 
 def compare_adapters(found: Sequence[Transferred]) -> AdapterComparison:
-    """Compare the adapters in transfers that `comparable` selected."""
+    """Compare the adapters of the transfers `found`, which `comparable` selected."""
     conditions = without_common([r.condition for r in found])
     found = [replace(r, condition=own) for r, own in zip(found, conditions, strict=True)]
     runs, key = rows_of(found)
@@ -110,8 +111,8 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
     """Return the lines of the table `AdapterComparison.scores` for one measure and one condition.
 
-    An episode without a finite value in one row, such as a stopped episode without an RMSE, is omitted in all rows. A
-    row without any finite value does not affect the other rows. The mean of a single episode has no interval.
+    If one row has no finite value for an episode, such as no RMSE after a stop, all rows omit this episode. A row
+    without any finite value does not affect the other rows. The mean of a single episode has no interval.
 
     Args:
         shared: output of `in_common`. measure: the compared measure. reference: {row: its reference row or None}.
@@ -175,7 +176,7 @@ def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]],
 
 
 def _short(paths: set[str]) -> dict[str, str]:
-    """Return {path: short path}: the last k components of each path, with the smallest k for which they differ."""
+    """Return {path: its last k components}, with the smallest k for which all these short paths differ."""
     for count in range(1, max(len(Path(p).parts) for p in paths) + 1):
         names = {p: os.path.join(*Path(p).parts[-count:]) for p in sorted(paths)}
         if len(set(names.values())) == len(paths):
@@ -184,7 +185,7 @@ def _short(paths: set[str]) -> dict[str, str]:
 
 
 def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | None:
-    """Return the adapt=none row to compare `name` with: one with a common policy, else the only one, else None."""
+    """Return the adapt=none row that shares a policy with the row `name`; else the only adapt=none row, or None."""
     policies = {r.policy for r in rows[name]}
     none = {n: {r.policy for r in members} for n, members in rows.items() if members[0].adapter == "none"}
     same = [n for n, own in none.items() if policies & own]
@@ -192,7 +193,7 @@ def _reference(name: str, rows: Mapping[str, Sequence[Transferred]]) -> str | No
 
 
 def verdict(found: AdapterComparison, row: str) -> str:
-    """Describe a row: headline measure in the worst condition, measures significantly worse than the reference."""
+    """Describe a row: headline measure in its worst condition, and measures significantly worse than adapt=none."""
     m, table = found.headline, found.losses
     own = table[(table["row"] == row) & (table["condition"] != NOMINAL)].to_dict("records")
     if own:
@@ -214,7 +215,7 @@ def verdict(found: AdapterComparison, row: str) -> str:
 
 
 def _place(found: AdapterComparison, worse: pd.DataFrame) -> str:
-    """Name a condition and the measures that got worse: "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)"."""
+    """Name a condition and the measures that are worse there: "1.0 kg (RMSE of the path 1.38 mm instead of 1.06)"."""
     parts = []
     for r in worse.to_dict("records"):
         m = found.measures[r["measure"]]

@@ -25,7 +25,7 @@ ABOUT = (
 
 
 def tables(found: AdapterComparison) -> dict[str, pd.DataFrame]:
-    """Return {title: table of strings}: per measure, of costs and, if an episode was stopped, of stopped episodes."""
+    """Return {title: table of strings}: a table per measure, one of costs and, if any, one of stopped episodes."""
     s = found.scores
     out = {m.heading: _cells(s[s["measure"] == key], m) for key, m in found.measures.items() if len(s)}
     first = s[s["measure"] == found.headline.key]

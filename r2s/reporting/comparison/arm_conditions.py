@@ -1,4 +1,4 @@
-"""Describe the test conditions of an arm in words: payload, friction of a warm arm, delayed commands."""
+"""Describe the test condition of an arm in words: payload, scaled friction, delayed commands, gear stiffness."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -18,15 +18,15 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     """Return the settings of conf/arm that differ from their nominal values, such as {"payload": 1.0}.
 
     Args:
-        arm: config of the arm. typed: config keys that the user overrides. Those of the arm, such as arm.live, are
-            settings too, except the keys in IDENTITY.
+        arm: config of the arm. typed: config keys that the user overrides. An overridden key of the arm, such as
+            arm.live, is a setting too, unless the key is in IDENTITY.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
     values = {k: _plain(arm[k]) for k in keys if k in arm and k not in IDENTITY}
 
     def empty(key: str, value: Any) -> bool:
-        return "payload" in key and not isinstance(value, str) and not _size(value)  # a string: payload's run folder
+        return "payload" in key and not isinstance(value, str) and not _size(value)  # a string names a run folder
 
     return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and not empty(k, v)}
 
@@ -34,7 +34,7 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
 def without_common(conditions: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the `conditions` without the settings that are equal in all conditions, such as the surface of a task.
 
-    The keys of SETTINGS remain even if equal, because their nominal values are known.
+    The keys of SETTINGS remain even if their values are equal, because their nominal values are known.
     """
     first = conditions[0]
     common = {k for k in first.keys() - SETTINGS if all(k in c and c[k] == first[k] for c in conditions)}

@@ -26,7 +26,7 @@ class Groups:
 def group(runs: Sequence[Trained]) -> Groups:
     """Group the runs by their settings, so that the runs of a group differ only in their seeds.
 
-    A group's label is the algorithm and the overrides of settings that differ among groups. A setting that the label
+    A group's label consists of the algorithm and the overrides that differ among groups. A setting that the label
     omits has its default value, or the same value in all groups. A label longer than LONGEST letters becomes the
     algorithm and a number, such as "tqc #1" (see `Groups.key`).
     """
@@ -62,7 +62,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
     names = [_joined(seeds[0].algo, p) for seeds, p in zip(sets, parts, strict=True)]
     for name in list(names):
         twins = [k for k, other in enumerate(names) if other == name]
-        if len(twins) > 1:  # the sets differ in settings that no override names, such as settings of +experiment=
+        if len(twins) > 1:  # these sets differ in settings that no override names, such as those of +experiment=
             changed = differing([sets[k][0].settings for k in twins])
             for k in twins:
                 more = {_short(s): sets[k][0].settings[s] for s in changed if s in sets[k][0].settings}
@@ -71,7 +71,7 @@ def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
 
 
 def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
-    """Return {algorithm: keys that differ}: algo.* compared within the algorithm, other keys among all algorithms."""
+    """Return {algorithm: keys that differ}: keys algo.* among sets of this algorithm, other keys among all sets."""
     settings = [seeds[0].settings for seeds in sets]
     common = [k for k in differing(settings) if not k.startswith("algo.")]
     out = {}

@@ -52,12 +52,12 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
     """Return, for each algorithm with several groups, how much a measure depends on the settings of the groups.
 
-    `best`, `median` and `worst` are the best, median and worst interquartile mean of all groups. `best` is
-    optimistic, because the same seeds select and score the group. For `held_out`, each seed scores the group that is
-    best at the other seeds; `held_out` is the mean of these scores. The median score of all groups is subtracted from
-    the score in `held_out` at each seed; `spread` is the mean difference (positive: better), and `low` to `high` is
-    its 95 % interval. An algorithm with a small `spread` needs little tuning. With fewer than two seeds common to all
-    groups, `held_out` and `spread` are nan.
+    `best`, `median` and `worst` are the best, median and worst interquartile mean of the algorithm's groups. `best`
+    is optimistic, because the same seeds select and score the group. `held_out` avoids this: for each seed, the other
+    seeds select the best group, and this seed scores the group; `held_out` is the mean score. `spread` is the mean
+    over seeds of this score minus the median score of all groups (positive: better); `low` to `high` is its 95 %
+    interval. An algorithm with a small `spread` needs little tuning. With fewer than two seeds common to all groups,
+    `held_out` and `spread` are nan.
 
     Args:
         grouped: groups of trainings. measure: key of the measure; if None, the last of `MeasureTable.selection`.
@@ -81,7 +81,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return two scores (S,) for S seeds: of the group that is best at the other seeds, and the median of all groups.
+    """Return, at S seeds, the score (S,) of the group best at the other seeds, and the median (S,) over all groups.
 
     Args:
         settings: {seed: score} of each group; a larger score is better. Only seeds common to all groups are used; the
@@ -96,7 +96,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line for each algo or reward setting whose best value is an extreme of three or more tried values."""
+    """For each algo or reward setting with three or more values, return a line if the best value is an extreme."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
@@ -136,6 +136,6 @@ def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np
     """
     curves = [r.curve for r in group]
     grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)
-    with np.errstate(invalid="ignore"):  # values are inf where arms were stopped: no curve there
+    with np.errstate(invalid="ignore"):  # values are inf where arms were stopped; the curve has a gap there
         values = np.stack([np.interp(grid, c[x], c[y]) for c in curves], -1)
     return grid, np.stack([interquartile_mean(values), values.min(-1), values.max(-1)])

@@ -26,7 +26,7 @@ def interval(
 
     Args:
         strata: scores of S seeds in each stratum, as one array (S,) per stratum. seed: random seed of the bootstrap.
-        statistic: function that maps D bootstrap draws, one array (D, S) per stratum, to D values (D,).
+        statistic: maps D bootstrap draws, given as one array (D, S) per stratum, to D values (D,).
     """
     if min(map(len, strata)) < 2:
         return np.nan, np.nan

@@ -21,11 +21,11 @@ READ = (
     *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
 )
 ALIKE = ("robot", "task")  # config groups that must have equal values in comparable runs
-# {key of `origin`: reason if two runs differ in it}; code affects the results, a machine affects the speed
+# {key of `origin`: reason if two runs differ in this key}; the commit affects results, the machine affects speed
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
-MOST_BUDGETS = 2.0  # largest ratio of comparable budgets: beyond it, the longer training would win by its length
+MOST_BUDGETS = 2.0  # largest ratio of comparable budgets; at larger ratios, the longer training wins by its length
 UNFINISHED = {"running": "unfinished"}
 
 
@@ -36,7 +36,7 @@ class Trained:
     Attributes:
         folder, seed, algo: run folder, random seed, name of the algorithm.
         settings: config values that the training used, such as {"algo.lr": 5e-4, "dr.phi_relative": 0.1}.
-        alike: config values that comparable runs share, such as {"task.ctrl_hz": 50, "evaluation.episodes": 200}.
+        alike: config values that agree in comparable runs, such as {"task.ctrl_hz": 50, "evaluation.episodes": 200}.
         origin: {key of ORIGIN: value in meta.json, None if unknown}; a model-based controller has only the commit.
         typed: the user's overrides of `settings`, from overrides.yaml: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether the run used +experiment=toy, a training too short for the policy to learn.
@@ -144,7 +144,7 @@ def _read(folder: Path) -> Trained:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    """Return commit, machine, threads and device of a run; several values of a resumed run become "A and B"."""
+    """Return commit, machine, threads and device of a run; a value that changed on resuming becomes "A and B"."""
     found: dict[str, set[str]] = {key: set() for key in ORIGIN}
     for part in parts_of(json.loads((folder / "meta.json").read_text())):
         git, machine = part["git"] or {}, part["machine"] or {}
@@ -189,8 +189,8 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
     Runs are comparable if robot, task, number of evaluation episodes, use of +experiment=toy and all keys of ORIGIN
     agree. The ratio of their budgets must be at most `MOST_BUDGETS`. Of sets of equal size, sets without
-    +experiment=toy have priority, then sets with more env steps. Only the first run with given settings and seed is
-    kept, because a repetition adds no evidence.
+    +experiment=toy have priority, then sets with more env steps. Of runs with equal settings and seed, only the
+    first remains, because a repetition adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -231,7 +231,7 @@ def _difference(run: Trained, first: Trained) -> str:
 
 
 def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
-    """List names as ["a, b (failed)", "c (unfinished)"]: up to `most` per reason, each cut to `width` letters."""
+    """Return texts such as "a, b (failed)": up to `most` names per reason, each name cut to `width` letters."""
     reasons: dict[str, list[str]] = {}
     for name, reason in why.items():
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")

@@ -20,7 +20,7 @@ from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
 
 FILES = ("config.yaml", "policy.yaml", "overrides.yaml", "summary.json")
-ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that describe the arm, and so are no settings of the adapter
+ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that describe the arm, not the adapter
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Transferred:
         arm: name such as "twin, rigid, seed 0" or "panda, 172.16.0.2". condition: output of `condition`.
         robot: robot config in training.
         measures: measures of the task. length: episode length and rate, as "4 s at 100 Hz". goals: number of goals.
-        us: median computing time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
+        us: median computing time of the adapter per cycle in microseconds; 0 without an adapter, nan if not measured.
         episodes: table with a row per episode, indexed by goal, and columns for `MeasureTable.transfer`, path gap and
             arm_stopped (0 or 1).
     """
@@ -105,7 +105,7 @@ def _cost(path: Path) -> float:
 
 
 def _names(goals: np.ndarray) -> Iterator[str]:
-    """Yield a name for each goal; a goal has the same name in all transfers, and a number distinguishes equal goals.
+    """Yield a name for each goal, the same in all transfers; a number distinguishes equal goals of one transfer.
 
     Goals are rounded to 10 micrometers, because two machines may compute them with different last digits.
     """

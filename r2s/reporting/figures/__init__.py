@@ -1,1 +1,1 @@
-"""Draw figures (PNG): panels and colors, learning curves, episodes."""
+"""Draw figures (PNG) of learning curves and episodes; provide panels, colors and thinned logs for other figures."""

@@ -1,4 +1,4 @@
-"""Assign colors to labels, the same in figures and in the viewer."""
+"""Assign colors to labels; figures and the Rerun viewer use the same colors."""
 
 from collections.abc import Iterable
 

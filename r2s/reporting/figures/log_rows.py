@@ -12,7 +12,7 @@ def thin(count: int, most: int = MOST_POINTS) -> slice:
 
 
 def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
-    """Return indices that sample a log with times t (T,) s at about `rate` Hz, including its first and last time."""
+    """Return indices of rows that sample a log with times t (T,) s at about `rate` Hz, with first and last row."""
     grid = np.arange(t[0], t[-1], 1 / rate)
     return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
 

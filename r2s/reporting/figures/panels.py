@@ -13,9 +13,9 @@ from r2s.tasks.measures import Measure
 DPI = 120
 WIDTH = 12.0  # inches
 LEGEND_WIDTH = 160  # number of letters that fit into WIDTH, in one line of the legend
-# fixed inches around and between panels: matplotlib's layout engines are slow, because they measure every text
+# inches around and between panels, fixed because matplotlib's layout engines are slow: they measure every text
 LEFT, RIGHT, TOP, BOTTOM, ACROSS, DOWN, LINE = 0.8, 0.15, 0.75, 0.5, 0.85, 0.75, 0.22
-LETTER = 0.085  # inches per letter of a tick label left of the first panel
+LETTER = 0.085  # inches of left margin per letter of the first panel's tick labels
 TITLE, AGAIN = 0.9, 0.2  # inches of height added to the rows of panels: per figure, and per row after the first
 
 

@@ -1,1 +1,1 @@
-"""Report an identification: tables, figures and page."""
+"""Report an identification in tables, in figures, and as a page (report.md, report.html)."""

@@ -43,7 +43,7 @@ def contact_table(found: ContactEstimate) -> pd.DataFrame:
 
 
 def press_table(found: ContactEstimate) -> pd.DataFrame:
-    """Tabulate the RMSE between modeled normal force and force from joint torques: fitted and held-out presses."""
+    """Tabulate the RMSE of the modeled normal force against joint torques, for fitted and for held-out presses."""
     parts = {"fitted presses": found.training, "held-out press": found.validation}
     cells = {
         name: [f"{part.summary()['seconds']:.1f}", *(number(part.rmse(side), "{:.2f}") for side in (0.0, 1.0, -1.0))]
@@ -84,4 +84,4 @@ def contact_figure(path: Path, found: ContactEstimate) -> Path:
 def _curves(found: ContactEstimate, depth: np.ndarray) -> np.ndarray:
     """Return the normal force (S, D) N of S posterior draws, at depths (D,) m below the plane of each draw."""
     draws = found.draws
-    return 1e-3 * draws["stiffness"][:, None] * (1e3 * depth) ** draws["exponent"][:, None]  # stiffness at 1 mm
+    return 1e-3 * draws["stiffness"][:, None] * (1e3 * depth) ** draws["exponent"][:, None]  # N/m at a depth of 1 mm

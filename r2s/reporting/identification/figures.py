@@ -57,9 +57,9 @@ def torque_figure(
 def position_figure(
     path: Path, windows_q: np.ndarray, predicted: Mapping[str, np.ndarray], dt: float = SIM_DT
 ) -> Path:
-    """Draw the open-loop error |q - windows_q|, mrad, of predicted joint angles {label: q (W, S, n) rad}.
+    """Draw the open-loop error |q - windows_q| in mrad of predicted joint angles {label: q (W, S, n) rad}.
 
-    `windows_q` (W, S, n) rad contains the joint angles that were measured in W windows of S rows, `dt` s apart. Lines
+    `windows_q` (W, S, n) rad contains the measured joint angles of W windows of S rows; rows are `dt` s apart. Lines
     are medians over the windows; bands contain 90 % of the windows.
     """
     colour, t = colours(predicted), dt * np.arange(1, windows_q.shape[1] + 1)
@@ -93,7 +93,7 @@ def friction_figure(
     Args:
         path: file of the figure (PNG). dynamics: {label: model}. dq_max: (n,) rad/s, largest speeds on the axes.
         data: speed (T, n) rad/s and friction torque (T, n) Nm of a recording.
-        draws: (S, n, K) posterior draws of the friction parameters of the last model, for the 95 % band.
+        draws: (S, n, K), S posterior draws of the K friction parameters of the last model, for the 95 % band.
     """
     colour = colours(dynamics)
     grid = np.linspace(-1, 1, 401)
@@ -128,7 +128,7 @@ def friction_figure(
 def _band(
     axis: Axes, speed: np.ndarray, torque: np.ndarray, limits: tuple[float, float], colour: str, label: str
 ) -> tuple[float, float]:
-    """Draw the 95 % band of S torque draws (T, S) Nm; return y limits that show the curves and cut a wide band."""
+    """Draw the 95 % band of S torque draws (T, S) Nm; return y limits that show all curves but cut a wide band."""
     low, high = limits
     bottom, top = np.quantile(torque, [0.025, 0.975], axis=1)
     axis.fill_between(speed, bottom, top, label=f"95 % band, {label}", color=colour, alpha=0.25, linewidth=0)
@@ -137,7 +137,7 @@ def _band(
 
 
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw each search's cost over time, relative to its first cost; for a search in SCANS, shade its duration.
+    """Draw the cost of each search over time, relative to its first cost; for searches in SCANS, shade the duration.
 
     Costs are comparable only within one search, because each search uses new weights of the residuals.
     """

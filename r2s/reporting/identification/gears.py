@@ -1,4 +1,4 @@
-"""Report identified gears: a table, and a figure of the motors' frequency response."""
+"""Report identified gear stiffness: a table, and a figure of the motors' frequency response."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ TICKS_HZ = (6, 10, 20, 50, 100)
 
 
 def gears_table(found: GearEstimate) -> pd.DataFrame:
-    """Return a row per joint: stiffness, 95 % interval, deflection, misfit, whether the stiffness is determined."""
+    """Return a row per joint: stiffness, 95 % interval, deflection, misfit, "yes" if stiffness is determined."""
     low, high = np.percentile(found.draws, COVERED, axis=0)
     stiffness, rows = found.drives.stiffness, {}
     for i, value in enumerate(stiffness):
@@ -33,7 +33,7 @@ def gears_table(found: GearEstimate) -> pd.DataFrame:
 
 
 def gears_figure(path: Path, found: GearEstimate) -> Path:
-    """Draw each motor's angle per torque over frequency, measured and fitted, relative to that of the rotor alone."""
+    """Draw each motor's frequency response (angle per torque), measured and fitted, relative to the rotor alone."""
     colour = colours(["measured", "identified"])
     inverse = (2 * np.pi * LINES_HZ) ** 2 * found.drives.rotor[:, None]  # scales the response of the rotor alone to 1
     measured: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 4, "color": colour["measured"]}

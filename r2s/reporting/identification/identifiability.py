@@ -1,4 +1,4 @@
-"""Report the limits of an identification: parameters and combinations that the data do not constrain."""
+"""Report the limits of an identification: parameters and their combinations that the data hardly constrain."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,8 +12,8 @@ MOST_LINES = 10  # largest number of listed combinations of parameters
 def identifiability(found: IdentificationResult) -> list[Item]:
     """Return sentences on the limits of an identification.
 
-    They name parameters that remained nominal, parameters that reached a bound, and combinations of parameters that
-    only the prior determines.
+    The sentences name parameters that remained nominal, parameters that reached a bound, and combinations of
+    parameters that only the prior determines.
     """
     space = found.space
     count, total = int(found.found.identifiable.sum()), len(space.names)

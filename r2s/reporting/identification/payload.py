@@ -1,4 +1,4 @@
-"""Report an identified payload: tables, and the loaded arm's torque, predicted with and without the payload."""
+"""Report an identified payload: tables, and a figure of the loaded arm's torque, measured and predicted."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def payload_table(found: PayloadEstimate) -> pd.DataFrame:
 
 
 def load_error_table(found: PayloadEstimate) -> pd.DataFrame:
-    """Return, per joint, the RMSE of predicted torque of the loaded arm, without and with the identified payload."""
+    """Return, per joint, the RMSE of the loaded arm's predicted torque, without and with the identified payload."""
     rows = {"without": found.rmse(found.without), "with": found.rmse(found.predicted)}
     cells = {f"{name} payload": [number(x) for x in values] for name, values in rows.items()}
     joints = [f"joint {j + 1}" for j in range(found.measured.shape[1])]

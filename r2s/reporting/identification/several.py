@@ -1,4 +1,4 @@
-"""Build tables of an identification from several recordings, and of the drift since an earlier identification."""
+"""Build tables of each recording's contribution to an identification, and of the drift since an earlier one."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,11 +13,11 @@ CONTRIBUTIONS = (
     "RMSE: torque of the fit to all training recordings, mean over joints; left out: of a fit to the others. The "
     "last column tells what a recording's information adds: how much wider intervals would be without it."
 )
-NARROWER = 1.02  # least factor by which an interval widens without a recording, if that recording adds information
+NARROWER = 1.02  # a recording adds information if, without it, an interval is wider by at least this factor
 
 
 def contribution_table(parts: Sequence[Contribution], names: Sequence[str]) -> pd.DataFrame:
-    """Return per recording: use, torque, seconds, RMSE, RMSE of a fit without the recording, effect on intervals."""
+    """Return a row per recording: use, torque, s, RMSE of the fits with and without it, effect on intervals."""
     rows = {}
     for p in parts:
         cells = {"": p.use, "torque": p.torque, "s": number(p.seconds), "RMSE, Nm": number(np.nanmean(p.rmse))}

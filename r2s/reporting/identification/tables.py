@@ -56,7 +56,7 @@ def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
 
 
 def _breakaway(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
-    """Return the breakaway torque per joint and direction; give the reason if the ramps did not measure a torque."""
+    """Return the breakaway torque per joint and direction; if the ramps did not measure a torque, add the reason."""
     reasons = identified.edges.unknown if identified.edges is not None else {}
     columns = {}
     for side, edges in zip(SIDES, identified.dynamics.breakaway.T, strict=True):

@@ -62,7 +62,7 @@ class Value(NamedTuple):
 
 
 def values(space: ParameterSpace, found: ParameterEstimate, block: str, kept: Sequence[str] = ()) -> list[Value]:
-    """Return a `Value` per parameter of `block` (per joint, link or arm). kept: names of parameters kept nominal."""
+    """Return a `Value` per parameter of `block`: per joint, per link or for the arm. kept: names kept nominal."""
     marks = (np.isin(space.names, list(names)) for names in (kept, space.fixed))
     parts = (space.start, found.x, found.low, found.high, found.identifiable, *marks)
     return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]

@@ -1,4 +1,4 @@
-"""Build tables about a recording before the fit: checks, and expected widths of the parameters' intervals."""
+"""Build tables that judge a recording before the fit: checks, and expected widths of the parameters' intervals."""
 
 from typing import Protocol
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from r2s.reporting.trackers.tracker import Tracked, Tracker, flat
 
-MOST_WAITING = 10_000  # largest number of rows that wait for a slow tracker: some megabytes
+MOST_WAITING = 10_000  # largest number of rows that wait for a slow tracker, some megabytes in all
 LAST_S = 60.0  # s, longest wait for each tracker at the end of a run
 FILES = ("recording.rrd", "report.html", "report.md", "parameters.yaml", "policy.onnx", "measures.json")
 
@@ -47,7 +47,7 @@ class AsyncTracker:
                 continue
             try:
                 call(self._tracker)
-            except (Exception, SystemExit) as error:  # a network library may raise anything
+            except (Exception, SystemExit) as error:  # a network library may raise any exception
                 self._give_up(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
 
     def _give_up(self, why: str) -> None:

@@ -65,7 +65,7 @@ class Mlflow(LoggerTracker):
             store = Path(self._uri.removeprefix(SQLITE)).absolute()
             store.parent.mkdir(parents=True, exist_ok=True)
             lock, artifacts = FileLock(f"{store}.lock"), str(store.parent / "mlartifacts")
-        with lock:  # otherwise jobs of a sweep may create the tables at the same time
+        with lock:  # otherwise, two jobs of a sweep may create the database tables at the same time
             start = {"run_id": known} if known else {"run_name": run.name, "tags": tags}
             self._logger = Logger(self._experiment, self._uri, artifact_location=artifacts, start=start)
         run.keep("mlflow", self._logger.experiment.info.run_id)

@@ -48,7 +48,7 @@ class Tensorboard(LoggerTracker):
         self._logger.shutdown()
 
     def _settings(self) -> None:
-        """Log the settings and the measure for comparing runs; add_hparams would begin a new run."""
+        """Log the settings, and the measure by which TensorBoard compares runs; add_hparams would begin a new run."""
         from torch.utils.tensorboard.summary import hparams
 
         metric = {f"summary/best/{self._run.measures.selection[0]}": 0}

@@ -46,7 +46,7 @@ class Tracked:
 
     @property
     def measures(self) -> MeasureTable:
-        """Measures of the run's task, which trainings and transfers write to measures.json before their first row."""
+        """Measures of the run's task; trainings and transfers write them to measures.json before they log a row."""
         return measures_of(self.folder)
 
     def kept(self, key: str) -> str | None:
@@ -64,7 +64,7 @@ class Tracked:
 class Tracker(Protocol):
     """Interface to a tool that shows runs.
 
-    r2s constructs a tracker before it creates the run folder, and calls the tracker's methods from one thread. After
+    r2s constructs a tracker before the run folder exists, and calls all methods of the tracker from one thread. After
     an exception in a tracker, the run prints one warning, does not call the tracker again, and continues.
     """
 

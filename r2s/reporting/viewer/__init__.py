@@ -1,1 +1,1 @@
-"""Write recordings for the Rerun viewer (data and layout), and run the viewer."""
+"""Write recordings (data and layout) for the Rerun viewer, and start the viewer."""

@@ -16,13 +16,13 @@ from r2s.tasks.measures import Measure
 
 FRAMES_HZ = 50.0
 TRAIL_EVERY = 3  # frames per point of a trail
-GOAL_RADIUS = 0.025  # m, the paper's success distance of 5 cm as a diameter
+GOAL_RADIUS = 0.025  # m; the diameter is the paper's success distance of 5 cm
 GOAL = "#ff5252"
-WORST_M = 0.01  # m, the trail on a path is red from this error on
+WORST_M = 0.01  # m, error from which the trail on a path is red
 
 
 class _Arm(NamedTuple):
-    """An arm in the Rerun recording; `frames`: indices of each episode's logged rows; `starts`: start times, s."""
+    """An arm in the Rerun recording; `frames`: indices of each episode's logged rows; `starts`: episode starts, s."""
 
     stream: rr.RecordingStream
     base: str
@@ -48,7 +48,7 @@ class _Arm(NamedTuple):
 def log_arms(
     stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Sequence[Episode]], error: Measure
 ) -> None:
-    """Show one arm per label, side by side, in the viewer; distances are in the unit of the measure `error`."""
+    """Log one arm per label, side by side; the plotted error has the unit of the measure `error`."""
     stream.log("arms", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     model, palette, starts = robot.model(gravity=False), colours(episodes), starts_of(episodes)
     for i, (label, sequence) in enumerate(episodes.items()):
@@ -113,7 +113,7 @@ def _goals(arm: _Arm) -> None:
 
 
 def _boxes(arm: _Arm, up: np.ndarray) -> None:
-    """Log the box that the arm pushes on a level table; `up` (3,) is the upward direction, of any length."""
+    """Log the box that the arm pushes on a level table; `up` (3,) is an upward vector of any length."""
     rows = np.concatenate([e.box[f] for e, f in zip(arm.episodes, arm.frames, strict=True) if e.box is not None])
     first, up = rows[:, 3:6], up / np.linalg.norm(up)
     axes = np.stack([first, np.cross(up, first), np.broadcast_to(up, first.shape)], axis=-1)
@@ -168,7 +168,7 @@ def _link(base: str, model: mujoco.MjModel, body: int) -> str:
 
 
 def _height(model: mujoco.MjModel) -> float:
-    """Return a height, m, above the base at which an arm's label does not hide the arm."""
+    """Return a height in m above the base at which a label does not hide the arm."""
     return 0.85 * float(np.linalg.norm(model.body_pos[1:], axis=1).sum())
 
 

@@ -40,7 +40,7 @@ class Episode:
 
     @property
     def distance(self) -> np.ndarray:
-        """Distance (T,) m from the end effector, or a pushed box, to the goal or the current point of the path."""
+        """Distance (T,) m of the end effector, or of a pushed box, from the goal or from the current path point."""
         return np.linalg.norm((self.ee if self.box is None else self.box[:, :3]) - self.goal, axis=-1)
 
     @property
@@ -86,7 +86,7 @@ class Content:
 
     @property
     def learning(self) -> list[Measure]:
-        """The task's measures for learning curves and comparisons, as far as `curves` has their columns."""
+        """The task's measures for learning curves and comparisons that are columns of a table in `curves`."""
         table = self.measures
         if table is None:
             return []
@@ -110,7 +110,7 @@ def first(e: "Episodes") -> list[Episode]:
 
 
 def saved_episodes(run: Path) -> dict[str, list[Episode]]:
-    """Return {simulator or arm: first episodes} from a run of stage=transfer; {} for a run of any other stage."""
+    """Return {simulator or arm: first episodes} of a run folder; {} if the run saved no episodes."""
     from r2s.tasks.rollout import Episodes
 
     out = {}

@@ -12,7 +12,7 @@ from r2s.reporting.viewer.data import Content, Episode
 from r2s.tasks.measures import Measure, MeasureTable
 
 PAUSE = 0.5  # s between two episodes
-SPACING = 0.95  # m between two arms: beyond a Panda's reach of 0.855 m
+SPACING = 0.95  # m between two arms, more than a Panda's reach of 0.855 m
 LEARNING = "learning"
 OVERLAY_OPENS = 15.0  # s, time range that a plot first shows; over a longer range, lines look like a solid band
 LINE = 1.6  # points, width of a line
@@ -24,7 +24,7 @@ def entity(*parts: str) -> str:
 
 
 def rgb(colour: str) -> np.ndarray:
-    """Return the values 0 to 255 (3,) of red, green and blue in "#rrggbb"."""
+    """Return red, green and blue (3,) of "#rrggbb", each from 0 to 255."""
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
 
 

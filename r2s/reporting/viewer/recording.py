@@ -23,7 +23,7 @@ from r2s.reporting.viewer.data import Content, Overlay
 from r2s.reporting.viewer.layout import LEARNING, blueprint, entity, log_series, starts_of
 from r2s.tasks.measures import Measure
 
-OVERLAY_HZ = 100.0  # rate at which torque overlays are drawn: ten times the cutoff of the torque's low-pass
+OVERLAY_HZ = 100.0  # Hz, rate at which torque overlays are drawn: ten times the cutoff of the torque's low-pass
 
 
 def write_recording(path: str | os.PathLike, robot: Robot, content: Content) -> Path:
@@ -58,7 +58,7 @@ def _limits(stream: rr.RecordingStream, torque: np.ndarray, seconds: float) -> N
 
 
 def _overlay(stream: rr.RecordingStream, label: str, overlay: Overlay) -> None:
-    """Log one torque plot per joint; numbered entity paths put the broad measured line below the predicted lines."""
+    """Log one torque plot per joint; numbered entity paths put the broad measured line behind the predicted lines."""
     clock, _ = without_pauses(overlay.t)
     rows = at_rate(clock, OVERLAY_HZ)
     index = [rr.TimeColumn("time", duration=clock[rows])]
