@@ -63,7 +63,7 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 
 
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
-    """Return the momentum residuals of a recording of commanded torque, from each trajectory's third span on."""
+    """Return the momentum residuals of a recording of commanded torque, without each trajectory's first two spans."""
     n, out = recording.n_joints, []
     q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # writable, as on an arm
     for stretch in recording.stretches:
@@ -104,7 +104,7 @@ def fit_noise(
 
 
 def _fit_to_residuals(noise: Noise, residuals: list[MomentumResidual]) -> Noise:
-    """Return the noise, fitted to residuals without a payload and scaled to the Kalman filter's innovations."""
+    """Fit `noise` to the residuals of a motion without a payload, then scale the noise, as `fit_noise` describes."""
     n = len(noise.level)
     white, momentum, model = noise.white.copy(), noise.momentum_share.copy(), noise.model.copy()
     for j in range(n):

@@ -5,14 +5,15 @@
     observer.force, observer.force_half, observer.in_contact
 
 The estimate is the force at the tip of `robot.tool`, or force and moment at the end effector of a robot without a
-tool (wrench_filter.py). A contact begins when the squared force, in units of the force's covariance, exceeds a
-threshold for 15 ms while a joint moves. The force test is a chi-square test of the hypothesis that no force acts. A
-second test, the impact test, detects sudden contacts (contact_detection.py). The force test and the impact test
-together aim at one false alarm per hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each
-cycle. For larger errors, `contact_thresholds` computes the thresholds from recordings without contact. The
-distribution of the largest squared force per half second has an exponential tail (extreme values of a chi-square
-variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, 3.3). `contact_thresholds`
-extrapolates this tail to one hour. Without recordings, the observer uses only the force test.
+tool (wrench_filter.py). With the estimated force f and its covariance C, the squared force is f^T C^-1 f. The force
+test compares the squared force with a threshold: a chi-square test of the hypothesis that no force acts. A second
+test, the impact test, detects sudden contacts (contact_detection.py). A contact begins when the squared force of a
+test exceeds the test's threshold for 15 ms while a joint moves. The two tests together aim at one false alarm per
+hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors,
+`contact_thresholds` computes the thresholds from recordings without contact. The distribution of the largest squared
+force per half second has an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and
+Mikosch, Modelling Extremal Events, 1997, 3.3). `contact_thresholds` extrapolates this tail to one hour. Without
+recordings, the observer uses only the force test.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,7 +48,7 @@ class WrenchObserver:
     """Observer that estimates the wrench on one arm, cycle by cycle.
 
     Attributes:
-        thresholds: (2,), thresholds of the force test and the impact test: squared forces in units of covariances.
+        thresholds: (2,), thresholds of force test and impact test for f^T C^-1 f, with force f and covariance C.
         tool: the robot's tool, or None if the robot has no tool.
 
     Args:
@@ -148,7 +149,7 @@ class WrenchObserver:
 
     @property
     def squares(self) -> np.ndarray:
-        """(2,), squared forces of the force test and the impact test, which the tests compare with `thresholds`."""
+        """(2,), f^T C^-1 f of force test and impact test, with force f and covariance C; see `thresholds`."""
         return self._state.contact[[SQUARE, IMPACT_SQUARE]]
 
     @property

@@ -171,10 +171,11 @@ class DriverBatch:
             command: (m, c), new commands for the control law; if None, the last commands still apply.
             added: (m, n) Nm, torque of the adapters in this cycle, clipped to ADDED * tau_max; None: no adapter. If
                 an arm's adapter torque is not finite, the driver ignores this torque and the arm's new command.
-            hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. A stop
-                still applies the last sum of `hold` and `added`, clipped to ADDED * tau_max.
-            contact: (m,), whether each arm is in contact; if None, no arm is in contact. In contact, a stop omits
-                `hold` and `added`.
+            hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. During a
+                stop, the driver still applies the last sum of `hold` and `added` before the stop. This sum is clipped
+                to ADDED * tau_max.
+            contact: (m,), whether each arm is in contact; if None, no arm is in contact. For an arm in contact, a
+                stop omits this sum.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)

@@ -14,7 +14,7 @@ from r2s.excitation.multisine import PERIOD_S, TORQUE_SHARE, gear_motion, multis
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-PAUSE_S = 1.0  # s, gap in the recorded time between two slides
+PAUSE_S = 1.0  # s, gap in the recorded time between two sliding motions
 
 
 def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
@@ -33,7 +33,7 @@ def check_gear_motions(robot: Robot, share: float = 1.0) -> None:
 def record_gear_motions(
     arm: Arm, *, progress: Callable[[int, int], None] | None = None, timing: Timing | None = None
 ) -> Recording:
-    """Run `gear_motion` with `multisine` for each joint; return one trajectory per slide at steady speed.
+    """Run `gear_motion` plus `multisine` torque for each joint; return each steady sliding motion as a trajectory.
 
     The rows have the format of `r2s.arm.recorder.record` with commanded torque.
 
@@ -42,8 +42,8 @@ def record_gear_motions(
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: as in `r2s.arm.recorder.record`; the exception's `recording` contains the slides of the completed
-            joints, if any.
+        ArmStopped: as in `r2s.arm.recorder.record`. The exception's `recording` contains the sliding motions of the
+            joints that were completed before the stop; None: no joint was completed.
         UserError: as in `r2s.arm.recorder.record`.
     """
     robot, share = arm.robot, speed_share(arm)
@@ -64,7 +64,7 @@ def record_gear_motions(
 
 
 def _recording(parts: list[tuple[np.ndarray, ...]], name: str) -> Recording:
-    """Join slides, each given as (q, dq, tau, t), into one recording."""
+    """Join sliding motions, each given as (q, dq, tau, t), into one recording, as one trajectory each."""
     q, dq, tau, t = (np.concatenate(x) for x in zip(*parts, strict=True))
     index = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     starts = np.repeat([part[3][0] for part in parts], [len(part[0]) for part in parts])

@@ -29,12 +29,12 @@ LOADED_DEVIATION = 0.5  # rad
 class TrackingController:
     """PD control with the nominal model's feedforward torque and an adaptive estimate of friction and offset.
 
-    At the reference speed dq_ref, each joint's friction and offset estimate is theta^T (1, tanh(dq_ref / 0.03),
-    dq_ref / dq_max). The vector theta contains offset, Coulomb friction and viscous friction. The controller adapts
-    theta during the motion, within limits, as in Slotine and Li (IJRR 6(3), 1987). Light wrist joints need the
-    estimate, because their small PD gains may not overcome friction. The PD gains are BANDWIDTH^2 M and 2 BANDWIDTH M
-    with the nominal mass matrix M. Gains proportional to M suit any arm; separate gains per joint would be unstable
-    if joint axes are nearly parallel.
+    For each joint, the vector theta contains offset, Coulomb friction and viscous friction. At the reference speed
+    dq_ref, the estimated torque is theta^T (1, tanh(dq_ref / 0.03), dq_ref / dq_max). The controller adapts theta
+    during the motion, within limits, as in Slotine and Li (IJRR 6(3), 1987). Light wrist joints need the estimate,
+    because their small PD gains may not overcome friction. The PD gains are BANDWIDTH^2 M and 2 BANDWIDTH M with the
+    nominal mass matrix M. Gains proportional to M suit any arm; separate gains per joint would be unstable if joint
+    axes are nearly parallel.
 
     Args:
         robot: the nominal model. excitation: the motion to track.
@@ -88,10 +88,11 @@ class TrackingController:
 
 
 class LoadedTrackingController(TrackingController):
-    """Tracking controller for an arm with an undeclared payload of up to half the mass that the arm can carry.
+    """Tracking controller for an arm with an undeclared payload of up to half of the arm's largest payload mass.
 
-    The gains assume half of the largest undeclared payload; with smaller gains, a strong joint would sag and swing
-    the wrist. The limits of deviation, offset and correction are larger than in `TrackingController`.
+    The gains are for a payload of a quarter of the largest payload mass. With the smaller gains of an arm without
+    payload, the payload's weight would make a strong joint sag, and this motion would swing the wrist. The limits of
+    deviation, offset and correction are larger than in `TrackingController`.
     """
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):

@@ -51,7 +51,14 @@ def blocks_of(
 
 
 def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Join `block` (T,) over repetitions `visit` (T,) with similar angles q (T, n) rad; return block numbers (T,)."""
+    """Join the rows of the same part of the period over all repetitions; return the block number (T,) of each row.
+
+    A part of one repetition is a separate block if a joint's mean angle deviates from the median by more than SAME.
+
+    Args:
+        block: (T,), part of the period to which each row belongs. visit: (T,), repetition of each row.
+        q: (T, n) rad, joint angles.
+    """
     own = _labels(block, visit)
     mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
     place = block[np.unique(own, return_index=True)[1]]
@@ -80,7 +87,7 @@ def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
 
 
 def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
-    """Return whether a joint's residual (T, n) repeats. at, visit: (T,) phase and repetition of each row."""
+    """Return whether the residual (T, n) of a joint repeats. at, visit: (T,), phase and repetition of each row."""
     cell = _labels(at, visit)
     count = np.bincount(cell)
     phase = at[np.unique(cell, return_index=True)[1]]

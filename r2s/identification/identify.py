@@ -97,7 +97,7 @@ class State:
         problem, u: the least-squares problem and its solution (P,) on the unit cube.
         edges: breakaway commands estimated from ramps. static_friction: residual of friction at the onset of
             sliding, only for friction families with a Stribeck effect.
-        refused: whether `fit` discarded the replay fit. dynamics: of the fitted arm, with breakaway torques.
+        refused: whether `fit` discarded the replay fit. dynamics: the fitted arm, with breakaway torques.
     """
 
     robot: Robot
@@ -232,10 +232,10 @@ def prune_terms(s: State) -> State:
 def draw_full_model(s: State) -> dict[str, np.ndarray]:
     """Return unit-cube draws (S, P) of the selected model's values, from a posterior with all terms and wide priors.
 
-    Intervals of a selected model are too narrow (Leeb and Poetscher, Econometric Theory 21(1), 2005): a kept value
-    compensates for a removed one, for example a payload for the error of a link's mass. The main fit's priors serve
-    prediction; priors narrower than the scatter among arms narrow the intervals further. For the result's intervals,
-    draws of the full and the selected model have equal weight (Hoeting et al., Stat. Sci. 14(4), 1999).
+    A selected model has too narrow intervals (Leeb and Poetscher, Econometric Theory 21(1), 2005). Its parameters
+    compensate for the removed parameters: for example, a payload compensates for the error of a link's mass. The main
+    fit's priors serve prediction; priors narrower than the scatter among arms narrow the intervals further. For the
+    result's intervals, draws of full and selected model have equal weight (Hoeting et al., Stat. Sci. 14(4), 1999).
     """
     full = formulate(replace(s, terms=s.unpruned or s.terms))
     u, problem = fit_torque(full.problem.with_usual_prior())

@@ -97,7 +97,7 @@ class PlannedWidths:
         self.information = self.information + self.of(t, q[None], dq[None], ddq[None])[0]
 
     def half(self, information: np.ndarray) -> np.ndarray:
-        """Return half the 95 % interval widths (..., P) on the unit cube for information (..., P, P) and prior."""
+        """Return half widths (..., P) of 95 % intervals on the unit cube from `information` (..., P, P) and prior."""
         covariance = np.linalg.inv(information + self._prior)
         return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
@@ -109,14 +109,14 @@ class PlannedWidths:
 
     @property
     def width(self) -> np.ndarray:
-        """(P,) expected widths of the 95 % intervals after all added motions, in SI units."""
+        """(P,) widths of the 95 % intervals, expected from all added motions, in SI units."""
         h = np.where(self._u > 0.5, -STEP, STEP)
         slope = (self.space.from_unit(self._u + h) - self.space.from_unit(self._u)) / h
         return 2 * self.half(self.information) * slope
 
     @property
     def share(self) -> np.ndarray:
-        """(P,) ratio of expected to prior interval width after all added motions, at most 1."""
+        """(P,) interval width expected from all added motions / interval width of the prior, at most 1."""
         return np.minimum(self.half(self.information) / (Z_95 * self._problem.prior_width), 1.0)
 
     @property

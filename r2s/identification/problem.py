@@ -19,7 +19,7 @@ UNIFORM = 12**-0.5  # standard deviation of a uniform distribution over its widt
 FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
 # r2s concludes that a minimum is wrong if another minimum lowers a joint's RMS error by more than this factor. In
 # trials with the 2- and 3-joint arms of benchmarks/scaling.py, with values drawn from the priors, this factor was 1.9
-# to 36 in wrong minima. On a physical Panda, where the fit from narrow priors predicts better, it is 1.0 to 1.2.
+# to 36 in wrong minima. On a physical Panda, the fit from narrow priors predicts better; the factor is 1.0 to 1.2.
 CLEARLY = 2.0
 TAIL = 25.0  # Student's t, the prior for link-side torque, has TAIL - 1 degrees of freedom
 # effect of implicit friction: least size in standard deviations; range of actual size / expected size
@@ -218,7 +218,7 @@ def fits_torque(search: Search) -> bool:
 
 
 def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
-    """Fit a torque problem in reweighted rounds; return the solution u (P,) and the problem with the last weights."""
+    """Fit a torque problem, starting at its nominal values; see `reweighted_fit` for the result."""
     rounds = MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
 
     def solve(own: Problem, u: np.ndarray) -> np.ndarray:
@@ -228,10 +228,12 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 
 
 def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
-    """Fit torque from `start` (P,) in reweighted rounds; return the last round's solution u (P,) and problem.
+    """Fit a torque problem `rounds` times; after the first fit, each fit takes weights from the previous solution.
+
+    The first fit starts at `start` (P,). Return the last solution u (P,), and the problem with the last weights.
 
     If true values are far outside of narrow priors, a fit to link-side torque has several minima. With the first
-    weights, which come from the nominal arm, a fit may keep cable torque near zero and distort friction. If `start`
+    weights, which come from the nominal arm, a fit may leave cable torque near zero and distort friction. If `start`
     is nominal, a second fit therefore begins with priors at least as wide as the scatter among arms and ends with the
     problem's priors. r2s uses the second fit if it is more likely than the first and clearly lowers the error of a
     joint. Both conditions are necessary: unmodeled effects may make the second fit more likely, but hardly lower its
@@ -248,7 +250,7 @@ def reweighted_fit(problem: Problem, start: np.ndarray, rounds: int, solve: Solv
 
 
 def _rounds(problem: Problem, u: np.ndarray, rounds: int, solve: Solve) -> tuple[np.ndarray, Problem]:
-    """Solve a problem from u (P,) in reweighted rounds; return the last round's solution and problem."""
+    """Fit `rounds` times as in `reweighted_fit`, first from u (P,); return the last solution and the last problem."""
     for k in range(rounds):
         u = solve(problem, u)
         if k < rounds - 1:
@@ -307,8 +309,8 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
 
     Where friction rises with speed, implicit integration uses the friction at the velocity half a step later; a
     physical arm does not. The effect of implicit friction must exceed `significant` standard deviations and have
-    about the expected size. The test of size is necessary, because a rotor inertia missing in the model has a similar
-    but a hundred times larger effect.
+    about the expected size. The test of size is necessary: a rotor inertia that the model lacks has a similar effect,
+    but a hundred times as large.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]

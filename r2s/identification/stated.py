@@ -19,7 +19,7 @@ TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to
 
 
 def check_stated(stated: Stated, n: int | None = None) -> None:
-    """Raise UserError for an unknown parameter or key, a wrong value, or a fixed value with a mean or width.
+    """Raise UserError for an unknown parameter or key, a wrong value, or a mean or width beside a fixed value.
 
     A value is a number, null or a list of n numbers or nulls. n: number of joints; if None, the lengths of lists are
     not checked.
@@ -41,7 +41,7 @@ def check_stated(stated: Stated, n: int | None = None) -> None:
 
 
 def check_family(stated: Stated, name: str) -> None:
-    """Raise UserError for a friction parameter that family `name` lacks; for auto, for any friction parameter."""
+    """Raise UserError if family `name` lacks a stated friction parameter; "auto" allows no friction parameter."""
     known = {own for f in known_families() for own in f.names}
     for parameter in stated:
         if parameter not in known or (name != "auto" and parameter in family(name).names):
@@ -75,7 +75,7 @@ def _values(entry: Mapping[str, Any], key: str, count: int) -> np.ndarray:
 
 
 def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
-    """Return the space with bounds so close to the user's fixed values that no search can change them."""
+    """Return the space with bounds so close to the user's fixed values that no search can change these values."""
     lower, upper, names = space.lower.copy(), space.upper.copy(), []
     for block, entry in stated.items():
         if block not in space.blocks:
@@ -100,7 +100,8 @@ def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, Arra
         space: the searched parameters. stated: see `check_stated`. prior: standard deviations, as in `Problem.of`.
 
     Raises:
-        UserError: a stated parameter is not in `space`, a mean is outside the bounds, or a mean has no width.
+        UserError: a stated parameter is not in `space`, a mean is outside the bounds, or neither the user nor `prior`
+            gives a width for a mean.
     """
     names, means, widths = [], [], []
     for block, entry in stated.items():

@@ -1,4 +1,4 @@
-"""Checkpoints of a training: the state in one file, and the transitions of the replay buffer in files called chunks.
+"""Checkpoints of a training run: state in one file, and transitions of the replay buffer in files called chunks.
 
 Each checkpoint writes one chunk: the transitions added since the previous checkpoint. The state file lists the chunks
 of the checkpoint and is replaced last, so an interrupted write does not damage the previous checkpoint. r2s deletes a
@@ -48,8 +48,8 @@ class Checkpoint:
     def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill the empty buffer `replay` with the saved transitions; return the state, or None without a checkpoint.
 
-        Each transition gets its previous row of the buffer, so a resumed training draws the same batches as an
-        uninterrupted training.
+        Each transition gets its previous row of the buffer, so a resumed training run draws the same batches as an
+        uninterrupted run.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.
@@ -72,7 +72,7 @@ class Checkpoint:
         return self.folder / f"replay_{end:012d}.pt"
 
     def clear(self) -> None:
-        """Remove the checkpoint of a finished training."""
+        """Remove the checkpoint of a finished training run."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 

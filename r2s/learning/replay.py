@@ -1,4 +1,4 @@
-"""The replay buffer: the last transitions of a training, on the learner's device."""
+"""The replay buffer: the last transitions of a training run, on the learner's device."""
 
 from collections.abc import Mapping
 

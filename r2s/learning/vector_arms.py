@@ -143,7 +143,10 @@ class VectorArms:
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:
-    """Raise FloatingPointError unless all `rows` (m, k) are finite; name the arm and its step from `steps` (m,)."""
+    """Raise FloatingPointError if a row of `rows` (m, k), one row per arm, is not finite.
+
+    The message contains the index of the arm and the step of its episode. steps: (m,), step of each arm's episode.
+    """
     finite = np.isfinite(rows)
     if not finite.all():
         arm = int((~finite.all(-1)).argmax())

@@ -1,7 +1,8 @@
 """Limit the force with which a tool's tip presses on a surface, and the tip's closing speed at contact.
 
-A push is a force along the surface's inward normal. Along the inward normal, the tip's Jacobian J, speed v and
-effective mass m = 1 / (J M^-1 J^T) (Khatib, IEEE Journal of Robotics and Automation 3(1), 1987) satisfy
+A push is a force along the surface's inward normal. With the arm's mass matrix M, and along the inward normal, the
+tip's Jacobian J, speed v and effective mass m = 1 / (J M^-1 J^T) (Khatib, IEEE Journal of Robotics and Automation
+3(1), 1987) satisfy
 
     m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
 
@@ -12,10 +13,11 @@ P is the push of the command, F >= 0 is the contact force, and P_f is the push o
 - Speed: dv/dt <= RATE (v_max - v). With an estimate R of F - P_f, the speed rule is P <= R + m RATE (v_max - v). The
   allowed speed v_max is `speed_near` / OVERSHOOT at the surface and grows with the tip's height.
 
-The estimate R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass filtered P - m dv/dt.
-In free motion, the estimate R is 0, so the speed rule bounds the tip speed by v_max. In contact at rest, the estimate
-R is P, so the speed rule allows the push P to rise. If the tip moves inward faster than v_max, or outward faster than
-`speed_near` / OVERSHOOT (in a stop: OVERSHOOT LEAVE), the push limit caps the estimate R at 0.
+The estimate R is P - m dv/dt after a low-pass: the momentum residual along the normal (De Luca et al., IROS 2006). In
+free motion, R is 0, so the speed rule bounds the tip speed by v_max. At rest in contact, dv/dt is 0, so R equals the
+push P. The speed rule is then P <= P + m RATE v_max, which allows P to rise. The push limit caps R at 0 if the tip
+moves inward faster than v_max. It also caps R at 0 if the tip moves outward faster than `speed_near` / OVERSHOOT, or,
+in a stop, faster than OVERSHOOT * LEAVE.
 
 On a frictionless surface of stiffness k, the contact force F is at most force_max + speed_near sqrt(k m). By the
 speed rule, the tip is not faster than speed_near when F reaches force_max. By the force rule, P + P_f <= force_max,

@@ -1,21 +1,22 @@
 """Simulate a box that a tool's tip pushes on a table, within the implicit contact step of contact.py.
 
 The limit surface of table friction is an ellipsoid (Goyal, Ruina and Papadopoulos, Wear 143, 1991; Lynch, Maekawa and
-Tanie, IROS 1992). A box with center velocity v and spin w has the generalized velocity u = (v, r w), and the table
-friction -mu N u / |u| under the normal force N. The model assumes uniform pressure on the base, so the ratio r of
-friction moment to friction force is the mean distance between the base's points and the base's center. On a box at
-rest, table friction is the elastic force -mu N z / `RIGID` with a deflection z. Backward Euler integrates dz/dt = u -
-|u| z / RIGID; while the box slides, z / RIGID equals u / |u|.
+Tanie, IROS 1992). The ratio r of friction moment to friction force is the mean distance between the base's points and
+the base's center, because the model assumes uniform pressure on the base. A box with center velocity v and spin w has
+the generalized velocity u = (v, r w). With friction coefficient mu and normal force N, a sliding box experiences the
+table friction -mu N u / |u|. At rest, u / |u| is undefined. The model therefore replaces u / |u| by z / RIGID, where
+z (4,) m is the elastic deflection between box and table. Backward Euler integrates dz/dt = u - |u| z / RIGID. While
+the box slides, z / RIGID equals u / |u|. While the box rests, -mu N z / RIGID is an elastic force.
 
 The box is not a body of the MuJoCo model, so simulations without a box stay unchanged. Training, twins and engines
 share one compiled law, which solves joint friction and box motion together. The box neither tilts nor lifts off
 (`check_size` in box.py). The tip does not touch the table; the tip's vertical force only changes the box's load.
 
-In a step, the contact force on the tip is F = F0 - K d, with a resistance K, N s/m. The vector d is the change of the
-tip's velocity relative to the box, and F0 is the contact force for d = 0. The box's velocity after the step is linear
-in F, with the mobility h W at the contact. Elimination of the box's velocity yields the contact force F = (1 + h K
-W)^-1 (F0 + K d_0 - K d_tip) for the joint equations. The vector d_tip is the change of the tip's velocity, and d_0 is
-the change of the box's velocity for F = 0.
+In a step of h s, the tip's velocity relative to the box changes by d. The contact force on the tip is F = F0 - K d,
+with a resistance K, N s/m, and the contact force F0 for d = 0. The tip's own velocity changes by d_tip. The box's
+velocity at the contact changes by d_0 - h W F, where h W is the box's mobility, and d_0 is the change for F = 0.
+Elimination of the box's velocity yields the contact force F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip) for the joint
+equations.
 """
 
 import numpy as np
@@ -61,7 +62,7 @@ def _cross(a, b, out):
 
 @njit(cache=True, error_model="numpy")
 def load_box(contact, x, y, z):
-    """Write the lever arm of a contact at (x, y, z) m, and the table friction limit under the last contact force."""
+    """Write the lever arm of a contact at (x, y, z) m, and the largest table friction for the last contact force."""
     a, b, c = contact[POINT], contact[POINT + 1], contact[POINT + 2]
     contact[ARM], contact[ARM + 1], contact[ARM + 2] = x - a, y - b, z - c
     down = 0.0
@@ -188,9 +189,9 @@ def _divide(a, vector, matrix):
 
 @njit(cache=True, error_model="numpy")
 def yielded(contact, tip, h, guess, point):
-    """Write the box's velocity at the contact to `point`; return table friction's relative error due to the guess.
+    """Write the box's velocity at the contact to `point`; return the relative error of the assumed table friction.
 
-    `point` and `tip`, (3,) m/s, are velocities after the step.
+    The guessed speed of the box causes this error. `point` and `tip`, (3,) m/s, are velocities after the step.
     """
     force, change = np.empty(3), np.empty(4)
     for i in range(3):

@@ -41,7 +41,10 @@ class Track:
 
 
 def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
-    """Return tracks of at least OVERLAP_S s: one per stretch if `each`, else one between restarts or long pauses."""
+    """Return tracks that last at least OVERLAP_S s.
+
+    If `each`, every stretch is a track. Otherwise, a new track begins only at a clock restart or after a long pause.
+    """
     cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
     tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
     return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
@@ -77,8 +80,8 @@ def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
 
-    A piece of `other` occurs in `training` if, in each joint, the RMS distance between the piece and a motion in
-    `training` is below the `_tolerance` of `other`.
+    The function cuts `other` into pieces, and compares each piece with all equally long parts of `training`. A piece
+    occurs in `training` if its RMS distance from one part is below `_tolerance(other)` in every joint.
     """
     tolerance, deviation = _tolerance(other), _deviation(other)
     pieces = [piece for track in other for piece in _pieces(track.q, PIECE_MOTION * deviation.max())]
@@ -99,10 +102,10 @@ def _deviation(tracks: Sequence[Track]) -> np.ndarray:
 
 
 def _tolerance(tracks: Sequence[Track]) -> np.ndarray:
-    """Return the RMS distance (n,) rad, per joint, below which two pieces of motion in `tracks` are treated as equal.
+    """Return the RMS distance (n,) rad of each joint below which two pieces of motion are treated as equal.
 
-    The distance is TRACKING, clipped to the range SIMILAR times s, where s is the joint's standard deviation, or
-    STILL times the largest standard deviation of all joints if this is larger.
+    With a joint's standard deviation d in `tracks` and the largest standard deviation D of all joints, let s be the
+    larger of d and STILL D. The joint's tolerance is TRACKING, clipped to the range SIMILAR[0] s to SIMILAR[1] s.
     """
     deviation = _deviation(tracks)
     return np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))

@@ -160,7 +160,11 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError unless the ramped joint's command changes mainly along `sign`, or all commands are constant."""
+    """Raise UserError if the commands of a ramp contradict its joint or sign.
+
+    Until breakaway, the ramped joint's command must change more along `sign` than against it. Constant commands of
+    all joints are also allowed, because a joint may move before its ramp begins.
+    """
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY

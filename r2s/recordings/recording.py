@@ -248,9 +248,9 @@ class Recording:
     def find_period(self) -> float | None:
         """Return the period (s) of the motion, or None if the motion does not repeat itself.
 
-        A repetition lasts at least 0.5 s. In a repetition, each joint's RMS difference is below a tolerance (about
-        0.03 rad), and at least one joint moves by about ten tolerances. `in_phase` also aligns repetitions after a
-        clock restart.
+        A repetition lasts at least 0.5 s. Each joint's RMS difference from the repeated motion is below a tolerance,
+        about 0.03 rad, and at least one joint moves by about ten tolerances. `in_phase` also aligns repetitions after
+        a clock restart.
         """
         return self._period_and_clock()[0]
 
@@ -289,8 +289,8 @@ class Recording:
 
         1. If the motion has a period (argument or attribute), validation is the end of each period: the rows whose
            phase (`t` modulo period) is largest. A chronological split would put repeated motion on both sides.
-        2. Otherwise, validation consists of the last trajectories, if they have between 0.5 f and max(2 f, 0.5) of
-           the rows, where f is `validation_fraction`.
+        2. Otherwise, validation is the last trajectories that have about the share f = `validation_fraction` of the
+           rows, if their exact share is between 0.5 f and max(2 f, 0.5).
         3. Otherwise, validation is the end of the recording.
 
         Except in case 2, training has no rows within 0.1 s of a validation row. Single-row trajectories are dropped.

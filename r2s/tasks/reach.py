@@ -22,7 +22,7 @@ FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds; small, so that this input
 OBSERVED = (  # terms of `observe`, for metadata
     f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
 )
-SPEED_NOISE = 0.05  # rad/s, largest speed noise in trainings for an identified arm; equals REST (rollout.py)
+SPEED_NOISE = 0.05  # rad/s, largest speed noise in training for an identified arm; equals REST (rollout.py)
 CLOSE_M = 1e-3  # m, the reward divides by the initial distance, or by CLOSE_M if larger
 MIDDLE = 0.05, 0.95  # default goal region: quantiles of the end effector's distance from the shoulder
 POSTURES = 500  # number of random postures from which r2s computes the quantiles MIDDLE
@@ -120,7 +120,7 @@ class ReachTask(BaseTask):
         return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the controller's torque limit; if it has none, the torque for an action of 1."""
+        """Return (n,) Nm, the controller's torque limit; without such a limit, the torque for an action of 1."""
         if self.controller is not None and self.controller.torque_limit is not None:
             return self.controller.torque_limit
         share = np.array(self.torque_fraction, dtype=float)
@@ -261,8 +261,8 @@ def observe(
 
     Terms: q; dq; ee; goal; error; effort / torque; tanh(error / 2 cm); J^T error; tanh(J^T error / 1.5 cm); tanh(dq /
     0.1 rad/s). J^T error shows which joints move the end effector toward the goal; a network without this term would
-    have to learn the Jacobian. The policy observes the effort because the torque can change from the effort by at
-    most 1 Nm per ms.
+    have to learn the Jacobian. Torque can change by at most 1 Nm per ms, so the next torques depend on the present
+    effort; the policy therefore observes the effort.
 
     Args:
         q, dq: (m, n) rad, rad/s, joint angles and speeds.

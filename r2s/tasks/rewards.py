@@ -60,7 +60,7 @@ PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms in eq. (2)
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
 PATIENCE = 50_000  # env steps in which the penalty factor grows e-fold while the filter rate is twice its limit
-MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2; at 4, ddpg and td3 learn not to move
+MAX_FACTOR = 2.5  # largest penalty factor; 34 runs of tqc stayed below 2.2; at 4, ddpg and td3 learn not to move
 
 
 class Reward:
@@ -88,7 +88,7 @@ class Reward:
         """Return the weights (k,) of the reward terms.
 
         Args:
-            task: task of the training. progress: used fraction of the budget. factor: last result of `adapt`.
+            task: task of the training run. progress: used fraction of the budget. factor: last result of `adapt`.
         """
         return task.paper_weights
 
@@ -99,10 +99,10 @@ class Reward:
 
 @dataclass(frozen=True)
 class Curriculum(Reward):
-    """A reward whose weights change during a training.
+    """A reward whose weights change during a training run.
 
     The paper's reward alone makes exploration difficult, because its acceleration terms reward early stopping. A
-    training with a curriculum starts with a small smoothness weight and a bonus for precision. The weights then
+    training run with a curriculum starts with a small smoothness weight and a bonus for precision. The weights then
     change linearly toward those of the paper. With reward=paper, the weights are constant: 1 for distance and
     smoothness, 0 for other terms.
 
@@ -110,11 +110,11 @@ class Curriculum(Reward):
         smoothness, precision, stillness, filter_penalty: (before, after), weights of the term before and after the
             linear change. anneal: fractions of the budget at which the weights start and stop changing.
         max_filter_rate: intended upper limit of the filter rate in training, including exploration; if None, no
-            limit. Once the weights have started to change, a filter rate above `max_filter_rate` raises the weight of
-            the filter penalty. A lower filter rate reduces the weight of the penalty, but not below the curriculum's
-            weight. With a fixed weight of the penalty, the filter rate is 1 to 6 %, depending on the seed
-            (benchmarks/results/minutes.md). The logarithm of the weight integrates the excess of the filter rate,
-            like a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
+            limit. A factor of 1 to MAX_FACTOR multiplies the curriculum's weight of the filter penalty. Once the
+            weights have started to change, the factor grows while the filter rate exceeds `max_filter_rate`, and
+            falls while the filter rate is lower. The factor's logarithm integrates the relative excess, filter rate /
+            `max_filter_rate` - 1, over env steps, like a Lagrange multiplier (Stooke, Achiam and Abbeel, ICML 2020).
+            With a constant factor, the filter rate is 1 to 6 %, depending on seed (benchmarks/results/minutes.md).
 
     Raises:
         UserError: a value is not a pair of numbers, or a number is outside its range.

@@ -48,15 +48,15 @@ class SurfaceTask(TipTask):
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
         force: (low, high) N, range of the requested forces. force_rate: N/s, rate of change of a requested force.
-        approach_speed: m/s, speed of the target against the nominal normal; at the first touch, the tip is at most as
-            fast.
+        approach_speed: m/s, speed of the target against the nominal normal; at the first touch, the tip is not
+            faster than `approach_speed`.
         clearance: m, gap between tip and nominal plane at the start. spread: m, largest distance of a touched point
             from `point`. place, tilt: m and degrees, largest shift and tilt of the true plane from the nominal plane.
         point, normal: point, m, and normal of the nominal plane in the base frame; if None, those of a work table
             below the tip in home posture.
         tool: tool file that the stages load if robot.tool is null.
         torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
-        pool: number of different goals in a training.
+        pool: number of different goals in a training run.
         stop: kind of stop in contact, a key of `r2s.physics.push_limit.STOPS`; if None, "release".
         model: model of the arm. own, parameters: default controller and its parameters. `with_model` sets model, own
             and parameters.
@@ -226,8 +226,9 @@ class SurfaceTask(TipTask):
     def depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, the depth of the tip center's target below the nominal plane at the times t (m,) s.
 
-        The depth grows at `approach_speed` until the tip touches even the lowest allowed surface, then at
-        `force_rate` / `spring` m/s.
+        First, the depth grows at `approach_speed` until the tip touches the lowest surface that `place` and `tilt`
+        allow; a tip on a higher surface touches earlier. Then, the depth grows at the speed `force_rate` / `spring`
+        (N/s divided by N/m), up to the depth for the largest requested force.
         """
         height, K = goals[:, HEIGHT], self.spring
         touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth at the first touch
@@ -238,7 +239,7 @@ class SurfaceTask(TipTask):
 
     @property
     def down_s(self) -> float:
-        """Time, s, after which the tip touches even the lowest allowed surface."""
+        """Time, s, at which the tip touches the lowest surface that `place` and `tilt` allow."""
         return (self.beyond + LAG_M + self.clearance) / self.approach_speed
 
     @property

@@ -34,7 +34,10 @@ class BoxModel:
         self._place, self._axes = ee_pose(robot)
 
     def pose(self, q: np.ndarray, tool: np.ndarray) -> np.ndarray:
-        """Return the base pose (4, 4) at q (n,) rad of the frame whose pose in the flange frame is `tool` (4, 4)."""
+        """Return the pose (4, 4) of a tool frame in the base frame at q (n,) rad.
+
+        tool: (4, 4), pose of the tool frame in the flange frame.
+        """
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         flange = np.eye(4)
@@ -43,10 +46,10 @@ class BoxModel:
         return flange @ tool
 
     def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the wrench (6,) N, Nm at the frame `tool`, in base axes, that best explains the torque (n,) Nm.
+        """Return the wrench F (6,) N, Nm in base axes that best explains the joint torque (n,) Nm.
 
-        The wrench F minimizes |J^T F - torque| with the frame's Jacobian J. Near a singularity the wrench is zero, as
-        in libfranka.
+        F acts at the origin of the tool frame (see `pose`). With the Jacobian J of this origin, F minimizes
+        |J^T F - torque|. Near a singularity, F is zero, as in libfranka.
         """
         place, j = self.pose(q, tool)[:3, 3], self._jacobian
         mujoco.mj_comPos(self._model, self._data)
@@ -62,6 +65,6 @@ class BoxModel:
         return self._data.qfrc_bias + self._load(q, self._carried(s), s["O_ddP_O"])
 
     def _carried(self, s: np.ndarray) -> np.ndarray:
-        """Return mass (kg) and first moment (kg m) of end effector plus load in the last link's frame, as (4,)."""
+        """Return (4,): mass, kg, and first moment (3,), kg m, of end effector plus load, in the last link's frame."""
         parts = ((s["m_ee"], s["F_x_Cee"]), (s["m_load"], s["F_x_Cload"]))
         return np.sum([np.append(m, m * (self._place + self._axes @ x)) for m, x in parts], axis=0)

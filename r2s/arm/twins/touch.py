@@ -119,7 +119,7 @@ class Touch:
 
 
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
-    """Draw a random surface near the nominal pose that the setting `surface` describes.
+    """Draw a random surface near a nominal pose; `surface` is a setting that describes the nominal pose.
 
     False means no surface. True means a work table below the tip in the home posture. {point: (3,) m, normal: (3,)}
     means a plane through the point. `box` means a box with edges `r2s.physics.box.SIZE` on a work table ahead of the
@@ -168,7 +168,7 @@ def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) 
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point (m) and the unit normal of the nominal plane that the setting `surface` describes."""
+    """Return point (3,) m and unit normal (3,) of the nominal plane in the setting `surface`."""
     if not isinstance(surface, Mapping):
         raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):

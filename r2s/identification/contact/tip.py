@@ -87,14 +87,14 @@ def _frames(links, q, frames, axes):
 def _contact(motion, settings, point, normal, law, tau, out):
     """Write joint torque into tau (F, n); write normal force, penetration depth and depth rate into out (3, F).
 
-    Friction is mu F z, with friction coefficient mu, normal force F and bristle deflection z (Dahl 1968 in two
-    dimensions). z follows dz = (dx - |dx| z) / bristle; x is the tip's deepest point, projected onto the surface.
-    Encoder noise lengthens the path |dx| of a resting tip, which would relax the bristles. A path shorter than `play`
-    therefore only bends bristles elastically.
+    The contact force on the tip is F g with g = n - mu z: normal force F, unit normal n, friction coefficient mu and
+    bristle deflection z (Dahl 1968 in two dimensions). z follows dz = (dx - |dx| z) / bristle; x is the tip's deepest
+    point, projected onto the surface. Encoder noise lengthens the path |dx| of a resting tip, which would relax the
+    bristles. A path shorter than `play` therefore only bends bristles elastically.
 
-    Gears and surface are springs in series: the gears' deflection reduces the measured depth by (J' g)' C (J' n) F,
-    with Jacobian J, normal n, compliances C and contact force F g = F (n - mu z). `bristle` includes the gears'
-    deflection along the surface.
+    Gears and surface are springs in series. With the deepest point's Jacobian J and the gears' compliances C, the
+    contact force turns the joints by C J^T g F. This deflection reduces the measured depth by n^T J C J^T g F.
+    `bristle` includes the gears' deflection along the surface.
     """
     centre, axes, origins, dq, starts = motion
     radius, step, play, compliance = settings

@@ -45,7 +45,7 @@ RIGID = 1e-8  # rad, creep length of a joint that does not creep
 DRIFT = 3e-4  # rad/s, prior sigma of a slow drift, because a resting joint may still settle
 SIDES = "negative", "positive"
 KAPPA_SIGMA = 0.1  # prior sigma of log kappa about the value of an identified arm
-WORSE = 1.01  # r2s uses the fit with `Slide` if its misfit / misfit without `Slide` is at most this
+WORSE = 1.01  # largest misfit with `Slide` / misfit without `Slide` for which r2s uses the fit with `Slide`
 BACK = 0.0, 0.03, 0.1  # initial values of U: last command minus these multiples of the ramp's rise
 DAMPING = np.log(10.0), 1.5  # prior mean and sigma of log lambda, which a short motion does not determine
 # initial values: creep length, rad; sliding time, relative to the sliding time of quadratic motion
@@ -200,7 +200,7 @@ def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarr
 def _fit_breakaway(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
     """Fit motion x (T,) rad to command u (T,) Nm; return breakaway command, Nm, and misfit, rad.
 
-    The breakaway command is NaN if it is close to u[0].
+    The returned command is NaN if the fitted breakaway command is close to the first command, u[0].
     """
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
@@ -285,7 +285,7 @@ def _parts(x: np.ndarray) -> tuple[int, slice]:
 
 @njit(cache=True)
 def _slides(t, u, U, kappa, z, damping, jump, fall):
-    """Return the positions (C, T) of `_slide` for parameters (C,) and a common `fall`."""
+    """Return the positions (C, T) of `_slide` for C values of each parameter (C,) and one value of `fall`."""
     out = np.empty((len(U), len(t)))
     for c in range(len(U)):
         out[c] = _slide(t, u, U[c], kappa[c], z[c], damping[c], jump[c], fall)
@@ -294,9 +294,10 @@ def _slides(t, u, U, kappa, z, damping, jump, fall):
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Integrate the module docstring's equation to positions x (T,) rad; if fall = 0, friction falls at once.
+    """Integrate the module docstring's equation; return the joint's positions x (T,) rad at t (T,) s.
 
-    The integration is implicit in velocity, and therefore stable even for creep lengths far below the encoder noise.
+    If `fall` is 0, friction falls at once at breakaway. The integration is implicit in velocity, and therefore stable
+    even for creep lengths far below the encoder noise.
     """
     x = np.zeros(len(t))
     v = 0.0

@@ -19,8 +19,9 @@ STEP = 1e-6  # finite-difference step, relative to the width of the bounds
 class BodySpace:
     """Coordinates z (10,) of a body in the end effector's frame: mass, center of mass, shape of the second moment.
 
-    The second moment about the center is mass gyration^2 V V^T, V = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]]
-    (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). Every z with positive mass is physically possible.
+    The second moment about the center is mass gyration^2 V V^T. The shape consists of the elements of the matrix V =
+    [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]] (log-Cholesky: Rucker and Wensing, IEEE RA-L 7(2), 2022). Every z
+    with positive mass is physically possible.
 
     Attributes:
         heaviest: kg, rated mass of the arm's payload. far: m, prior standard deviation of the center's coordinates.
@@ -49,7 +50,7 @@ class BodySpace:
         return -reach, reach + HEAVIEST * self.heaviest * np.eye(10)[0]
 
     def body(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mass (...) kg, center (..., 3) m, tensor about center (..., 3, 3) kg m^2 of bodies z (..., 10)."""
+        """Return mass (...) kg, center (..., 3) m and tensor about the center (..., 3, 3) kg m^2 for z (..., 10)."""
         v = np.zeros((*z.shape[:-1], 3, 3))
         for i in range(3):
             v[..., i, i] = np.exp(z[..., 4 + i])
@@ -58,12 +59,15 @@ class BodySpace:
         return z[..., 0], z[..., 1:4], np.trace(second, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - second
 
     def standard(self, z: np.ndarray) -> np.ndarray:
-        """Return standard parameters (..., 10) of bodies z about the end effector: mass, first moments, tensor."""
+        """Return standard parameters (..., 10) of bodies with coordinates z (..., 10): mass, first moments, tensor.
+
+        First moments and inertia tensor are about the origin of the end effector's frame.
+        """
         mass, centre, tensor = self.body(z)
         return LinkInertia(mass, centre, tensor).standard()
 
     def slope(self, z: np.ndarray) -> np.ndarray:
-        """Return the derivative (10, 10) of `standard` at the body z (10,)."""
+        """Return the derivative (10, 10) of `standard` with respect to the coordinates z (10,)."""
         h = STEP * np.diag(np.subtract(*self.bounds[::-1]))
         return ((self.standard(z + h) - self.standard(z - h)) / (2 * h.diagonal()[:, None])).T
 

@@ -46,9 +46,10 @@ class TorqueResidual:
     Args:
         space: the parameters to estimate. recording: a recording, or a planned motion, which needs no filter.
         cutoff_hz: cutoff of the zero-phase filter. rate_hz: residual rows per second.
-        presliding_rad: rad, distance over which bristles bend, a number or (n,).
-        slowest: rad/s; if positive, rows are means over windows in which the joint is faster than `slowest` and does
-            not reverse (modulating_functions.py), and the weights of rows include encoder noise.
+        presliding_rad: presliding distance in rad, a number or (n,).
+        slowest: rad/s. If positive, each row of a recording is a mean over a window in which the joint is faster than
+            `slowest` and does not reverse (modulating_functions.py). The weight of such a row accounts for encoder
+            noise. If `slowest` is 0, each row is a sample of the zero-phase filtered recording.
     """
 
     def __init__(
@@ -115,9 +116,10 @@ class TorqueResidual:
         return self._with(lead_s=lead_s)
 
     def with_presliding(self, recording: Recording, presliding_rad: np.ndarray) -> "TorqueResidual":
-        """Return a copy for bristles that bend over `presliding_rad` (n,) rad during the motion of `recording`.
+        """Return a copy with the presliding distances `presliding_rad` (n,) rad.
 
-        The copy has the weights of an unfitted residual, and shares motion and regressors to save memory.
+        The method computes the bristle deflections anew from `recording`, the recording of this residual. The copy
+        has the weights of an unfitted residual. It shares the other arrays with this residual to save memory.
         """
         of = partial(self._of, presliding_rad=presliding_rad)
         bristle = np.concatenate([of(piece).bristle for piece in _pieces(recording, of)])
@@ -240,10 +242,10 @@ class TorqueResidual:
     ) -> tuple[np.ndarray, list[tuple[str, np.ndarray, np.ndarray]]]:
         """Return the torque error (T, n) at x, and a list of (parameter block, indices in x, change).
 
-        A step of one block from x to `stepped` changes torque (T, n) or, for L link parameters, standard parameters
-        (n, 10 n, L). Link parameters need no further evaluation of torque, because torque is linear in standard
-        parameters. Other parameters of a joint, such as its friction, affect only this joint's torque, so one
-        evaluation steps all joints at once.
+        If one block steps from x to `stepped`, torque changes by `change` (T, n). For L link parameters, `change` is
+        instead the change of standard parameters (n, 10 n, L), times 1 + gain of each joint. Torque is linear in
+        standard parameters, so link parameters need no further evaluation of torque. Other parameters of a joint,
+        such as its friction, affect only this joint's torque, so one evaluation steps all joints at once.
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
@@ -293,7 +295,10 @@ class TorqueResidual:
         return self._with(_weights=self._weights_at(r, fitted), **own)
 
     def noise_at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return correlation length (n,), in rows, and RMS (n,) Nm of the error at x (P,) without encoder noise."""
+        """Return correlation length (n,), in rows, and RMS (n,) Nm of the error at x (P,).
+
+        The RMS does not contain the part of the error that encoder noise explains.
+        """
         factor, constant = self._weights_at(self._seen_errors(x), True)
         return factor**2, constant
 

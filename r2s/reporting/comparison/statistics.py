@@ -41,11 +41,13 @@ def interval(
 
 
 def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return bootstrap means (DRAWS, A) of A rows; a draw uses the same resampled arms and episodes for all rows.
+    """Return bootstrap means (DRAWS, A) for the A lines of a comparison table, such as A adapters.
+
+    A draw uses the same resampled arms and episodes for all lines.
 
     Args:
-        each: one array (E, A) per arm, with the values of E episodes in A rows of a comparison. rng: random
-            generator.
+        each: one array (E, A) per arm: the values in E episodes; column k is for line k of the table.
+        rng: random generator.
     """
     draws = []
     for _ in range(DRAWS):
