@@ -23,6 +23,7 @@ from omegaconf import OmegaConf
 
 from r2s.physics.robot import OF_TASKS, Robot, load_robot
 
+pytest.register_assert_rewrite("cli_runs", "made_bundles")  # what differs is said for their asserts too
 gc.set_threshold(100_000, 20, 20)  # collections of what torch and numba keep would cost a tenth of the suite
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"

@@ -17,7 +17,7 @@ from pathlib import Path
 NUMERIC = (
     *("physics", "regressor", "driver", "engines", "oracle", "twin", "breakaway", "identify", "tqc", "algorithms"),
     *("identify_torque", "env", "excitation", "contact_physics", "push_limit", "presliding"),
-    *("friction_families", "simulator", "losses", "cable_torque"),
+    *("breakaway_by_hand", "ramp_files", "friction_families", "simulator", "losses", "cable_torque"),
 )
 # What is no matter of rounding: a million cycles, what torch compiles for the processor that it finds, and mistakes
 LEFT_OUT = (

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from test_cli import one_line, r2s, succeed
+from cli_runs import one_line, r2s, succeed
 from test_comparison import write_run
 
 from r2s.reporting.comparison.adapter_comparison import compare_adapters, score, verdict

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from cli_runs import r2s, started, succeed
 from conftest import conf
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from test_cli import r2s, started, succeed
 from test_envs import calibration  # noqa: F401
 
 from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors

@@ -1,164 +1,29 @@
-"""The command line: the commands of docs/reference/commands.md at toy size, and a user's mistakes."""
+"""The commands of docs/reference/commands.md at toy size, their run folders, and a user's mistakes."""
+
+# ruff: noqa: F811 (the arguments are fixtures of cli_runs.py)
 
 import fcntl
 import json
-import multiprocessing
 import os
 import platform
 import re
-import runpy
 import shlex
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
-import traceback
-from functools import cache
 from importlib.util import find_spec
-from multiprocessing import forkserver
 from pathlib import Path
-from types import SimpleNamespace
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import REAL, ROOT, conf, in_blocks
+from cli_runs import SHORT, TOY, one_line, r2s, recording, root, started, succeed, trained  # noqa: F401 (fixtures)
+from conftest import ROOT, conf, in_blocks
 
-from r2s.arm.clients import fr3_limits
 from r2s.engines.gazebo import RELEASES
-from r2s.physics.robot import load_robot
-from r2s.stages import pipeline
-from r2s.stages.transfer import rest_warning
-from r2s.tasks.rewards import PAPER, TERMS, Curriculum
-
-TOY = ["+experiment=toy"]
-SHORT = [*TOY, "budget.env_steps=1600", "evaluation.env_steps=1600"]  # if the policy does not matter
-
-
-# Commands are forked off a server that has imported what they import anyway: seconds less for each of a hundred.
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(
-    [
-        "hydra",
-        "onnxscript",
-        "r2s.arm.policy_runner",
-        "r2s.engines.episodes",
-        "r2s.reporting.pages",
-        "r2s.learning.tqc",
-        "r2s.learning.train",
-        "torch.export",
-        "test_cli",
-        "warm",
-    ]
-)
-
-
-@cache
-def serve() -> None:
-    """Start the server, where it finds tests/warm.py: what it does not find it leaves out without a word."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
-        forkserver._forkserver.ensure_running()
-
-
-def front_door(words: tuple[str, ...], at: Path, out: str, err: str) -> None:
-    """Be `python run.py WORDS` in the folder `at`, with its output in files."""
-    for number, path in enumerate((out, err), 1):
-        os.dup2(os.open(path, os.O_WRONLY), number)
-    os.environ["COLUMNS"] = "110"
-    os.chdir(at)
-    sys.argv = ["run.py", *words]
-    pipeline.subprocess = SimpleNamespace(Popen=Step, PIPE=None, STDOUT=None)  # type: ignore[assignment]
-    try:
-        runpy.run_path(str(ROOT / "run.py"), run_name="__main__")
-        status = 0
-    except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else int(end.code is not None)
-    except BaseException:
-        traceback.print_exc()
-        status = 1
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)  # a process of multiprocessing would wait for the workers of a sweep
-
-
-def started(*words: str, at: Path, out: str = os.devnull, err: str = os.devnull) -> multiprocessing.Process:
-    """Start `python run.py WORDS` in the folder `at`."""
-    serve()
-    child = FORKS.Process(target=front_door, args=(words, at, out, err))
-    child.start()
-    return child
-
-
-class Step:
-    """A command that a chain starts, off the same server: as much of subprocess.Popen as the chain uses."""
-
-    def __init__(self, command: list[str], **_: object):
-        assert command[:2] == [sys.executable, str(ROOT / "run.py")]
-        forkserver._forkserver.ensure_running = lambda: None  # it runs: this process is of it
-        self.folder = tempfile.TemporaryDirectory()
-        pipe = str(Path(self.folder.name) / "pipe")
-        os.mkfifo(pipe)
-        self.child = started(*command[2:], at=Path.cwd(), out=pipe, err=pipe)
-        self.stdout = open(pipe)  # noqa: SIM115
-        self.poll, self.terminate = (lambda: self.child.exitcode), self.child.terminate
-
-    def wait(self) -> int | None:  # noqa: D102
-        self.child.join()
-        self.folder.cleanup()
-        self.returncode = self.child.exitcode
-        return self.returncode
-
-
-def r2s(*words: str, at: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run run.py as a user does, without a terminal."""
-    with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as err:
-        child = started(*words, at=at, out=out.name, err=err.name)
-        child.join()
-        return subprocess.CompletedProcess(words, child.exitcode or 0, out.read(), err.read())
-
-
-def succeed(*words: str, at: Path = ROOT) -> str:
-    done = r2s(*words, at=at)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "INFO" not in done.stdout + done.stderr, "a library logs"
-    return done.stdout
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("runs")
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Path:
-    """A recording of two seconds of a Panda with viscous friction, as CSV with q1..q7 columns and both torques."""
-    path = tmp_path_factory.mktemp("data") / "log.csv"
-    t = np.arange(2000) * 1e-3
-    swing = np.linspace(0.1, 0.2, 7)
-    q = np.outer(1 - np.cos(2 * t), swing) + np.array([0, -0.8, 0, -2.3, 0, 1.6, 0.8])
-    dq, ddq = np.outer(2 * np.sin(2 * t), swing), np.outer(4 * np.cos(2 * t), swing)
-    torques = []
-    for gravity in (True, False):
-        model = load_robot(**conf("robot/panda")).model(gravity=gravity)
-        data, tau = mujoco.MjData(model), 2 * dq
-        for k in range(len(t)):
-            data.qpos, data.qvel, data.qacc = q[k], dq[k], ddq[k]
-            mujoco.mj_inverse(model, data)
-            tau[k] += data.qfrc_inverse
-        torques.append(tau)
-    head = ",".join(["t", *(f"{name}{j}" for name in ("q", "dq", "tau_J", "tau_J_d") for j in range(1, 8))])
-    np.savetxt(path, np.column_stack([t, q, dq, *torques]), delimiter=",", header=head, comments="")
-    return path
-
-
-@pytest.fixture(scope="module")
-def trained(root) -> Path:
-    succeed("name=seed_run", f"root={root}", *TOY)
-    return root / "train" / "seed_run"
+from r2s.tasks.rewards import TERMS
 
 
 @pytest.fixture(scope="module")
@@ -194,56 +59,6 @@ def test_a_resumed_identification_ends_where_an_uninterrupted_one_does(stopped, 
     done = r2s(f"resume={stopped}")
     assert done.returncode == 2
     assert "is finished" in done.stderr
-
-
-@pytest.mark.long
-def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
-    """One bad value: one line, exit status 2, the other job done; a repeated sweep skips that one."""
-    sweep = ["-m", *SHORT, f"root={tmp_path}", "skip_completed=true", "name=lr${algo.lr}", "algo.lr=2.0,1e-3"]
-    done = r2s(*sweep)
-    assert done.returncode == 2
-    assert "error: algo.lr: expected a number in (0, 1], got 2.0\n" in done.stderr
-    assert done.stderr.endswith("error: 1 job of the sweep failed, see above; the others are done\n")
-    assert json.loads((tmp_path / "train" / "lr0.001" / "meta.json").read_text())["status"] == "done"
-    assert [p.name for p in (tmp_path / "train").iterdir()] == ["lr0.001"]
-    assert f"already finished: {tmp_path}/train/lr0.001" in r2s(*sweep).stdout
-
-
-@pytest.mark.long
-def test_a_command_that_a_job_of_a_sweep_runs_fails_by_itself(tmp_path):
-    """It ends with status 2 and is no failed job of the sweep, so that the job sees that its command failed."""
-    env = os.environ | {"R2S_FAILED": str(tmp_path / "failed.txt")}
-    command = [sys.executable, "run.py", "seed=-1", f"root={tmp_path}"]
-    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: seed: ")
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_the_grid_is_what_its_file_says(tmp_path):
-    """paper_grid, cut down to two jobs, runs them side by side in folders named by their settings."""
-    grid = ["-m", "+experiment=[paper_grid,toy]", f"root={tmp_path}", 'grid.algo="td3,tqc"', 'grid.lr="1e-3"']
-    succeed(*grid, *SHORT[1:], 'grid.batch_size="16"', 'grid.gamma="0.9"', 'grid.seed="3"')
-    names = sorted(p.name for p in (tmp_path / "train").iterdir())
-    assert names == [f"grid_{a}_lr0.001_batch16_gamma0.9_seed3" for a in ("td3", "tqc")]
-    config = yaml.safe_load((tmp_path / "train" / names[0] / "config.yaml").read_text())
-    assert (config["seed"], config["threads"], config["algo"]["policy_delay"]) == (3, 1, 2)
-    assert all((tmp_path / "train" / name / "policy.onnx").is_file() for name in names)
-
-
-@pytest.mark.long
-def test_the_papers_reward_ends_alone_and_without_noise(tmp_path):
-    """experiment=paper_reward ends in eq. (2) alone; noise has fallen 15-fold before, the learning rate threefold."""
-    succeed("+experiment=[paper_reward,toy]", f"root={tmp_path}", "name=eq2")
-    config = yaml.safe_load((tmp_path / "train" / "eq2" / "config.yaml").read_text())
-    reward = Curriculum(**{k: v for k, v in config["reward"].items() if k != "_target_"})
-    algo, (_, alone) = config["algo"], reward.anneal
-    assert alone < 1
-    assert np.array_equal(reward.weights(None, alone), PAPER)
-    assert algo["explore_end"] ** alone < 1 / 15
-    lr_share = 1 - (1 - algo["lr_end"]) * (alone - algo["lr_decay"]) / (1 - algo["lr_decay"])
-    assert lr_share < 1 / 3
 
 
 COMMANDS = [c.removeprefix("python run.py ") for c in in_blocks(ROOT / "docs" / "reference" / "commands.md")]
@@ -357,15 +172,6 @@ def test_exported_policy_is_the_trained_policy(trained):
     assert facts["q_min_rad"].split()[3] == "-3.0718"
 
 
-@pytest.mark.long
-def test_every_algorithm_trains(root):
-    """A sweep over those that the grid leaves out writes a run folder with a policy each."""
-    out = succeed("-m", "algo=ddpg,sac", f"root={root}", *SHORT)
-    folders = re.findall(r"written: (\S+)", out)
-    assert len(folders) == 2
-    assert all((Path(f) / "policy.onnx").is_file() for f in folders)
-
-
 @pytest.mark.slow  # test_checkpoint.py compares two trainings of one seed to the bit, one of them killed
 def test_same_seed_same_training(root, trained):
     """With a budget of environment steps, the seed decides every number."""
@@ -377,14 +183,6 @@ def test_same_seed_same_training(root, trained):
         return [row[:clock] + row[clock + 1 :] for row in table]
 
     assert rows(root / "train" / "again") == rows(trained)
-
-
-def one_line(done, pattern):
-    """Check that a command printed one line on stderr and ended with status 2."""
-    assert done.returncode == 2, done.stdout + done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
-    assert re.search(pattern, lines[0])
 
 
 @pytest.mark.long
@@ -417,20 +215,6 @@ def test_mistake_in_a_transfer_gets_one_line(mistake, trained, tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.slow
-def test_a_policy_for_an_fr3_meets_one(root):
-    """Trained with its limits, which are those of the emulator, and through its client without a stop."""
-    pytest.importorskip("pylibfranka")
-    succeed("robot=fr3", "name=fr3", f"root={root}", *TOY)
-    config = yaml.safe_load((root / "train" / "fr3" / "config.yaml").read_text())["robot"]
-    np.testing.assert_array_equal(config["q_min"], fr3_limits.Q_MIN)
-    np.testing.assert_array_equal(config["q_max"], fr3_limits.Q_MAX)
-    np.testing.assert_array_equal(config["dq_max"], fr3_limits.DQ_MAX)
-    words = ["arm=fr3_emulated", "simulator=none", "evaluation.episodes=1", "name=fr3", f"root={root}"]
-    succeed("stage=transfer", f"policy={root / 'train' / 'fr3'}", *words, *TOY)
-    assert (root / "transfer" / "fr3" / "stops.txt").read_text() == "none\n"
-
-
 @pytest.mark.long
 def test_a_training_transfers_without_the_identification_that_it_came_from(identified, tmp_path):
     """calibration= and dr=identified: with the identify folder gone, the same policy meets the same arms."""
@@ -447,21 +231,6 @@ def test_a_training_transfers_without_the_identification_that_it_came_from(ident
         shutil.rmtree(folder, ignore_errors=True)
     assert rows[0] == rows[1]
     assert set(rows[0]) == {"mujoco", "predicted", "twin"}
-
-
-@pytest.mark.slow
-def test_another_arm_needs_no_more_than_its_file(root):
-    """Six joints, their own limits, no published friction: the pipeline ends with its table."""
-    arm = Path(__file__).parent / "models" / "six_joints.xml"
-    words = ["robot=other", f"robot.mjcf={arm}", "pipeline.train_minutes=null", "name=six", f"root={root}", *TOY]
-    out = succeed("stage=pipeline", *words)
-    assert all(
-        f"{model} model, {where}" in out for model in ("identified", "nominal") for where in ("mujoco", "twin")
-    )
-    config = yaml.safe_load((root / "train" / "six_nominal" / "config.yaml").read_text())
-    assert config["friction"]["phi1"] == conf("friction/uniform")["phi1"]
-    parameters = yaml.safe_load((root / "identify" / "six" / "parameters.yaml").read_text())
-    assert parameters["joints"] == len(parameters["parameters"]["phi1"]["value"]) == 6
 
 
 @pytest.mark.long
@@ -499,75 +268,9 @@ def test_the_same_policy_in_dart(trained, root):
     assert rows["dart"]["return_paper"] == pytest.approx(rows["mujoco"]["return_paper"], abs=1.0)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("arm", "package"),
-    [
-        ("panda_emulated", "panda_py"),
-        pytest.param(
-            "fr3_emulated", "pylibfranka", marks=pytest.mark.slow
-        ),  # above: once, with a policy of its own, also slow
-    ],
-)
-def test_a_policy_through_the_client_that_drives_hardware(arm, package, tmp_path):
-    """The whole way, in lock-step against the emulator of the control box: no stop, and twice the same to the bit."""
-    pytest.importorskip(package)
-    root = tmp_path / "runs"
-    succeed("name=gentle", f"root={root}", "algo.demonstrations=0", *TOY)  # of demonstrations it would learn to move
-    gentle = root / "train" / "gentle"
-    saved = torch.load(gentle / "policy.pt", weights_only=True)
-    for name in ("actor.body.4.weight", "actor.body.4.bias"):  # a tenth: it would drift into the fence of the table
-        saved["state"][name] *= 0.1
-    torch.save(saved, gentle / "policy.pt")
-    runs = []
-    for k in range(2):
-        words = [f"arm={arm}", "simulator=none", "evaluation.episodes=1", f"name={arm}_{k}"]
-        succeed("stage=transfer", f"policy={gentle}", f"root={root}", *words, *TOY)
-        folder = root / "transfer" / f"{arm}_{k}"
-        assert (folder / "stops.txt").read_text() == "none\n"
-        with np.load(folder / f"episodes_{arm}.npz") as episodes:
-            runs.append({key: episodes[key] for key in episodes.files})
-    assert np.ptp(runs[0]["q"], axis=1).max() > 1e-3  # it moved
-    for key, values in runs[0].items():
-        np.testing.assert_array_equal(runs[1][key], values)
-
-
-def test_a_policy_that_rests_less_than_predicted_raises_a_warning():
-    """No warning without a prediction, or if the task has no such measure."""
-    rows = {"predicted": {"rest": 1.0}, "twin": {"rest": 0.49}}
-    assert "51 % of the episodes on arm=twin" in rest_warning(rows, "twin")
-    assert rest_warning(rows | {"twin": {"rest": 0.98}}, "twin") is None
-    assert rest_warning({"twin": {"rest": 0.49}}, "twin") is None
-    assert rest_warning({"predicted": {}, "twin": {}}, "twin") is None
-
-
-def test_a_pipeline_moves_a_physical_arm_with_one_command_at_a_time():
-    """Twins and emulated arms are as many as the transfers; a physical arm accepts one client."""
-    step = {"identified": ["stage=transfer"], "nominal": ["stage=transfer"]}
-    assert pipeline.at_once(step, moves=True) == [{label: words} for label, words in step.items()]
-    assert pipeline.at_once(step, moves=False) == [step]
-
-
 def test_help_does_not_import_torch():
     """--help answers without the heavy libraries."""
     code = "import sys, runpy; sys.argv = ['run.py', '--help']\ntry: runpy.run_path('run.py', run_name='__main__')\n"
     code += "except SystemExit: pass\nprint('LOADED', [m for m in ('torch', 'mujoco', 'rerun') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert "LOADED []" in done.stdout, done.stdout[-500:] + done.stderr
-
-
-@pytest.mark.slow  # test_identify.py has it without the command
-@pytest.mark.skipif(not REAL.is_file(), reason="the real Panda recording is not beside this checkout")
-def test_real_panda_is_predicted_better_than_by_the_published_model(tmp_path):
-    """The command on the real recording: held-out torque improves on average over the joints."""
-    succeed(
-        "stage=identify",
-        "data=recording",
-        f"data.path={REAL}",
-        "data.torque=measured",
-        "name=real",
-        f"root={tmp_path}",
-    )
-    validation = json.loads((tmp_path / "identify" / "real" / "summary.json").read_text())["validation"]
-    assert np.mean(validation["torque_rmse_Nm"]) < 0.75 * np.mean(validation["nominal_torque_rmse_Nm"])
-    assert np.all(np.array(validation["torque_rmse_Nm"]) <= 1.02 * np.array(validation["nominal_torque_rmse_Nm"]))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_cli import one_line, r2s, recording  # noqa: F401
+from cli_runs import one_line, r2s, recording  # noqa: F401
 
 from r2s.override_checks import check_overrides, quoted
 

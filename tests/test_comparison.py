@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from cli_runs import succeed
 from hydra import compose, initialize_config_dir
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from omegaconf import OmegaConf
-from test_cli import succeed
 
 from r2s.errors import UserError
 from r2s.reporting.comparison.grouping import LONGEST, group

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 import torch
+from cli_runs import r2s, succeed
 from conftest import conf
 from test_checkpoint import make_algo, make_env
-from test_cli import r2s, succeed
 from test_faults import composed
 from test_press import PANDA, TRUE
 from test_push import make_task as pushing

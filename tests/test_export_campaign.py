@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from conftest import ROOT, conf, unfenced
-from test_export import COMPILER, LAW_NM, LIBFRANKA, Exported, arm_of, drawn, loaded
+from made_bundles import COMPILER, LAW_NM, LIBFRANKA, Exported, arm_of, drawn, loaded
 
 from r2s import commands
 from r2s.arm.clients.fr3 import as_driven

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, unfenced
-from test_export import COMPILER, LAW_NM, LIBFRANKA, POLICY, Exported, arm_of, drawn, loaded
+from made_bundles import COMPILER, LAW_NM, LIBFRANKA, POLICY, Exported, arm_of, drawn, loaded
 from test_faults import composed
 
 from r2s import commands

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT, conf
-from test_export import ROUNDINGS, arm_of, bare, compare, drawn, hostile, loaded, runs_in  # noqa: F401
+from made_bundles import ROUNDINGS, arm_of, bare, compare, drawn, hostile, loaded, runs_in  # noqa: F401
 
 from r2s import commands
 from r2s.arm.policy_runner import PolicyRunner

@@ -12,7 +12,7 @@ import pytest
 import torch
 import yaml
 from conftest import conf
-from test_export import Exported, arm_of, drawn, loaded
+from made_bundles import Exported, arm_of, drawn, loaded
 
 from r2s import commands
 from r2s.arm.clients import fr3_limits

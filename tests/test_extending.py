@@ -7,8 +7,8 @@ import subprocess
 import sys
 
 import pytest
+from cli_runs import TOY, r2s, succeed
 from conftest import ROOT
-from test_cli import TOY, r2s, succeed
 
 PAGE = (ROOT / "docs" / "how_to" / "extending.md").read_text()
 EXAMPLES = {part.split("\n")[0]: part for part in re.split(r"^## ", PAGE, flags=re.M)[1:]}

@@ -1,8 +1,8 @@
-"""Mutated recordings, run folders and command lines never end in a traceback; a faulty arm always ends stopped.
+"""Mutated recordings and run folders never end in a traceback; see also test_fuzz_commands.py and test_fuzz_arm.py.
 
 A mutated input has two good outcomes. Either one line names the mistake (a UserError, exit status 2), or the input is
 accepted and describes a possible arm. The tests judge accepted inputs by limits of their own, not by r2s's checks.
-Examples are few, so that the suite stays fast; `R2S_FUZZ=20 pytest tests/test_fuzz.py` draws 20 times as many.
+Examples are few, so that the suite stays fast; `R2S_FUZZ=20 pytest tests/test_fuzz*.py` draws 20 times as many.
 """
 
 import contextlib
@@ -11,10 +11,6 @@ import json
 import math
 import os
 import shutil
-import sys
-from dataclasses import replace
-from importlib import import_module
-from unittest import mock
 
 import h5py
 import mujoco
@@ -30,20 +26,13 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from r2s import cli
-from r2s.arm.interface import ArmStopped, Reflexes
-from r2s.arm.policy_runner import PolicyRunner
-from r2s.arm.recorder import record
-from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
-from r2s.excitation.minimum_jerk import minimum_jerk
-from r2s.excitation.motion import Excitation
 from r2s.identification.parameter_file import load_parameters, load_posterior, save_parameters
 from r2s.identification.parameters import ParameterEstimate, parameter_space
 from r2s.learning.checkpoint import load_tensors
-from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import load_policy, make_policy, save_policy
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.robot import SIM_DT, load_robot
+from r2s.physics.robot import load_robot
 from r2s.reporting.comparison.trainings import read_trainings
 from r2s.runs import is_done, load_arrays, read_summary
 from r2s.stages import build
@@ -51,7 +40,6 @@ from r2s.stages.data import FileData
 from r2s.stages.recordings import read_groups
 from r2s.stages.transfer import trained_config
 from r2s.tasks.reach import ReachTask
-from r2s.tasks.rollout import rollout
 
 PANDA = load_robot(**conf("robot/panda"))
 PAPER = nominal_dynamics(PANDA, **conf("friction/paper"))
@@ -321,188 +309,3 @@ def test_a_mutated_run_folder_is_refused_or_physical(run_folder, data):
     else:
         path.write_bytes(damage(data.draw, path.read_bytes()))
     refusal(lambda: READ[path.name](path.parent))
-
-
-COMMANDS = (
-    ["+experiment=toy"],
-    ["algo=sac", "dr=none", "seed=3"],
-    ["stage=identify", "+experiment=toy"],
-    ["stage=identify", "data=simulated", "+experiment=toy"],
-    ["stage=compare", "runs='runs/train/*'"],
-    ["-m", "+experiment=toy", "seed=0,1"],
-    ["task=track", "+experiment=toy"],
-    ["stage=estimate", "+experiment=toy"],
-)
-NUMBERS = {  # [low, high], and whether the option is a whole number: written down again, independent of r2s's checks
-    "seed": (0, math.inf, True), "threads": (0, 4096, True), "budget.minutes": (1e-9, math.inf, False),
-    "budget.env_steps": (1e-9, math.inf, False), "algo.lr": (1e-30, 1, False), "algo.gamma": (0, 1, False),
-    "algo.tau": (1e-30, 1, False), "algo.batch_size": (1, 800_000, True), "algo.n_envs": (1, 100_000, True),
-    "algo.learning_starts": (0, math.inf, True),
-    "algo.demonstrations": (0, math.inf, True), "algo.replay_size": (32, 1e10, True),
-    "evaluation.episodes": (1, 1e6, True), "evaluation.env_steps": (1, math.inf, True),
-    "task.ctrl_hz": (1, 1000, True), "task.episode_s": (0.01, 1000, False), "task.preview": (1, 1e6, True),
-    "dr.phi_relative": (0, 1, False), "dr.inertia_relative": (0, 1, False), "friction.phi1": (0, 1e6, False),
-    "friction.dq_min": (0, 100, False), "inertia.scale": (1e-6, 1e6, False),
-    "robot.torque_fraction": (1e-6, 1, False), "identify.window_s": (1e-3, 1000, False),
-    "identify.stride": (1, 10_000, True), "identify.cutoff_hz": (1e-3, 500, False), "identify.folds": (2, 1000, True),
-    "identify.validation_fraction": (1e-9, 1 - 1e-9, False), "data.seconds": (0.1, 1e5, False),
-    "data.ramp_poses": (0, 1000, True),
-}  # fmt: skip
-VALUES = ["nan", "inf", "-inf", "-1", "0", "1e308", "1e400", "1e-320", "0.5", "1_000", "0x1F", "\uff13", "'", "''"]
-VALUES += ["word", "[]", "{}", "null", "true", "[1,2]", "[nan]", "{a: 1}", "${seed}", "${nowhere}", "${oc.env:HOME}"]
-NEVER_NUMBERS = ("word", "{}", "true", "''", "{a: 1}", "[nan]", "[]", "${oc.env:HOME}")
-TEXTS = ["..", "a/b", "''", "null", "[]", "{}", "-1", "true", "x" * 300, "'\t'", "∅"]
-PATHS = ["/", "/dev/null", "/dev/zero", ".", "'*'", "/proc/self/mem", "~", "'**'"]
-
-
-def outside(key: str, value: str) -> bool:
-    """Return whether `key` must refuse `value`; r2s alone judges lists, null and interpolations."""
-    low, high, integral = NUMBERS[key]
-    try:
-        number = float(value)
-    except ValueError:
-        return value in NEVER_NUMBERS
-    return not (math.isfinite(number) and low <= number <= high) or (integral and number != int(number))
-
-
-def mutate_command(draw) -> tuple[list[str], bool]:
-    """Return the words of a command with one mutation, and whether r2s must refuse it."""
-    words = list(draw(st.sampled_from(COMMANDS)))
-    kind = draw(st.sampled_from(["number", "number", "letter", "word", "text", "path"]))
-    if kind == "number":
-        key, value = draw(st.sampled_from(sorted(NUMBERS))), draw(st.sampled_from(VALUES))
-        return [*words, f"{key}={value}"], outside(key, value)
-    if kind == "letter":
-        k = draw(st.integers(0, len(words) - 1))
-        at = draw(st.integers(0, len(words[k]) - 1))
-        words[k] = words[k][:at] + draw(st.sampled_from("abcxyzäß=+~[]{}$,'\"\\ \t0:;")) + words[k][at + 1 :]
-    elif kind == "word":
-        words.append(draw(st.text(max_size=12, alphabet=st.characters(codec="utf-8", exclude_characters="\0"))))
-    else:
-        keys = ["name", "root", "calibration", "device", "matmul", "friction.family", "stage"]
-        keys = keys if kind == "text" else ["resume", "calibration", "runs", "robot.mjcf", "data.excitation"]
-        words.append(f"{draw(st.sampled_from(keys))}={draw(st.sampled_from(TEXTS if kind == 'text' else PATHS))}")
-    return words, False
-
-
-class Reached(BaseException):
-    """The command was accepted: it would open its run folder now."""
-
-    def __call__(self, *_, **__):
-        """Be opened."""
-        raise self
-
-
-@pytest.mark.long
-@examples(8)
-@given(data=st.data())
-def test_a_mutated_command_is_one_line_and_makes_no_folder(tmp_path_factory, data):
-    """Values out of range, replaced letters, foreign words and impossible paths: exit status 2, one `error:` line."""
-    folder = tmp_path_factory.mktemp("typed")
-    words, wrong = mutate_command(data.draw)
-    words += [] if any(w.startswith("root=") for w in words) else [f"root={folder / 'runs'}"]
-    out, reached, status = io.StringIO(), False, 0
-    with contextlib.ExitStack() as stack:
-        for name in ("compare", "estimate", "identify", "train"):
-            stack.enter_context(mock.patch.object(import_module(f"r2s.stages.{name}"), "open_run", Reached()))
-        stack.enter_context(mock.patch.dict(os.environ))
-        stack.enter_context(mock.patch.object(sys, "argv", ["run.py", *words]))
-        stack.enter_context(mock.patch.object(sys, "path", list(sys.path)))
-        stack.enter_context(contextlib.chdir(folder))
-        stack.enter_context(contextlib.redirect_stdout(out))
-        stack.enter_context(contextlib.redirect_stderr(out))
-        try:
-            cli.main()
-        except Reached:
-            reached = True
-        except SystemExit as end:
-            status = end.code
-    text = out.getvalue()
-    errors = [line for line in text.splitlines() if line.startswith("error: ")]
-    assert "Traceback" not in text
-    if status:
-        assert status == 2, text
-        assert len(errors) == 1 or ("-m" in words and errors), text  # one line per job of a sweep
-    assert not (wrong and reached), f"{' '.join(words)} was accepted"
-    assert not list(folder.rglob("meta.json"))
-
-
-class FaultyArm(SimulatedArm):
-    """A simulated Panda that fails in given cycles, {cycle: fault}, and records the commands of its motion."""
-
-    def __init__(self, faults):
-        self.faults, self.commands, self.stopped = {}, [], True
-        super().__init__(PANDA, replace(PAPER, delay=4e-3, lag=1e-3), position_noise=2e-5, velocity_noise=3e-3)
-        self.faults = faults
-
-    def move_to(self, q):
-        """Begin a motion."""
-        self.stopped, self.commands, self.last = False, [], None
-        return super().move_to(q)
-
-    def read(self):
-        """Return the state, wrong if a sensor fails in this cycle."""
-        state = super().read()
-        fault = self.faults.get(self._cycle)
-        if fault == "frozen" and self.last is not None:
-            return self.last
-        change = {"nan q": {"q": np.full(7, np.nan)}, "inf dq": {"dq": np.full(7, np.inf)}}
-        change |= {"jump q": {"q": state.q + 1.0}, "jump dq": {"dq": state.dq + 5.0}}
-        self.last = replace(state, **change.get(fault, {}))
-        return self.last
-
-    def command(self, tau):
-        """Take a command, or end the motion by a reflex of its own."""
-        assert not self.stopped, "a command after the stop"
-        self.commands.append(np.array(tau))
-        if self.faults.get(self._cycle) == "reflex":
-            raise ArmStopped("a reflex of the arm")
-        super().command(tau)
-
-    def stop(self):
-        """End the motion."""
-        self.stopped = True
-        super().stop()
-
-
-FAULTS = st.dictionaries(
-    st.integers(0, 380), st.sampled_from(["nan q", "inf dq", "jump q", "jump dq", "frozen", "reflex"]), max_size=3
-)
-
-
-@pytest.mark.long
-@examples(6)
-@given(faults=FAULTS, spoil_from=st.integers(0, 20), acts=st.booleans())
-def test_a_faulty_arm_ends_stopped_and_within_its_torque_limits(faults, spoil_from, acts):
-    """Failing sensors, reflexes and a policy that returns NaN: every command is finite and within range and rate."""
-    arm = FaultyArm(faults)
-    t = SIM_DT * np.arange(401)
-    end = PANDA.q_home + 0.05 * np.array([1.0, 0.3, 0.2, 0.3, 0.2, 0.3, 0.4])
-    with contextlib.suppress(ArmStopped, UserError):  # a UserError names readings that are not finite
-        record(arm, Excitation(t, *minimum_jerk(PANDA.q_home, end, 0.4, t[:, None])))
-    check_ended(arm)
-
-    task, steps = replace(TASK, episode_s=0.4), iter(range(1000))
-    policy = make_policy(PANDA, task, (8,))
-
-    class Spoilt:
-        """The policy until step `spoil_from`, then NaN."""
-
-        def __getattr__(self, name):
-            return getattr(policy, name)
-
-        def action(self, *args):
-            action = policy.action(*args)
-            return action if acts or next(steps) < spoil_from else torch.full_like(action, math.nan)
-
-    runner = PolicyRunner(arm, task, PAPER.level)
-    rollout(Spoilt(), runner, task, *fixed_episodes(PANDA, task, 1))
-    check_ended(arm)
-
-
-def check_ended(arm: FaultyArm) -> None:
-    """Fail unless the arm is stopped and would have taken each command after the one before."""
-    assert arm.stopped
-    commands = np.array([np.zeros(7), *arm.commands])
-    assert np.isfinite(commands).all()
-    assert Reflexes(PANDA).accepts(commands[1:], commands[:-1]).all()

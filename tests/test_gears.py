@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cli_runs import r2s
 from conftest import ROOT, conf
-from test_cli import r2s
 
 from r2s.arm.gear_motions import check_gear_motions, record_gear_motions
 from r2s.arm.interface import ArmStopped

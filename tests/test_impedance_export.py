@@ -4,7 +4,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from test_export import COMPILER, LAW_NM, LIBFRANKA, ROUNDINGS, compare, drawn, hostile, loaded
+from made_bundles import COMPILER, LAW_NM, LIBFRANKA, ROUNDINGS, compare, drawn, hostile, loaded
 from test_impedance import FRICTIONLESS, PANDA, REACH, N, Pose
 from test_impedance_feedforward import bristle_model, random_model
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from cli_runs import TOY, recording, succeed  # noqa: F401 (a fixture)
 from conftest import ROOT, in_blocks
-from test_cli import TOY, recording, succeed  # noqa: F401 (a fixture)
 from test_extending import EXAMPLES
 
 DOCS = ROOT / "docs"
@@ -33,9 +33,9 @@ ELSEWHERE = {  # what this file does not type, and why
     r"sudo |export R2S_GAZEBO_ROOT=": "packages of the system, as root; the shell",
     r"python run.py .*simulator=gazebo_classic": "needs Gazebo Classic: test_gazebo_classic.py",
     r"python run.py resume=": "test_cli.py kills a run first",
-    r"python run.py -m \+experiment=paper_grid": "144 jobs; test_cli.py runs two of them",
+    r"python run.py -m \+experiment=paper_grid": "144 jobs; test_cli_sweeps.py runs two of them",
     r"python run.py \+experiment=tune": "test_tune.py",
-    r"python run.py \+experiment=paper_reward": "test_cli.py, at toy size",
+    r"python run.py \+experiment=paper_reward": "test_cli_sweeps.py, at toy size",
     r"python run.py .*data\.path=(logs/|\[a\.csv)": "recordings that a reader has: test_known.py",
     r"python run.py .*identify\.prior\.": "a recording of three joints: test_known.py",
     r"python run.py .*(UNLOADED|LOADED)": "an arm with and without a payload: test_loaded.py",

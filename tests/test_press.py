@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from cli_runs import r2s, succeed
 from conftest import conf
-from test_cli import r2s, succeed
 from test_trust import composed
 
 from r2s.control.torque import torque

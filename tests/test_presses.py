@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from cli_runs import TOY, r2s, succeed
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
-from test_cli import TOY, r2s, succeed
 from test_press import DR_CONF, PANDA, TRUE
 
 from r2s.arm.interface import ArmState, ArmStopped

@@ -1,117 +1,42 @@
-"""Logs and robot files with the faults of public reports: each gives the right result, or one line that names it.
+"""Logs with the faults of public reports: each gives the right result, or one line that names it.
 
 Each row names the report, on GitHub, that describes the fault; the data here are made.
 """
 
-import io
+# ruff: noqa: F811 (the arguments are fixtures of made_logs.py)
+
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 from conftest import conf
+from made_logs import (  # noqa: F401 (ur is a fixture)
+    ALPHABET,
+    JOINTS,
+    UR,
+    columns,
+    decimal_comma,
+    held,
+    moved,
+    rostopic,
+    rows,
+    savetxt,
+    swapped,
+    text,
+    ur,
+    with_row,
+)
+from test_public_reports_urdf import URDF
 
 from r2s.errors import UserError
 from r2s.identification.checks import check_recording
-from r2s.physics.description import write_urdf
-from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.rigid_body import mujoco_inverse_dynamics
 from r2s.physics.robot import load_robot
 from r2s.recordings.readers import read
-from r2s.recordings.recording import Recording
-
-UR = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
-JOINTS = [f"{name}_joint" for name in UR]
-ALPHABET = np.argsort(JOINTS)
-FRICTIONLESS = {"phi1": 0.0, "phi2": 10.0, "phi3": 0.0}
-
-
-@pytest.fixture(scope="module")
-def ur():
-    return load_robot(**conf("robot/ur10e"))
-
-
-def moved(robot, torque="measured", gravity=None, rate=250.0, seconds=6.0):
-    """Return a recording of sines about home: inverse dynamics, Coulomb and viscous friction, offsets, noise."""
-    t, n, rng = np.arange(0, seconds, 1 / rate), robot.n, np.random.default_rng(0)
-    w, a = np.array([1.2, 1.3, 1.0, 1.6, 1.7, 1.4, 1.9])[:n], np.array([0.5, 0.4, 0.5, 0.4, 0.5, 0.5, 0.6])[:n]
-    phase = np.outer(t, w) + np.arange(n)
-    q, dq, ddq = robot.q_home + a * np.sin(phase), a * w * np.cos(phase), -a * w**2 * np.sin(phase)
-    model = robot.model(gravity=torque != "commanded")
-    if gravity is not None:
-        model.opt.gravity[:] = gravity
-    tau = mujoco_inverse_dynamics(model, q, dq, ddq)
-    tau += 0.02 * robot.tau_max * (np.tanh(dq / 0.02) + 0.3 * dq + 0.3)
-    q, dq, tau = (x + s * rng.standard_normal(x.shape) for x, s in ((q, 1e-5), (dq, 3e-3), (tau, 0.05)))
-    return Recording(t, q, dq, tau, torque)
 
 
 @pytest.fixture(scope="module")
 def recording(ur):
     return moved(ur)
-
-
-def columns(r, names=None, order=range(6), form="{field}{joint}"):
-    """Return the columns of a log by name."""
-    named = names or [str(j + 1) for j in range(6)]
-    out = {"t": r.t}
-    for field in ("q", "dq", "tau"):
-        for j, name in zip(order, [named[k] for k in order] if names else named, strict=True):
-            out[form.format(field=field, joint=name)] = getattr(r, field)[:, j]
-    return out
-
-
-def text(table, **how):
-    """Return a table as CSV."""
-    out = io.StringIO()
-    pd.DataFrame(table).to_csv(out, index=False, **{"float_format": "%.9g", **how})
-    return out.getvalue()
-
-
-def with_row(r, row, **values):
-    """Return the columns of a log with other values in one row."""
-    changed = {}
-    for field, value in values.items():
-        changed[field] = getattr(r, field).copy()
-        changed[field][row] = value
-    return columns(replace(r, **changed))
-
-
-def rows(table, index):
-    return {k: v[index] for k, v in table.items()}
-
-
-def swapped(count, at):
-    index = np.arange(count)
-    index[[at, at + 1]] = at + 1, at
-    return index
-
-
-def rostopic(r, order, period=4):
-    """Return `rostopic echo -p` of a JointState topic."""
-    stamp = 1_700_000_000_000_000_000 + np.round(1e9 * r.t).astype(np.int64)
-    out = {"%time": stamp + 1000, "field.header.seq": np.arange(len(r.t)), "field.header.stamp": stamp}
-    out |= {f"field.name{k}": np.full(len(r.t), JOINTS[j]) for k, j in enumerate(order)}
-    for field, name in (("q", "position"), ("dq", "velocity"), ("tau", "effort")):
-        out |= {f"field.{name}{k}": getattr(r, field)[:, j] for k, j in enumerate(order)}
-    return text(out, float_format="%.12g")
-
-
-def held(r, every):
-    """Return the columns of a log in which values are repeated `every` rows."""
-    at = (np.arange(len(r.t)) // every) * every
-    return columns(replace(r, **{k: getattr(r, k)[at] for k in ("q", "dq", "tau")}))
-
-
-def decimal_comma(r):
-    lines = text(columns(r), sep=";").replace(".", ",").splitlines()
-    return "\n".join([lines[0], *lines[1:]])
-
-
-def savetxt(r, **how):
-    out, table = io.StringIO(), columns(r)
-    np.savetxt(out, np.column_stack(list(table.values())), fmt="%.9g", **how)
-    return out.getvalue()
 
 
 SENSIBLE = 1e-6  # of values that were written with 9 digits
@@ -396,57 +321,6 @@ def test_a_repair_is_noted(tmp_path, recording):
     assert "q of joint 1 jumps by a turn" in turns
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("source", "gravity", "said"),
-    [
-        ("frankarobotics/libfranka#118", [9.81, 0, 0], "is mounted on a wall: set robot.gravity=[9.81, 0, 0]"),
-        ("Kinovarobotics/kinova-ros#413", [0, 9.81, 0], "is mounted on a wall: set robot.gravity=[0, 9.81, 0]"),
-        ("roboticslibrary/rl#64", [0, 0, 9.81], "hangs: set robot.gravity=[0, 0, 9.81]"),
-        ("frankarobotics/franka_ros#338", [0, 6.94, -6.94], "is mounted at an angle: set robot.gravity=["),
-    ],
-)
-def test_a_mounting_is_found_from_the_torque(ur, source, gravity, said):
-    """The direction of gravity is fitted; no joint is said to have the other sign."""
-    with pytest.raises(UserError, match="fits ur10e only if it ") as caught:
-        check_recording(ur, moved(ur, gravity=gravity))
-    assert said in str(caught.value)
-    check_recording(replace(ur, gravity=np.array(gravity)), moved(ur, gravity=gravity))
-
-
-@pytest.mark.parametrize("torque", ["measured", "commanded", "motor"])
-def test_alphabetical_order_is_seen_in_each_kind_of_torque(ur, torque):
-    """Also without gravity; the right order passes."""
-    r = moved(ur, torque)
-    check_recording(ur, r)
-    with pytest.raises(UserError, match=r"columns 3 2 1 4 5 6 \(the log has them in alphabetical order\)"):
-        check_recording(ur, replace(r, **{k: getattr(r, k)[:, ALPHABET] for k in ("q", "dq", "tau")}))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("torque", ["measured", "commanded", "motor"])
-def test_an_arm_that_is_only_wrongly_modelled_passes(ur, seed, torque):
-    """Masses of 0.6 to 1.7 times, shifted centres, friction, offsets, rotors and sensor gains are no mistake."""
-    rng, t, n = np.random.default_rng(seed), np.arange(0, 4.0 + 2 * seed, 4e-3), ur.n
-    w, a = rng.uniform(0.4, 2.5, n), rng.uniform(0.1, 0.7, n)
-    phase = np.outer(t, w) + rng.uniform(0, 6, n)
-    q, dq, ddq = ur.q_home + a * np.sin(phase), a * w * np.cos(phase), -a * w**2 * np.sin(phase)
-    model = ur.model(gravity=torque != "commanded")
-    links, scale = model.jnt_bodyid, rng.uniform(0.6, 1.7, n)
-    model.body_mass[links] *= scale
-    model.body_inertia[links] *= (scale * rng.uniform(0.4, 2.5, n))[:, None]
-    model.body_ipos[links] += rng.normal(0, 0.02, (n, 3))
-    tau = mujoco_inverse_dynamics(model, q, dq, ddq)
-    tau += ur.tau_max * (rng.uniform(0.003, 0.08, n) * (np.tanh(dq / 0.02) + dq) + rng.normal(0, 0.02, n))
-    if torque == "motor":
-        tau += 0.01 * ur.tau_max * ddq
-    if torque != "commanded":
-        tau *= rng.uniform(0.7, 1.1, n)
-    tau += 0.003 * ur.tau_max * rng.standard_normal(tau.shape)
-    check_recording(ur, Recording(t, q, dq, tau, torque))
-
-
 def test_a_names_array_gives_the_order(tmp_path, ur, recording):
     """In .npz the joints' names stand beside (T, n) arrays; data.joints then chooses."""
     r, path = recording, tmp_path / "log.npz"
@@ -457,108 +331,6 @@ def test_a_names_array_gives_the_order(tmp_path, ur, recording):
     np.savez(path, t=r.t, **arrays)
     with pytest.raises(UserError, match=r"data\.joints: expected null, as the file names no joints"):
         read(path, torque="measured", joints=JOINTS)
-
-
-URDF = {  # name: (report, change of the text of a URDF, arguments, words of the error, or None: nothing changes)
-    "no torque": ("dexsuite/dex-urdf#29", ('effort="150.0"', 'effort="0"'), {}, "robot.tau_max: no torque limit of"),
-    "one torque for all": (
-        "ros-industrial/universal_robot#32",
-        ("", ""),
-        {"tau_max": [10.0] * 6},
-        "joint 2 would need",
-    ),
-    "42.9 kg for 7.2": (
-        "JAKARobotics/jaka_ros2#15",
-        ("MASS2", "77.6"),
-        {},
-        "has 77.6 kg, all other links together have",
-    ),
-    "46 kg of a first link": (
-        "lbr-stack/lbr_fri_ros2_stack#18",
-        ("MASS1", "46.0"),
-        {},
-        "has 46 kg, all other links together have 20.9 kg",
-    ),
-    "a placeholder": ("Genesis-Embodied-AI/genesis-world#3185", ("MASS3", "0.001"), {}, "a placeholder?"),
-    "moments of 1": ("turtlebot/turtlebot_arm#20", ("MOMENT", "100.0"), {}, "as if it were longer than the arm"),
-    "no mass": ("userguide-galaxea/URDF#5", ("MASS3", "0.0"), {}, "expected an <inertial> with a mass"),
-    "no body has such moments": (
-        "Gepetto/example-robot-data#130",
-        ("MOMENT", "0.2"),
-        {},
-        "none above the sum of the others",
-    ),
-    "decimal commas": ("ros/urdfdom#98", ('xyz="0.0 0.0 ', 'xyz="0,0 0,0 '), {}, "expected 3 numbers in xyz"),
-    "limits of 0 to 0": (
-        "gkjohnson/urdf-loaders#9",
-        ("LIMIT", 'lower="0" upper="0"'),
-        {},
-        "to 0 to 0 rad: set robot.q",
-    ),
-    "limits in degrees": ("dfki-ric/phobos#37", ("LIMIT", 'lower="-90" upper="90"'), {}, "are they in degrees?"),
-    "soft limits of 0": (
-        "ros-industrial/motoman#29",
-        ("<axis", '<safety_controller soft_lower_limit="0" soft_upper_limit="0" k_velocity="0"/><axis'),
-        {},
-        None,
-    ),
-    "a space before a number": ("openrr/urdf-rs#105", ('effort="', 'effort=" '), {}, None),
-    "nine moments": ("fetchrobotics/fetch_ros#14", ("<inertia ", '<inertia iyx="1" '), {}, None),
-    "a velocity of -1": ("osrf/drcsim#287", ("VELOCITY", 'velocity="-1"'), {}, None),
-    "a mimic joint": (
-        "google-deepmind/mujoco#3527",
-        ("<axis", '<mimic joint="elbow_joint"/><axis'),
-        {},
-        "robot.lock={",
-    ),
-}
-
-
-@pytest.fixture(scope="module")
-def urdf(ur, tmp_path_factory):
-    """Return the text of a UR10e's URDF."""
-    path = tmp_path_factory.mktemp("urdf") / "arm.urdf"
-    write_urdf(path, ur, nominal_dynamics(ur, **FRICTIONLESS))
-    return path.read_text()
-
-
-def marked(urdf, old, new, ur):
-    """Replace a part of a URDF; some are marked by what they are."""
-    if old.startswith("MASS"):
-        old = f'<mass value="{float(ur.mass[int(old[4:]) - 1])!r}"'
-        new = f'<mass value="{new}"'
-    elif old == "MOMENT":
-        old, new = f'ixx="{float(ur.inertia[2, 0, 0])!r}"', f'ixx="{new}"'
-        if float(new[5:-1]) > 50:
-            tensor = [float(ur.inertia[2, i, i]) for i in (1, 2)]
-            old += f' iyy="{tensor[0]!r}" izz="{tensor[1]!r}"'
-            new += ' iyy="100" izz="100"'
-    elif old == "LIMIT":
-        old = f'lower="{float(ur.q_min[2])!r}" upper="{float(ur.q_max[2])!r}"'
-    elif old == "VELOCITY":
-        old = f'velocity="{float(ur.dq_max[0])!r}"'
-    assert old in urdf
-    return urdf.replace(old, new)
-
-
-@pytest.mark.parametrize("name", URDF)
-def test_a_urdf_of_a_public_report(tmp_path, ur, urdf, name):
-    _, (old, new), arguments, expected = URDF[name]
-    path = tmp_path / "arm.urdf"
-    path.write_text(marked(urdf, old, new, ur))
-    how = {"q_home": ur.q_home.tolist(), **arguments}
-    if expected is not None:
-        with pytest.raises(UserError) as caught:
-            load_robot(str(path), **how)
-        assert expected in str(caught.value)
-        assert "\n" not in str(caught.value)
-        return
-    rng = np.random.default_rng(0)
-    at = rng.uniform(*ur.q_range, (20, 6)), *rng.normal(size=(2, 20, 6))
-    ours, theirs = (
-        mujoco_inverse_dynamics(robot.model(gravity=True), *at) for robot in (load_robot(str(path), **how), ur)
-    )
-    np.testing.assert_allclose(ours, theirs, atol=1e-9 * np.abs(theirs).max())
 
 
 def test_there_are_forty_reports():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import test_box
 import torch
+from cli_runs import r2s, succeed
 from conftest import conf
-from test_cli import r2s, succeed
 from test_press import BARE, PANDA, TRUE, N, resting
 
 from r2s.arm.twins.make_twin import make_twin

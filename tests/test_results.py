@@ -6,8 +6,8 @@ import subprocess
 
 import pytest
 import yaml
+from cli_runs import r2s, succeed
 from conftest import ROOT
-from test_cli import r2s, succeed
 
 from r2s.reporting.page_comparison import MISSING, compare_all, compare_pages, table_cells, without_rows
 

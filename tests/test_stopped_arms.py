@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from test_cli import TOY, r2s, root, trained  # noqa: F401 (fixtures)
+from cli_runs import TOY, r2s, root, trained  # noqa: F401 (fixtures)
 
 STOPPING = """
 from r2s.arm.interface import ArmStopped, NotCleared

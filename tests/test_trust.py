@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 from conftest import ROOT
+from made_bundles import drawn
 from omegaconf import OmegaConf
-from test_export import drawn
 
 from r2s import cli, commands
 from r2s.errors import UserError
