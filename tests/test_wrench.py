@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import conf
+from scipy.signal import lfilter
 
 from r2s.adaptation import tuning
 from r2s.adaptation.adapters import AdapterContext, observer, rls
@@ -17,6 +18,7 @@ from r2s.adaptation.wrench import (
     WrenchObserver,
     contact_thresholds,
     contacts,
+    normal_threshold,
     observe_recording,
 )
 from r2s.adaptation.wrench_fusion import TRUSTED, FusedWrench, fuse, surface_law
@@ -120,6 +122,18 @@ def test_free_motion_is_no_contact():
     """Motion that the thresholds were not calibrated on: no false alarm."""
     _, _, touches = run(calibrated(), free(3))
     assert not touches.any()
+
+
+@pytest.mark.parametrize("cycles", [0, 5, 30, 120])
+def test_normal_errors_cause_few_false_alarms(cycles):
+    """Any correlation time: at most the alarms that the threshold is made for, here one in a second."""
+    seconds, share = 300, np.exp(-1.0 / cycles) if cycles else 0.0
+    noise = np.random.default_rng(0).normal(size=(3, round(seconds / SIM_DT)))
+    force = lfilter([np.sqrt(1.0 - share**2)], [1.0, -share], noise)  # of unit covariance
+    above = pd.Series((force**2).sum(0) > normal_threshold(3600.0))
+    confirmed = above.rolling(tuning.CONFIRMED).min().fillna(0.0)
+    alarms = (confirmed.diff() > 0).sum()
+    assert seconds / 10 * (cycles == 120) <= alarms <= seconds  # slow errors come within a decade of the bound
 
 
 def test_an_arm_without_friction_has_a_finite_force():

@@ -131,7 +131,7 @@ ALARMS_PER_HOUR = 1.0
 # m, path of the tip after which a force that points down is a payload's weight
 # largest ratio of horizontal to downward force; factor on the path to subtract while the force does not point down
 WEIGHT_PATH, WEIGHT_SHARE, WEIGHT_LOSS = 0.05, 0.3, 5.0
-UNCALIBRATED = 2.0  # without recordings: contact threshold / GAUSSIAN (wrench.py)
+UNCALIBRATED = 2.4  # without recordings: contact threshold / GAUSSIAN (wrench.py)
 
 # wrench with a surface (wrench_fusion.py)
 DIFFERENCE_RATE, TEST_RATE, DEPTH_RATE = 50.0, 10.0, 100.0  # 1/s, low-passes: force difference, its test, depth rate

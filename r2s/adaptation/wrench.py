@@ -9,7 +9,7 @@ tool (wrench_filter.py). With the estimated force f and its covariance C, the sq
 test compares the squared force with a threshold: a chi-square test of the hypothesis that no force acts. A second
 test, the impact test, detects sudden contacts (contact_detection.py). A contact begins when the squared force of a
 test exceeds the test's threshold for 15 ms while a joint moves. The two tests together aim at one false alarm per
-hour. The smallest threshold, GAUSSIAN, assumes independent normal errors in each cycle. For larger errors,
+hour. The smallest threshold, GAUSSIAN, is for normal errors (`normal_threshold`). For larger errors,
 `contact_thresholds` computes the thresholds from recordings without contact. The distribution of the largest squared
 force per half second has an exponential tail (extreme values of a chi-square variable: Embrechts, Klueppelberg and
 Mikosch, Modelling Extremal Events, 1997, 3.3). `contact_thresholds` extrapolates this tail to one hour. Without
@@ -39,7 +39,19 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 ALARMS_PER_TEST = tuning.ALARMS_PER_HOUR / 2  # per hour
-GAUSSIAN = float(chi2.isf(ALARMS_PER_TEST * SIM_DT / 3600.0, 3))  # threshold for independent normal errors
+
+
+def normal_threshold(alarms_per_hour: float) -> float:
+    """Return the threshold of a contact test with at most this many false alarms, if the errors are normal.
+
+    The squared force then is a chi-square variable with three degrees of freedom. A contact needs CONFIRMED
+    successive cycles above the threshold, and these cycles include one whose index is a multiple of CONFIRMED. The
+    bound therefore sums only over these cycles (Boole's inequality). It holds for any correlation in time.
+    """
+    return float(chi2.isf(alarms_per_hour * tuning.CONFIRMED * SIM_DT / 3600.0, 3))
+
+
+GAUSSIAN = normal_threshold(ALARMS_PER_TEST)
 SQUARES = ["square", "impact_square"]  # columns with the squared forces of the two contact tests
 BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows per block; least number of blocks for a threshold
 
