@@ -88,6 +88,9 @@ def test_a_policy_that_rests_less_than_predicted_raises_a_warning():
     assert "51 % of the episodes on arm=twin" in rest_warning(rows, "twin")
     assert rest_warning(rows | {"twin": {"rest": 0.98}}, "twin") is None
     assert rest_warning({"twin": {"rest": 0.49}}, "twin") is None
+    stopped = {"rest": 0.75, "stops": 1, "episodes": 4}  # only a stop, no moving joint
+    assert rest_warning(rows | {"twin": stopped}, "twin") is None
+    assert "25 % of" in rest_warning(rows | {"twin": stopped | {"rest": 0.5}}, "twin")
     assert rest_warning({"predicted": {}, "twin": {}}, "twin") is None
 
 

@@ -65,7 +65,7 @@ class WrenchObserver:
 
     Args:
         robot, dynamics: the identified arm. thresholds: see the attribute; if None, the threshold of the force test
-            is 2 GAUSSIAN, and the observer has no impact test.
+            is UNCALIBRATED * GAUSSIAN, and the observer has no impact test.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):

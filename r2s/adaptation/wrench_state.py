@@ -24,7 +24,7 @@ SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, U
 # TORQUE, KNOWN: known torque without motor and friction, mean known torque with both, Nm.
 # MOTOR, MOTOR_MEAN: motor torque now, mean motor torque in the coming cycle, Nm.
 # MOMENTUM_NOISE: variance of the measured momentum, (Nm s)^2. SLOW_P: low-passed momentum, Nm s.
-# FAST_P: low-passed momentum minus SLOW_P, Nm s. SHAKE: mean square of the momentum's high-frequency part.
+# FAST_P: low-passed difference momentum - SLOW_P, Nm s. SHAKE: mean square of the momentum's high-frequency part.
 ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
 MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)
 

@@ -249,7 +249,7 @@ class Recording:
         """Return the period (s) of the motion, or None if the motion does not repeat itself.
 
         A repetition lasts at least 0.5 s. Each joint's RMS difference from the repeated motion is below a tolerance,
-        about 0.03 rad, and at least one joint moves by about ten tolerances. `in_phase` also aligns repetitions after
+        about 0.03 rad, and a joint moves by about ten tolerances or more. `in_phase` also aligns repetitions after
         a clock restart.
         """
         return self._period_and_clock()[0]

@@ -231,7 +231,7 @@ class SurfaceTask(TipTask):
         (N/s divided by N/m), up to the depth for the largest requested force.
         """
         height, K = goals[:, HEIGHT], self.spring
-        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth at the first touch
+        touched = self.beyond + LAG_M - (height - self.clearance)  # m, depth at the lowest allowed surface
         slow, late = self.approach_speed * t - height, (t - self.down_s).clip(0.0)
         return np.minimum(
             slow.clip(None, touched) + self.force_rate / K * late, touched + goals[:, FORCES].max(1) / K
