@@ -26,7 +26,7 @@ from r2s.physics.robot import SIM_DT
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of payload, friction and offsets at one time, with half widths (`_half`) of the 95 % intervals."""
+    """Estimate of payload, friction and offsets at the time t; fields `_half` are half widths of 95 % intervals."""
 
     cycle: int  # cycles since the start
     t: float  # s since the start, pauses included

@@ -139,7 +139,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether the driver has a `push_limit`; a stop then holds the contact force, or moves the tip outward."""
+        """Whether the driver has a `push_limit`. If so, a stop holds the contact force or moves the tip outward."""
         return bool(len(self._push))
 
     @property
@@ -174,8 +174,8 @@ class DriverBatch:
             hold: (m, n) Nm, part of the target torque that compensates an undeclared payload; None: zero. During a
                 stop, the driver still applies the last sum of `hold` and `added` before the stop. This sum is clipped
                 to ADDED * tau_max.
-            contact: (m,), whether each arm is in contact; if None, no arm is in contact. For an arm in contact, a
-                stop omits this sum.
+            contact: (m,), whether each arm is in contact; if None, no arm is in contact. An arm in
+                contact stops without this sum.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)

@@ -111,9 +111,10 @@ def joined(parts: list[Excitation]) -> Excitation:
 
 
 def trajectory_yaml(motion: Excitation, joints: list[str], rate_hz: float) -> str:
-    """Return YAML of a motion as trajectory_msgs/msg/JointTrajectory (ROS 2): samples at `rate_hz`, and the last row.
+    """Return a motion as YAML of trajectory_msgs/msg/JointTrajectory (ROS 2), sampled at `rate_hz`.
 
-    ROS 2 controllers interpolate by quintic polynomials between points with position, velocity and acceleration.
+    The last point is the motion's last row. ROS 2 controllers interpolate by quintic polynomials between points
+    with position, velocity and acceleration.
     """
     rows = np.union1d(np.arange(0, len(motion.t), max(1, round(1 / (rate_hz * SIM_DT)))), [len(motion.t) - 1])
     lines = ["header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}", f"joint_names: [{', '.join(joints)}]", "points:"]

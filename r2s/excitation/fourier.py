@@ -87,7 +87,7 @@ def fourier(
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
 
     Raises:
-        UserError: an argument is out of range, or no random series is safe.
+        UserError: an argument is out of range, or no randomly drawn Fourier series is safe.
     """
     if not LEAST_S <= duration <= LONGEST_S:
         raise UserError(f"excitation.duration: expected {LEAST_S:g} to {LONGEST_S:g} s, got {duration:g}")
@@ -138,7 +138,7 @@ class Candidates:
         """Return the best motion of `effort` tries; call `report` with the completed fraction of the tries.
 
         Raises:
-            UserError: no random series is safe.
+            UserError: no randomly drawn Fourier series is safe.
         """
         best = self.draw(rng, KEPT if effort else 1)
         motion = self.finish(*self.search(rng, best, effort, report)) if best else None

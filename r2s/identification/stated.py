@@ -19,7 +19,7 @@ TINY = 1e-9  # half-width of a fixed value's bounds, relative to the value or to
 
 
 def check_stated(stated: Stated, n: int | None = None) -> None:
-    """Raise UserError for an unknown parameter or key, a wrong value, or a mean or width beside a fixed value.
+    """Raise UserError for an unknown parameter or key, a wrong value, or a mean or width of a fixed parameter.
 
     A value is a number, null or a list of n numbers or nulls. n: number of joints; if None, the lengths of lists are
     not checked.

@@ -1,8 +1,8 @@
 """Evaluation in simulation: 200 episodes without exploration noise, the same for every policy.
 
-A seed determines goals, start postures and dynamics of the episodes. Episodes of the seed SELECTION select the best
-policy of a training run. Episodes of the seed REPORT yield the reported results and select no policy. REPORT was used
-to choose settings of conf/algo and conf/reward, so benchmarks/minutes.py uses a third seed.
+A seed determines goals, start postures and dynamics of the episodes. Episodes with the seed SELECTION serve to
+select the best policy of a training run. Episodes with the seed REPORT serve to report results, never to select a
+policy. Settings of conf/algo and conf/reward were chosen with REPORT, so benchmarks/minutes.py uses a third seed.
 """
 
 from collections.abc import Callable

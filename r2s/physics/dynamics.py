@@ -150,8 +150,8 @@ def nominal_dynamics(
     """Return the dynamics that `conf/friction` and `conf/inertia` describe; a scalar value applies to all joints.
 
     phi1, phi2 and phi3 are the parameters of the sigmoid law. If phi1 is None, frictionloss and damping in the
-    robot's file define Coulomb and viscous friction. For a joint without frictionloss and damping, phi1 is then PHI1
-    times tau_max. family="auto" selects the sigmoid law or, if the friction comes from the file, the Coulomb law. Any
+    robot's file define Coulomb and viscous friction. If a joint has neither in the file, its phi1 is the
+    constant PHI1 times tau_max. family="auto" selects the Coulomb law if the file has friction, else the sigmoid. Any
     other family receives parameters with the same friction at 1 rad/s. If a breakaway torque is None, its magnitude
     is the file's frictionloss.
 

@@ -93,7 +93,7 @@ for _k in reversed(range(len(BUILT_IN))):
 
 @njit(inline="always")
 def _weight(mass, hx, hy, hz, anchor, axis, gravity):
-    """Return the gravity torque, Nm, about a joint, axis^T ((h - mass anchor) x gravity); h: kg m, first moment."""
+    """Return a joint's gravity torque, Nm: axis^T ((h - mass * anchor) x gravity). The first moment h is in kg m."""
     x, y, z = hx - mass * anchor[0], hy - mass * anchor[1], hz - mass * anchor[2]
     level = gravity[0] * (axis[1] * z - axis[2] * y) + gravity[1] * (axis[2] * x - axis[0] * z)
     return level + gravity[2] * (axis[0] * y - axis[1] * x)

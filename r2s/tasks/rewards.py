@@ -138,7 +138,7 @@ class Curriculum(Reward):
             check_number("reward.max_filter_rate", self.max_filter_rate, "(0, 1]")
 
     def terms(self, task: Any) -> tuple[str, ...]:
-        """Return the names TERMS; raise UserError if the task's reward terms have different names."""
+        """Return TERMS; raise UserError if these are not the names of the task's reward terms."""
         if task.reward_terms != TERMS:
             raise UserError(
                 f"reward: a curriculum weights {', '.join(TERMS)}; {type(task).__name__} has "

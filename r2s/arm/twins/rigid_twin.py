@@ -1,4 +1,4 @@
-"""The rigid variant of the hidden twin: it replaces a real arm and has effects that a rigid-body simulator lacks.
+"""The rigid variant of the hidden twin: a simulated arm that replaces a real one, with friction, offsets and latency.
 
 The twin runs in DART, not in the training engine. It has LuGre friction (bristles, Stribeck effect, load and
 direction dependence, breakaway), torque offsets, delay and lag, cable drag, sensor noise and quantization. Masses,

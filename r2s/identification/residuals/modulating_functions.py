@@ -40,7 +40,7 @@ class SlidingMotion:
     Attributes:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2, motion. bristle: (F, n), presliding state.
         means: for each piece of the recording, n sparse matrices (moments, instants) with the window weights of each
-            joint. A moment without a window has an empty matrix row.
+            joint. If no window covers a moment, its matrix row is zero.
         seen: (T, n) bool, whether the moment has a window; in a window, the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of a window's mean acceleration for white encoder noise of 1 rad.
         encoder: (n,) rad, standard deviation of the encoder noise.

@@ -187,8 +187,8 @@ class TorqueResidual:
     def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
         """Return the unfiltered friction torque in Nm at a slice of the F instants.
 
-        A simulator with implicit integration evaluates friction at the velocity `lead_s` s earlier or, if friction
-        rises with speed, `lead_s` s later.
+        A simulator with implicit integration evaluates friction at the velocity of another instant: `lead_s` later
+        if friction rises with speed, else `lead_s` earlier.
         """
         dq, sign = self.motion.friction_dq[rows], self._sign(d.family.has_memory, rows)
         if not self.lead_s:
