@@ -78,6 +78,25 @@ def test_a_model_without_stribeck_effect_finds_no_force_in_slow_motion():
     assert rms["stribeck", False] < 0.9 * rms["stribeck", True]  # by hand: 0.27 and 0.33 N
 
 
+@pytest.mark.parametrize("joint", [1, 3])
+def test_slow_motion_determines_the_sign_of_friction(joint):
+    """A joint moves to and fro at 5 mrad/s (1.7 times the noise of its speed); all other joints rest.
+
+    Just after the reversal, the sign of friction is uncertain. Later, at the same speed, the friction's standard
+    deviation is less than half as large.
+    """
+    observer = WrenchObserver(ROBOT, replace(truth(), breakaway=np.column_stack([-BAND, BAND])))
+    rng, turn, zero = np.random.default_rng(0), 600, np.zeros(7)
+    q, dq, tau, error = ROBOT.q_home.copy(), zero.copy(), zero.copy(), []
+    for k in range(2 * turn):
+        dq[joint] = 5e-3 if k < turn else -5e-3
+        q[joint] += dq[joint] * SIM_DT
+        tau[joint] = BAND[joint] * np.sign(dq[joint])
+        observer(q + 1e-2 * NOISE * rng.standard_normal(7), dq + NOISE * rng.standard_normal(7), tau)
+        error.append(np.sqrt(observer._state.P[3 + joint, 3 + joint]))
+    assert np.mean(error[turn + 100 :]) < 0.5 * np.max(error[turn : turn + 60])
+
+
 def test_only_a_breakaway_torque_beyond_the_model_is_an_excess():
     """Load-dependent friction at home, a breakaway torque that was not measured, and a smooth family are none."""
     phi = dict.fromkeys(COULOMB.names, np.zeros(7)) | {"coulomb": BAND, "asymmetry": np.full(7, 0.2)}

@@ -88,7 +88,13 @@ LAG = SLOW_RATE / (FAST_RATE - SLOW_RATE)  # at constant acceleration, lag of th
 # A joint rests if its fast speed is below STILL_SPEED, either for STILL cycles or with a slow speed below RESTS.
 MOVES, RESTS, STILL_SPEED, STILL = 0.4, 0.2, 1.2, 25
 REVERSES = 1.2  # in units of the speed noise; a larger speed determines the direction of friction (side)
-SIDE_NOISE = 1.0  # standard deviation of the speed that determines the direction of friction / speed noise
+# standard deviation of the speed that determines the direction of friction / speed noise
+# SIDE_NOISE: noise of that speed (0.39), derived from the low-passes for white noise at 1 kHz.
+# REVERSAL_NOISE: just after a reversal, for a gear that untwists at a few mrad/s; chosen on elastic twins 0 to 5.
+SIDE_NOISE, REVERSAL_NOISE = 0.4, 1.0
+# rad, motion over which the second value decays to the first: 1.5 Nm of friction twist a gear of 15 kNm/rad by 1e-4.
+# With benchmarks/wrench.py, REVERSAL_PATH=3e-4 gives equal results on elastic twins 0 to 5.
+REVERSAL_PATH = 1e-4
 CREPT, CREEP_RATE = 1.5, 50.0  # displacement of a creeping joint / angle noise; 1/s, low-pass of this displacement
 # friction variance / squared distance between the breakaway edges
 # BRISTLES: a moving joint in the middle of presliding; BRISTLES_AT_REST: a joint at rest, for a family with bristles

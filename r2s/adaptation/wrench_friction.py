@@ -23,6 +23,7 @@ from r2s.adaptation.wrench_state import (
     MOMENTUM_NOISE,
     MOTOR_MEAN,
     MOVED,
+    PATH,
     QUIET,
     REST,
     SLOW,
@@ -88,6 +89,7 @@ def known_torque(arm, noise, state, q):
             side = 1.0 if side > 0.0 else -1.0
             speed = side * max(side * now, 0.0)
             moved = abs(joints[CREEP, j]) if joints[CREEP, j] != 0.0 else abs(speed) * SIM_DT
+            joints[PATH, j] = side * max(side * joints[PATH, j], 0.0) + SIM_DT * joints[SLOW, j]
             model, joints[DEFLECTION, j] = _model(arm, noise, state, j, q[j], side, speed, moved)
             if rested:
                 joints[FRICTION_BEFORE, j] = model
@@ -166,11 +168,14 @@ def _unlagged(joints, j):
 def side_variance(noise, joints, j):
     """Return the variance (Nm^2) of a moving joint's friction due to uncertain sign, presliding and Stribeck effect.
 
-    If the sign of a friction f is wrong with probability p, the variance is 4 f^2 p (1 - p).
+    If the sign of a friction f is wrong with probability p, the variance is 4 f^2 p (1 - p). After a reversal, p is
+    larger, because friction changes its sign only when the gear has untwisted.
     """
     now = _unlagged(joints, j)
     lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
-    sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
+    twist = np.exp(-abs(joints[PATH, j]) / tuning.REVERSAL_PATH)
+    share = tuning.SIDE_NOISE + (tuning.REVERSAL_NOISE - tuning.SIDE_NOISE) * twist
+    sd = np.sqrt((share * noise.speed) ** 2 + lag**2)
     p = 1.0 / (1.0 + np.exp(min(1.7 * abs(now) / sd, 50.0)))  # approximately the normal cdf
     unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # due to presliding, whose law is uncertain
     slow = tuning.EXCESS_ERROR * excess_friction(noise, j, now, now)

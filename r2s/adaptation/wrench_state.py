@@ -25,8 +25,9 @@ SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING, IMPACT_SQUARE, IMPACT_ABOVE, U
 # MOTOR, MOTOR_MEAN: motor torque now, mean motor torque in the coming cycle, Nm.
 # MOMENTUM_NOISE: variance of the measured momentum, (Nm s)^2. SLOW_P: low-passed momentum, Nm s.
 # FAST_P: low-passed difference momentum - SLOW_P, Nm s. SHAKE: mean square of the momentum's high-frequency part.
+# PATH: motion since the last reversal, rad, with the sign of its direction.
 ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
-MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)
+MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, PATH, ROWS = range(12, 21)
 
 
 class WrenchNoise(NamedTuple):
