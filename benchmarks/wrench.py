@@ -26,7 +26,7 @@ from common import CONSTANT, JUDGING, ROBOT, ROOT, identify_twins, markdown_rows
 from contact_identification import identify_arm
 from press_twins import armed, press_twin, twin_run
 
-from r2s.adaptation.wrench import WrenchObserver, contact_thresholds, observe_recording
+from r2s.adaptation.wrench import WrenchObserver, observe_recording
 from r2s.adaptation.wrench_fusion import FusedWrench
 from r2s.identification.contact.contact_file import load_contact
 from r2s.physics.surface import load_tool
@@ -72,6 +72,7 @@ def scores(found: pd.DataFrame, recording, true: np.ndarray, normal: np.ndarray)
         out[f"{name} inside"] = (
             100 * float((np.abs(force - true) < half)[mask].mean()) if mask.any() else float("nan")
         )
+        out[f"{name} cycles"] = int(mask.sum())
     delays = []
     for a, b in zip(begins, [*begins[1:], len(fn)], strict=True):
         above = np.flatnonzero(fn[a:b] > DETECTED)
@@ -88,7 +89,7 @@ def arm(folder: Path) -> dict[str, str]:
     run, robot = identify_arm(folder, []), replace(ROBOT, tool=load_tool(folder / "tool.json"))
     dynamics, surface = calibrated(run, robot)[0], load_contact(run).simulated
     observer = WrenchObserver(robot, dynamics)
-    observer.thresholds = contact_thresholds(robot, observer, free_recordings(run))
+    observer.calibrate(robot, free_recordings(run))
     recording, truth = read(folder / "contact.npz", torque="commanded"), np.load(folder / "truth_contact.npz")
     true = truth["wrench"][:, :3], np.array(json.loads((folder / "truth.json").read_text())["contact"]["normal"])
     own = scores(observe_recording(robot, observer, recording), recording, *true)
@@ -98,20 +99,28 @@ def arm(folder: Path) -> dict[str, str]:
     fused = []
     for off in (0.0, OFF):
         moved = [replace(s, point=s.point + off * s.normal) for s in (surface.surface, *surface.draws)]
-        together = FusedWrench(robot, dynamics, moved[0], moved[1:], thresholds=observer.thresholds)
+        together = FusedWrench(robot, dynamics, moved[0], moved[1:], observer.thresholds, observer.sensors)
         fused.append(scores(observe_recording(robot, together, recording), recording, *true)["moving"])
     plain = "{:.2f} / {:.2f}".format(*ARMS[folder.name])
     return row(own) | {"fused, right / moved, N": "{:.2f} / {:.2f}".format(*fused), "true parameters, N": plain}
 
 
-def twin(variant: str, seed: int) -> dict[str, str]:
-    """Return the row of a twin."""
+def twin(variant: str, seed: int) -> dict:
+    """Return the scores of a twin."""
     run, robot = twin_run(variant, seed), armed(ROBOT)
     observer = WrenchObserver(robot, calibrated(run, robot)[0])
-    observer.thresholds = contact_thresholds(robot, observer, free_recordings(run))
+    observer.calibrate(robot, free_recordings(run))
     recording, *true = press_twin(robot, variant, seed)
-    found = scores(observe_recording(robot, observer, recording), recording, *true)
-    return row(found) | {"fused, right / moved, N": "", "true parameters, N": ""}
+    return scores(observe_recording(robot, observer, recording), recording, *true)
+
+
+def pooled(found: list[dict]) -> str:
+    """Return a sentence with the share of all twins' time inside the intervals."""
+    shares = [
+        sum(r[f"{name} inside"] * r[f"{name} cycles"] for r in found) / sum(r[f"{name} cycles"] for r in found)
+        for name in ("moving", "rest")
+    ]
+    return "All judging twins together: {:.1f} % inside in motion, {:.1f} % at rest.".format(*shares)
 
 
 def row(r: dict) -> dict[str, str]:
@@ -143,21 +152,24 @@ def main() -> None:
     if wrong := [word for word in words if not re.fullmatch(r"(rigid|elastic)_\d+", word)]:
         parser.error(f"--twins: '{wrong[0]}' is no twin; rigid_SEED and elastic_SEED are allowed")
     twins = [(v, int(s)) for v, _, s in (word.partition("_") for word in words)]
-    rows = {}
+    rows, judging = {}, []
     for name in ARMS if options.arms else ():
         rows[name] = arm((Path(options.arms) / name).resolve())
         print(name, rows[name], flush=True)
     identify_twins([(v, s, twin_run(v, s)) for v, s in twins], ROOT / "runs")
     for variant, seed in twins:
-        judged = " (judging)" if seed in JUDGING[variant] else ""
-        rows[f"{variant} twin {seed}{judged}"] = twin(variant, seed)
-        print(variant, seed, rows[f"{variant} twin {seed}{judged}"], flush=True)
+        found, judged = twin(variant, seed), seed in JUDGING[variant]
+        judging += [found] * judged
+        cells = row(found) | {"fused, right / moved, N": "", "true parameters, N": ""}
+        rows[f"{variant} twin {seed}" + " (judging)" * judged] = cells
+        print(variant, seed, cells, flush=True)
     if options.constants:
         return
     command = "python benchmarks/wrench.py" + f" --twins {options.twins}" * (
         options.twins != parser.get_default("twins")
     )
-    write_page("wrench", "Force without a sensor", command, [NOTE, markdown_rows(rows, "arm")])
+    summary = [pooled(judging)] if judging else []
+    write_page("wrench", "Force without a sensor", command, [NOTE, markdown_rows(rows, "arm"), *summary])
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from r2s.adaptation.kalman import Noise
 from r2s.adaptation.model_correction import apply_correction
 from r2s.adaptation.observer import Observer
 from r2s.adaptation.offline_estimation import fit_correction
-from r2s.adaptation.wrench import WrenchObserver, contact_thresholds
+from r2s.adaptation.wrench import WrenchObserver
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -56,7 +56,7 @@ class AdapterContext:
             return adapter
         wrench = WrenchObserver(self.robot, self.dynamics)
         if self.unloaded is not None:
-            wrench.thresholds = contact_thresholds(self.robot, wrench, self.unloaded)
+            wrench.calibrate(self.robot, self.unloaded)
         return ContactGate(adapter, wrench, *self.corrected)
 
 

@@ -80,7 +80,8 @@ BLENDING = -np.expm1(-SIM_DT / T)  # per cycle; the torque of a new estimate fad
 ACCELERATION_S = 1 / RATE  # s, low-pass of accelerations: a feedback loop of rate RATE tolerates an arm's latency
 
 # wrench (wrench_filter.py, wrench.py); tested by benchmarks/wrench.py on independent arms and on twins in contact
-SPEED_NOISE, ANGLE_NOISE = 3e-3, 2e-5  # rad/s, rad: sensors of a Panda, for all arms
+# rad/s, rad: sensors of a Panda, for arms without recordings; least share of this noise that an arm may have
+SPEED_NOISE, ANGLE_NOISE, LEAST_NOISE = 3e-3, 2e-5, 0.1
 ANGLE_RATE = 60.0  # 1/s, crossover: below it, speed is derived from angles; above it, from measured speeds
 SLOW_RATE, FAST_RATE = 40.0, 200.0  # 1/s, low-passes of the speed (slow speed, fast speed)
 LAG = SLOW_RATE / (FAST_RATE - SLOW_RATE)  # at constant acceleration, lag of the fast speed / (fast - slow speed)

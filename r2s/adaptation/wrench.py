@@ -28,6 +28,7 @@ from r2s.adaptation import tuning
 from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimate, Estimator
 from r2s.adaptation.offline_estimation import LEAST_HZ, at_rate, pauses
+from r2s.adaptation.sensor_noise import SensorNoise, sensor_noise
 from r2s.adaptation.wrench_filter import update_wrench
 from r2s.adaptation.wrench_state import HANGING, IMPACT_SQUARE, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
 from r2s.errors import UserError
@@ -61,19 +62,27 @@ class WrenchObserver:
 
     Attributes:
         thresholds: (2,), thresholds of force test and impact test for f^T C^-1 f, with force f and covariance C.
+        sensors: sensor noise that the observer assumes.
         tool: the robot's tool, or None if the robot has no tool.
 
     Args:
         robot, dynamics: the identified arm. thresholds: see the attribute; if None, the threshold of the force test
-            is UNCALIBRATED * GAUSSIAN, and the observer has no impact test.
+            is UNCALIBRATED * GAUSSIAN, and the observer has no impact test. sensors: if None, those of a Panda.
+            `calibrate` computes both from recordings.
     """
 
-    def __init__(self, robot: Robot, dynamics: Dynamics, thresholds: np.ndarray | None = None):
+    def __init__(
+        self,
+        robot: Robot,
+        dynamics: Dynamics,
+        thresholds: np.ndarray | None = None,
+        sensors: SensorNoise | None = None,
+    ):
         self._arm, self.tool = make_arm_model(robot, dynamics), robot.tool
         position, axes = ee_pose(robot)
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
-        self._noise = wrench_noise(robot, dynamics)
+        self._noise = wrench_noise(robot, dynamics, sensors)
         uncalibrated = (tuning.UNCALIBRATED * GAUSSIAN, np.inf)
         self.thresholds = np.array(uncalibrated if thresholds is None else thresholds, dtype=float)
         self._q, self._dq, self._tau = np.zeros((3, robot.n))
@@ -81,6 +90,12 @@ class WrenchObserver:
         zero = np.zeros(robot.n)
         self(robot.q_home, zero, zero)  # compile now, while no arm waits for the result
         self.begin()
+
+    def calibrate(self, robot: Robot, free: Sequence[Recording]) -> None:
+        """Set sensor noise and contact thresholds from recordings without contact, see `contact_thresholds`."""
+        sensors = sensor_noise([at_rate(robot, recording) for recording in free])
+        self._noise = self._noise._replace(speed=sensors.speed, angle=sensors.angle)
+        self.thresholds = contact_thresholds(robot, self, free)
 
     def begin(self) -> None:
         """Start a motion of an arm that rests, touches nothing, and carries only the payload of its model."""
@@ -118,6 +133,11 @@ class WrenchObserver:
         other._arm = self._arm._replace(compensated=compensated, declared=np.zeros(4))
         other.begin()
         return other
+
+    @property
+    def sensors(self) -> SensorNoise:
+        """Sensor noise that the observer assumes."""
+        return SensorNoise(self._noise.speed, self._noise.angle)
 
     @property
     def in_contact(self) -> bool:
@@ -170,8 +190,8 @@ class WrenchObserver:
         return self._state.joints[REST] > 0.0
 
 
-def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
-    """Return the uncertainty of an identified arm's model and sensors."""
+def wrench_noise(robot: Robot, dynamics: Dynamics, sensors: SensorNoise | None = None) -> WrenchNoise:
+    """Return the uncertainty of an identified arm's model and sensors, by default a Panda's sensors."""
     arm = make_arm_model(robot, dynamics)
     friction = tuning.WRENCH_FRICTION * arm.level + tuning.LEAST_FRICTION * robot.tau_max.min()
     edges = np.array(dynamics.breakaway, dtype=float)
@@ -180,7 +200,7 @@ def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
     excess = np.where(measured[:, None], _excess(robot, dynamics), 0.0)
     excess_speed = tuning.EXCESS_SPEED * np.array(robot.dq_max)
     presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
-    rest = tuning.INERTIA_SHARE, tuning.SPEED_NOISE, tuning.ANGLE_NOISE, tuning.FORCE_FLOOR * robot.payload_max[0]
+    rest = tuning.INERTIA_SHARE, *(sensors or SensorNoise()), tuning.FORCE_FLOOR * robot.payload_max[0]
     return WrenchNoise(friction, np.ascontiguousarray(edges), excess, excess_speed, presliding, *rest)
 
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from r2s.adaptation import tuning
+from r2s.adaptation.sensor_noise import SensorNoise
 from r2s.adaptation.wrench import WrenchObserver
 from r2s.compiled import njit
 from r2s.errors import UserError
@@ -34,14 +35,13 @@ class SurfaceLaw(NamedTuple):
 
     law: np.ndarray  # (1 + S, LAW): the estimate, then S posterior samples
     radius: float  # m, radius of the tip
-    angle: float  # rad, noise of measured angles
 
 
-def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle: float) -> SurfaceLaw:
+def surface_law(surface: Surface, draws: Sequence[Surface], radius: float) -> SurfaceLaw:
     """Return the `SurfaceLaw` of a surface and of at most `tuning.SURFACE_DRAWS` posterior samples."""
     each = [surface, *draws[: tuning.SURFACE_DRAWS]]
     law = [np.concatenate([[s.coefficient, s.exponent, s.damping], s.point, s.normal]) for s in each]
-    return SurfaceLaw(np.array(law, dtype=float), float(radius), float(angle))
+    return SurfaceLaw(np.array(law, dtype=float), float(radius))
 
 
 class FusedWrench(WrenchObserver):
@@ -62,12 +62,13 @@ class FusedWrench(WrenchObserver):
         surface: Surface,
         draws: Sequence[Surface] = (),
         thresholds: np.ndarray | None = None,
+        sensors: SensorNoise | None = None,
     ):
         if robot.tool is None:
             raise UserError("robot.tool: a force from a surface needs the tip that touches it, got none")
-        self._law = surface_law(surface, draws, robot.tool.radius, tuning.ANGLE_NOISE)
+        self._law = surface_law(surface, draws, robot.tool.radius)
         self._fused, self._fused_covariance = np.zeros(3), np.zeros((3, 3))
-        super().__init__(robot, dynamics, thresholds)
+        super().__init__(robot, dynamics, thresholds, sensors)
 
     def begin(self) -> None:
         """Start a motion from rest; trust the surface again, even after a rejection by the innovation test."""
@@ -80,6 +81,7 @@ class FusedWrench(WrenchObserver):
         touches, state = super().__call__(q, dq, tau), self._state
         fuse(
             self._law,
+            self._noise.angle,
             state.x,
             state.P,
             state.place,
@@ -117,8 +119,11 @@ def surface_force(law, k, tip, rate):
 
 
 @njit(cache=True, error_model="numpy")
-def surface_variance(law, force, depth, tip, rate, jacobian):
-    """Return the normal force's variance (N^2) due to posterior, encoder noise and errors of the contact law."""
+def surface_variance(law, angle, force, depth, tip, rate, jacobian):
+    """Return the normal force's variance (N^2) due to posterior, encoder noise and errors of the contact law.
+
+    angle: rad, noise of measured angles.
+    """
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count
@@ -126,13 +131,16 @@ def surface_variance(law, force, depth, tip, rate, jacobian):
     smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # share of the variance of white noise that passes the low-pass
     for j in range(jacobian.shape[1]):
         lever = normal[0] * jacobian[0, j] + normal[1] * jacobian[1, j] + normal[2] * jacobian[2, j]
-        square += smooth * (slope * lever * law.angle) ** 2
+        square += smooth * (slope * lever * angle) ** 2
     return square
 
 
 @njit(cache=True, error_model="numpy")
-def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance):
-    """Compute the fused force (3,) N and its covariance (3, 3) N^2; update `memory` (6,) of the observer."""
+def fuse(law, angle, force, covariance, tip, jacobian, memory, fused, fused_covariance):
+    """Compute the fused force (3,) N and its covariance (3, 3) N^2; update `memory` (6,) of the observer.
+
+    angle: rad, noise of measured angles.
+    """
     fused[:] = force[:3]
     fused_covariance[:] = covariance[:3, :3]
     normal = law.law[0, LAW_NORMAL : LAW_NORMAL + 3]
@@ -143,7 +151,7 @@ def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance)
     if pressing <= 0.0:  # the tip does not touch the surface; another part of the arm may touch something
         memory[DIFFERENCE] = 0.0
         return
-    own = surface_variance(law, pressing, depth, tip, memory[RATE], jacobian)
+    own = surface_variance(law, angle, pressing, depth, tip, memory[RATE], jacobian)
     gain, variance, difference = np.zeros(3), own, pressing
     for i in range(3):
         for k in range(3):

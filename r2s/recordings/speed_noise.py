@@ -30,7 +30,7 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
     Raises:
         UserError: the noise of a joint exceeds MAX_NOISE, so dq is not the velocity of q.
     """
-    found: list[tuple[np.ndarray, np.ndarray]] = []
+    curvatures, squares = list[np.ndarray](), list[np.ndarray]()
     joints = recordings[0].n_joints
     for recording in (spread(r, LONGEST_S) for r in recordings):
         for rows in even(recording):
@@ -43,12 +43,11 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
             count = (len(t) - 2 * half) // piece
             inside = slice(half, half + count * piece)
             error = (dq - slope)[inside].reshape(count, piece, -1)
-            found.append((np.abs(curvature[inside]).reshape(count, piece, -1).max(1), error))
-    if not found:
+            curvatures.append(np.abs(curvature[inside]).reshape(count, piece, -1).max(1))
+            squares.append(np.square(error).mean(1))
+    if not curvatures:
         return np.zeros(joints)
-    curvatures, squares = np.concatenate([c for c, _ in found]), [np.square(e).mean(1) for _, e in found]
-    calm = curvatures <= np.quantile(curvatures, CALM, axis=0)
-    noise = np.sqrt(np.nanmedian(np.where(calm, np.concatenate(squares), np.nan), axis=0))
+    noise = calm_rms(curvatures, squares)
     if (noise > MAX_NOISE).any():
         j = int(noise.argmax())
         raise UserError(
@@ -56,6 +55,17 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
             f"{MAX_NOISE:g} is allowed: is dq in rad/s, and in the order of q?"
         )
     return noise
+
+
+def calm_rms(curvatures: Sequence[np.ndarray], squares: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the root (n,) of the median of `squares` over the pieces with the smallest curvature, per joint.
+
+    Args:
+        curvatures, squares: per recording, arrays (pieces, n): largest |d2q/dt2|, mean squared error of each piece.
+    """
+    curvature, square = np.concatenate(curvatures), np.concatenate(squares)
+    calm = curvature <= np.quantile(curvature, CALM, axis=0)
+    return np.sqrt(np.nanmedian(np.where(calm, square, np.nan), axis=0))
 
 
 def even(recording: Recording) -> Iterator[slice]:

@@ -132,7 +132,7 @@ def identified_surface(cfg, robot):
 
 def wrench_observer(cfg, robot, dynamics, surface):
     """Return the wrench observer, and the source of its contact thresholds: "recordings" or "noise"."""
-    from r2s.adaptation.wrench import WrenchObserver, contact_thresholds
+    from r2s.adaptation.wrench import WrenchObserver
     from r2s.adaptation.wrench_fusion import FusedWrench
 
     observer = WrenchObserver(robot, dynamics)
@@ -140,7 +140,7 @@ def wrench_observer(cfg, robot, dynamics, surface):
         observer = FusedWrench(robot, dynamics, surface.surface, surface.draws)
     free = free_recordings(cfg.calibration) if cfg.calibration else []
     if free:
-        observer.thresholds = contact_thresholds(robot, observer, free)
+        observer.calibrate(robot, free)
     return observer, "recordings" if free else "noise"
 
 

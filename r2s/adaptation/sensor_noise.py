@@ -1,0 +1,61 @@
+"""Estimate the sensor noise of joint angles and speeds that the wrench observer assumes, from recordings."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter, savgol_coeffs, savgol_filter
+
+from r2s.adaptation import tuning
+from r2s.physics.robot import SIM_DT
+from r2s.recordings.recording import Recording
+from r2s.recordings.speed_noise import HALF_S, PIECE_S, calm_rms
+
+ROWS, PIECE = 2 * round(HALF_S / SIM_DT) + 1, round(PIECE_S / SIM_DT)  # Savitzky-Golay window, piece of a recording
+
+
+class SensorNoise(NamedTuple):
+    """Standard deviations of the white noise of a joint's sensors, by default a Panda's."""
+
+    speed: float = tuning.SPEED_NOISE  # rad/s, of dq
+    angle: float = tuning.ANGLE_NOISE  # rad, of q
+
+
+def sensor_noise(recordings: Sequence[Recording]) -> SensorNoise:
+    """Return the noise of the noisiest joint of recordings with one row per millisecond.
+
+    The method is that of `speed_noise`: the noise of dq is its difference from the slope of a local cubic fit to q,
+    and the noise of q its difference from this fit, both at low acceleration. The noise of dq is low-passed first
+    (FAST_RATE), because the observer low-passes speeds, and sensors often low-pass dq themselves. The result is the
+    standard deviation of the white noise that has the same variance after the low-pass, and at least LEAST_NOISE of a
+    Panda's noise. With each joint's own noise, the observer was less accurate on arms whose gears vibrate.
+    """
+    gain = SIM_DT * tuning.FAST_RATE
+    passed = gain / (2.0 - gain)  # share of the variance of white noise that passes the low-pass
+    kept = 1.0 - savgol_coeffs(ROWS, 3)[ROWS // 2]  # share of the variance of white noise that the fit leaves
+    response = np.pad(savgol_coeffs(ROWS, 3, deriv=1, delta=SIM_DT), (0, 5 * round(1.0 / gain)))
+    slope_noise = np.square(
+        lfilter([gain], [1.0, gain - 1.0], response)
+    ).sum()  # 1/s^2, per variance of the noise of q
+    curvatures, speeds, angles = [], [], []
+    for recording in recordings:
+        for rows in recording.stretches:
+            q, dq = recording.q[rows], recording.dq[rows]
+            if len(q) < ROWS + PIECE:
+                continue
+            fit, slope, curvature = (savgol_filter(q, ROWS, 3, deriv=k, delta=SIM_DT, axis=0) for k in range(3))
+            slow = lfilter([gain], [1.0, gain - 1.0], dq - slope, axis=0)
+            count = (len(q) - ROWS + 1) // PIECE
+            inside = slice(ROWS // 2, ROWS // 2 + count * PIECE)
+            pieces = [x[inside].reshape(count, PIECE, -1) for x in (np.abs(curvature), slow, q - fit)]
+            curvatures.append(pieces[0].max(1))
+            speeds.append(np.square(pieces[1]).mean(1))
+            angles.append(np.square(pieces[2]).mean(1))
+    if not curvatures:
+        return SensorNoise()
+    angle = calm_rms(curvatures, angles) / np.sqrt(kept)
+    square = (calm_rms(curvatures, speeds) ** 2 - slope_noise * angle**2) / passed
+    speed, share = np.sqrt(np.maximum(square, 0.0)).max(), tuning.LEAST_NOISE
+    return SensorNoise(
+        max(float(speed), share * tuning.SPEED_NOISE), max(float(angle.max()), share * tuning.ANGLE_NOISE)
+    )
