@@ -4,6 +4,7 @@ After a user's mistake, r2s prints one line on stderr and ends with exit status 
 """
 
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -36,6 +37,7 @@ def main():
         sys.exit(fail(f"{problem}; type `make setup` once, then `source .venv/bin/activate`"))
     from hydra._internal.utils import get_args_parser
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `kill` ends a run as Ctrl-C does
     try:
         if sys.argv[1:2] and sys.argv[1] in COMMANDS:
             from r2s.commands import run_command

@@ -23,6 +23,7 @@ from cli_runs import SHORT, TOY, one_line, r2s, recording, root, started, succee
 from conftest import ROOT, conf, in_blocks
 
 from r2s.engines.gazebo import RELEASES
+from r2s.runs import read_meta
 from r2s.tasks.rewards import TERMS
 
 
@@ -45,6 +46,22 @@ def stopped(root) -> Path:
     process.join()
     assert not (folder / "parameters.yaml").exists()
     return folder
+
+
+@pytest.mark.long
+def test_kill_ends_a_run_as_ctrl_c_does(root):
+    """SIGTERM, as `kill` and batch systems send it: one line, exit code 130, status `stopped`."""
+    folder, err = root / "identify" / "terminated", root / "terminated.txt"
+    err.touch()
+    process = started("stage=identify", "name=terminated", f"root={root}", *TOY, at=ROOT, err=str(err))
+    while not (folder / "checkpoints" / "search_1.npz").is_file():
+        assert process.is_alive(), "it ended before it could be terminated"
+        time.sleep(0.02)
+    process.terminate()
+    process.join()
+    assert process.exitcode == 130
+    assert f"interrupted; {folder} keeps what was written; resume={folder} goes on" in err.read_text()
+    assert read_meta(folder)["status"] == "stopped"
 
 
 @pytest.mark.long

@@ -288,6 +288,8 @@ def test_wrong_faults_and_thresholds_are_refused(panda):
         CollisionThresholds([1.0] * 3, CAUTIOUS.force)
     with pytest.raises(UserError, match=r"collision_force: expected .*, got 0.0"):
         CollisionThresholds(CAUTIOUS.torque, [0.0] * 6)
+    with pytest.raises(UserError, match=r"collision_torque: expected .*100.*, got 100"):
+        CollisionThresholds([100.0] * 7, CAUTIOUS.force)  # the arm's reflexes would be off
 
 
 def test_a_box_that_wakes_late_does_not_shorten_the_clients_time(panda, monkeypatch):

@@ -1,6 +1,7 @@
 """A recording is read back as it was written; a bad file gives one line."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,10 +33,12 @@ def test_two_dimensional_columns(tmp_path):
 def test_a_saved_recording_is_restored(tmp_path, period):
     t = np.concatenate([jittered_time(200), 40 + jittered_time(200)])  # a gap inside trajectory 3 stays inside
     r = sine(t, torque="commanded", trajectory=np.full(400, 3), period=period, name="a name")
+    r = replace(r, notes=("2 repeated rows are left out", "the last row is incomplete and left out"))
     path = tmp_path / "saved.npz"
     r.save(path)
     for torque in (None, "???", "commanded"):
         assert_same(read(path, torque=torque), r)
+        assert read(path, torque=torque).notes == r.notes
     assert "expected torque=commanded, as the file declares, got data.torque=measured" in message(
         read, path, torque="measured"
     )

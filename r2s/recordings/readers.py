@@ -86,7 +86,7 @@ def read(
     Without a column dq, dq is the central difference of q over the logged time. Gaps and clock restarts separate
     trajectories; clock restarts do not do so in bags and in files with a column `trajectory`. The reader repairs log
     faults that have only one remedy (r2s/recordings/repairs.py); the recording's notes list the repairs. A file that
-    `Recording.save` wrote is restored unchanged, but without its notes.
+    `Recording.save` wrote is restored unchanged.
 
     Raises:
         UserError: the file or a column is missing or damaged, or the values do not form a valid recording.
@@ -121,7 +121,7 @@ def from_table(table: Table, how: Options) -> Recording:
     saved = set(table) - set(SIGNALS) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
     repair = how.repair and not saved
     arrays, repairs = repair_rows(arrays) if repair else (arrays, [])
-    repairs = [*([notes["reader_note"]] if "reader_note" in notes else []), *repairs]
+    repairs = [*(notes["reader_note"].split("\n") if "reader_note" in notes else []), *repairs]
     if how.restarts and "trajectory" not in arrays and (index := restart_index(arrays["t"])) is not None:
         arrays["trajectory"] = index
     if not saved:

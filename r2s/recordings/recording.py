@@ -331,9 +331,9 @@ class Recording:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return {name: array} for all arrays that `save` writes."""
-        period = {k: np.asarray(v) for k in ("period", "command_period") if (v := getattr(self, k)) is not None}
-        own = {field: np.asarray(getattr(self, field)) for field in (*FIELDS, "torque", "name")}
-        return {**own, **period, **self.signals}
+        own = {k: getattr(self, k) for k in (*FIELDS, "torque", "name", "period", "command_period")}
+        own["reader_note"] = "\n".join(self.notes) or None
+        return {**{k: np.asarray(x) for k, x in own.items() if x is not None}, **self.signals}
 
     def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
         """Return the rows with indices `rows` (K,) as a recording with the trajectory indices `trajectory` (K,).

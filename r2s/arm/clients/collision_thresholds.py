@@ -31,7 +31,7 @@ class CollisionThresholds:
         torque: (7,) Nm, threshold of each joint. force: (6,) N, Nm, thresholds of the wrench at the end effector.
 
     Raises:
-        UserError: the number of values is wrong, or a value is not above 0.
+        UserError: the number of values is wrong, or a value is not between 0 and OFF.
     """
 
     torque: Sequence[float] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
@@ -42,7 +42,7 @@ class CollisionThresholds:
             if len(values) != count:
                 raise UserError(f"collision_{name}: expected {count} numbers, got {len(values)}")
             for value in values:
-                check_number(f"collision_{name}", value, "(0, inf)")
+                check_number(f"collision_{name}", value, f"(0, {OFF:g})")
 
 
 CAUTIOUS = CollisionThresholds()
