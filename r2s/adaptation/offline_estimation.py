@@ -62,7 +62,7 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
 def estimate_recording(
     robot: Robot, estimator: Estimator, recording: Recording, report: Callable[[Estimate], None] | None = None
 ) -> list[Estimate]:
-    """Return the estimates at the ends of a recording's 20 ms spans; pass each new estimate to `report` at once."""
+    """Return the estimates at the end of each 20 ms of a recording; call `report` with each new estimate."""
     recording, out = at_rate(robot, recording), []
     for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         estimator.begin(pause_s)

@@ -31,7 +31,7 @@ class NotCleared(ArmStopped):
 
 
 class StopRequested(ArmStopped):
-    """Error: a signal, or the end of the commanding process, ended the motion; no further motion follows."""
+    """Error: a signal ended the motion, or the commanding process has ended; no further motion follows."""
 
 
 @dataclass(frozen=True, slots=True)

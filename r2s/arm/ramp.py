@@ -83,8 +83,8 @@ def ramp(
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver ended the motion, or in real time the arm missed more than 1 % of the
-            commands; no recording is returned.
+        ArmStopped: the arm or the driver ended the motion, or a real-time arm missed more than 1 % of the commands;
+            no recording is returned.
         UserError: an argument is out of range, or no path leads to a pose.
     """
     robot = arm.robot

@@ -172,7 +172,7 @@ def cartesian_impedance(
         stiffness: N/m, largest stiffness; None: force_clip / CLIP_M, or less if `fastest_spring` requires less.
         rotational_stiffness: Nm/rad, largest stiffness; 0: only the null-space springs act on the orientation.
         force_clip: N, largest spring force at the largest stiffness. The torque limit allows a force F in all
-            directions in the home posture; force_clip may be at most F. If None, force_clip is CLIP F.
+            directions in the home posture; force_clip may be at most F, and is CLIP times F if None.
         moment_clip: Nm, largest spring moment, at most the moment that the torque limit allows in all directions;
             None: CLIP times this moment.
         null_stiffness: 1/rad; this factor times a joint's torque limit is the stiffness, Nm/rad, of the joint's

@@ -150,7 +150,7 @@ class Problem:
         return replace(out, data=self.data.reweighted(x, fitted)) if self.uses_replays else out
 
     def cost(self, u: np.ndarray) -> float:
-        """Return the sum of squares of all rows at the unit-cube parameters u (P,)."""
+        """Return the sum of all squared residuals at the parameters u (P,), scaled to [0, 1]."""
         return float((self.residual(u[None]) ** 2).sum())
 
     def prior_cost(self, u: np.ndarray) -> float:
@@ -309,8 +309,8 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
 
     Where friction rises with speed, implicit integration uses the friction at the velocity half a step later; a
     physical arm does not. The effect of implicit friction must exceed `significant` standard deviations and have
-    about the expected size. The test of size is necessary: a rotor inertia that the model lacks has a similar effect,
-    but a hundred times as large.
+    about the expected size. A rotor inertia that the model lacks has a similar effect, but one a hundred times as
+    large.
     """
     problem = problem.on_torque
     r = problem.residual(u[None])[0]

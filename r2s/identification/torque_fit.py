@@ -61,7 +61,7 @@ class Unexplained:
         return float(left / max(whole, 1e-12))
 
     def scaled(self) -> tuple[np.ndarray, float]:
-        """Fit tau by a multiple of each joint's nominal torque; return the factors (S,) and the remaining misfit."""
+        """Fit each joint's tau by a factor times its nominal torque; return the factors (S,) and the misfit."""
         factors, left, whole = [], 0.0, 1e-12
         for need, tau in (x.T for x in self._apart([self.need, self.m.tau])):
             factors.append(need @ tau / max(need @ need, 1e-12))

@@ -113,7 +113,7 @@ def _check_clock(recording: Recording) -> np.ndarray:
 
 
 def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Compare dq (T, n) with the slope of q (T, n), rad/s; return their ratio (n,), nan for joints at rest."""
+    """Return the ratio (n,) of dq (T, n) rad/s to the slope of q (T, n) rad; nan for joints at rest."""
     size = np.sqrt((slope**2).mean(0))
     seen, ratios = np.flatnonzero(size > MOVING), np.full(len(size), np.nan)
     if not len(seen):

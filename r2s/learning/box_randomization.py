@@ -22,9 +22,9 @@ class BoxRandomization(UniformRandomization):
     from the nominal pose by U(-spread, spread) in x and in y, and by U(-yaw, yaw) in yaw.
 
     Attributes:
-        table, friction: ranges [least, most] of the friction coefficients box on table, and tip on box. mass (kg),
-            stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`. size: (3,) m, edges of
-            the box.
+        table: range [least, most] of the friction coefficient between box and table. friction: the same, between tip
+            and box. mass (kg), stiffness (N/m), damping (s/m), bristle (m): ranges [least, most], see `Surface`.
+        size: (3,) m, edges of the box.
         spread, yaw: m and degrees, largest deviation of the box from its nominal pose.
         point, normal: point (3,) m and normal (3,) of the table; if None, see `table_frame`.
 

@@ -20,7 +20,7 @@ class TD3(DeterministicLearner):
 
     Args:
         scale, action_scale, shared: see `DeterministicLearner`.
-        n_critics: number of critics; the target uses the minimum over the critics, the actor loss the first critic.
+        n_critics: number of critics; the target uses the minimum over the critics, and the actor loss uses the first.
         smoothing_std, smoothing_clip: standard deviation and limit of the noise on the action in the target.
         policy_delay: number of critic updates per update of the actor and the target networks.
     """

@@ -134,7 +134,10 @@ def delayed(tau, delay, lag, steps, line, motor, cycle, out):
 
 
 def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Convert delay and lag from s to steps for `motor_torque`; limit the delay to MAX_DELAY; add EARLY steps."""
+    """Convert delay and lag from s to steps for `motor_torque`.
+
+    The function limits the delay to MAX_DELAY, and adds EARLY steps to it.
+    """
     steps = np.clip(np.asarray(delay) / SIM_DT, 0.0, MAX_DELAY / SIM_DT) + EARLY
     return steps, np.asarray(lag) / SIM_DT
 

@@ -329,7 +329,8 @@ def finish_contact(contact, h, guess):
 def _deflect(contact, slide, speed, h, terms):
     """Write the contact force, and the bristle deflection after h s at the sliding velocity `slide` (3,) m/s.
 
-    speed: m/s, magnitude of `slide` or its guess. terms: normal force N, spring constant N/m and damping N s/m.
+    speed: m/s, magnitude of `slide`, exact or estimated. terms: normal force N, spring constant N/m and
+        damping N s/m.
     """
     force, spring, damper = terms
     reach, length = max(contact[BRISTLE], RIGID), 0.0

@@ -221,8 +221,8 @@ def write_world(
 
     The physics step is 1 ms; simulated time runs as fast as possible. The world has no gravity (libfranka's
     convention), no limits of velocity or torque (r2s enforces both), and no friction (r2s applies friction torque).
-    Because SDF has no rotors, a joint damping of armature / 1 ms replaces the armature, and the engine cancels the
-    torque of this damping.
+    SDF has no rotor inertia (armature). Each joint therefore gets a damping of its armature divided by 1 ms, and the
+    engine cancels the torque of this damping.
 
     Args:
         path: file to write. robot, dynamics: the arm. plugin: the world's plugin element. version: SDF version.

@@ -214,7 +214,7 @@ def normal_force(command, shift, parameters, memory):
     """Return the desired tip force, N, against the normal: the reference plus an integral of the force error.
 
     The command contains the normal (3,), reference and measured force, N, and a flag, above 0 if force is measured.
-    The reference includes the stiffness times the action's displacement against the normal. Saturation stops the
+    The reference includes the stiffness times the action's displacement into the surface. Saturation stops the
     integral.
     """
     at = int(parameters[TARGET_AT]) + int(parameters[TARGET_SIZE])
@@ -238,7 +238,7 @@ def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
     """Estimate the slope of the surface under a sliding tip; write the force (3,) N that corrects the tip's motion.
 
     The gradient method (Widrow and Hoff, 1960) fits a slope g so that g . target velocity is the tip's speed along
-    the normal. `slide` adds this speed, in the direction of the normal, to `velocity` (3,) m/s. The correcting force
+    the normal. `slide` adds g . target velocity times the normal to `velocity` (3,) m/s. The correcting force
     is the sum of two clamped integrals of the position error, one along the motion, where friction acts, and one
     across the motion.
     """

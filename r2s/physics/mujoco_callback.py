@@ -110,7 +110,10 @@ def _first_moment(mass, xpos, xmat, h):
 
 @njit(inline="always")
 def _direction(v, net, z, user):
-    """Return the factor on load-dependent friction, in [-1, 1], and its slope, s/rad; z: bristle deflection."""
+    """Return the factor on load-dependent friction, in [-1, 1], and its derivative by the speed v, s/rad.
+
+    z: bristle deflection.
+    """
     if user[FAMILY] == BRISTLES:  # z after the coming step, without bristle damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))

@@ -1,7 +1,7 @@
 """Read the arm in an MJCF or URDF file, weld locked joints, and remove elements of the simulation.
 
 The reader removes loose objects of MJCF scenes: bodies with free or ball joints only. The reader welds a gripper's
-fingers at the positions in `robot.lock`, so the fingers become part of the link with the gripper.
+fingers at the positions in `robot.lock`, so the fingers become part of the link that carries the gripper.
 """
 
 from collections.abc import Mapping

@@ -128,8 +128,8 @@ def make_adapter(cfg, robot, source):
 def calibration_of(cfg, source):
     """Return the run folder with the adapter's model: adapt.calibration, or by default the training's calibration=.
 
-    If the training's calibration= is gone or has changed, return the training's folder `source`, which contains a
-    copy of the model but no recordings.
+    If the run folder that the training's calibration= names no longer exists or has changed, return `source`, the
+    training's own run folder, which contains a copy of the model but no recordings.
     """
     if cfg.adapt.get("calibration"):
         folder = run_folder(cfg.adapt.calibration)

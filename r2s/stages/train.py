@@ -220,7 +220,7 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config; if the training is resumed, calibration= and dr name the copies in its run folder.
+    """Return the config; in that of a resumed training, `calibration` and `dr` point to the copies in its run folder.
 
     The original files may no longer exist.
     """

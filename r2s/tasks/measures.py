@@ -83,7 +83,7 @@ class MeasureTable:
         measures: measures of this task only; r2s adds COMMON, the measures of every task.
         selection: keys of the measures that compare trainings. Every row of evaluations.csv must contain the first
             key; the last key ranks the trainings.
-        rows: columns of the table that has one row per simulator or arm; by default all `measures`.
+        rows: measures to show in the table that has one row per simulator or arm; by default all `measures`.
         comparison: columns of the table that compares trainings. curves: panels of the figure with learning curves.
         scores: panels of the figure that compares the scores of trainings.
         transfer: measures for comparing adapters episode by episode on an arm.

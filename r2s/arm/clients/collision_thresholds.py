@@ -51,7 +51,7 @@ CAUTIOUS = CollisionThresholds()
 def thresholds_for(robot: Robot, task: Task | None) -> CollisionThresholds:
     """Return thresholds above the largest contact force of a `SurfaceTask`, or of any task with a push limit.
 
-    The result is CAUTIOUS without a task, and for every other task, such as task=push without safety.force_max.
+    Without a task, and for other tasks, such as task=push without safety.force_max, the result is CAUTIOUS.
     Without safety.force_max, the largest push of a `SurfaceTask` is the sum of the requested force, the force that an
     action may add, and twice the force that joint friction may hide. The function assumes that the tip meets the
     surface at the task's approach speed.

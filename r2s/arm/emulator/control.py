@@ -260,7 +260,9 @@ class Control:
             self._arm.external = np.zeros(7)
 
     def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
-        """Filter the external torque, set wrench and contact flags; in a collision, return error index and message.
+        """Filter the external torque, and set the wrench and the contact flags.
+
+        Return index and message of the error in a collision, else None.
 
         As in libfranka, external torque is tau_J minus the torque of the control box's arm model with the `DESK`
         settings. Unlike on a real arm, friction and model errors have no effect on the emulated external torque.

@@ -126,9 +126,10 @@ class Drives:
 def motor_response(slides: Slides, mass: np.ndarray, drives: Drives) -> np.ndarray:
     """Return the response (W, F) rad/Nm of the sliding joints' motors to their commands.
 
-    For motor angles y, link angles q, gear torque g = K (y - q) + D (y' - q'), and command u of the sliding joint:
-        rotor y'' + viscous y' + g + loop (y' - q') = u, delayed and lagged (sliding joint only)
-        M q'' = g (all joints; Spong, ASME J. Dyn. Sys. Meas. Control 109, 1987, without the links' effect on rotors)
+    The model has motor angles y, link angles q, and gear torques g = K (y - q) + D (y' - q') (Spong, ASME J. Dyn.
+    Sys. Meas. Control 109, 1987, without the links' effect on rotors). u is the delayed and lagged command:
+        motor of the sliding joint: rotor y'' + viscous y' + g + loop (y' - q') = u
+        links of all joints: M q'' = g
     Each other motor moves as measured, or friction holds it at rest. A zero-order hold delays the command by half a
     sample.
 

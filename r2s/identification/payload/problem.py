@@ -122,7 +122,7 @@ class LoadedTorque:
         return np.stack(moved, -1) @ np.linalg.inv(LinkInertia(np.ones(10), centre, tensor).standard()).T
 
     def load_friction(self, payload: Payload | None) -> np.ndarray:
-        """Return the change of friction (T, n) Nm due to a payload's weight, for 1 Nm of friction per Nm of load."""
+        """Return the change of friction (T, n) Nm due to a payload's weight, for a load coefficient of 1."""
         m = self.torque.motion
         carried = mass_and_moment(self.arm.robot, payload)
         loaded = self._weight + np.array([self._load(q, carried) for q in m.q])

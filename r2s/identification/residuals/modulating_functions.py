@@ -35,11 +35,11 @@ LAG_POINTS, LAG_WEIGHTS = (x[:12] for x in np.polynomial.laguerre.laggauss(16))
 
 @dataclass(frozen=True)
 class SlidingMotion:
-    """A recording sampled at F instants, with averaging windows around T moments.
+    """A recording of F samples, with an averaging window around each of T moments.
 
     Attributes:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2, motion. bristle: (F, n), presliding state.
-        means: for each piece of the recording, n sparse matrices (moments, instants) with the window weights of each
+        means: for each piece of the recording, n sparse matrices (moments, samples) with the window weights of each
             joint. If no window covers a moment, its matrix row is zero.
         seen: (T, n) bool, whether the moment has a window; in a window, the joint slides in one direction.
         noise: (T, n) 1/s^2, standard deviation of a window's mean acceleration for white encoder noise of 1 rad.

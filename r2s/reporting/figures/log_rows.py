@@ -18,7 +18,7 @@ def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
 
 
 def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shorten the pauses of a clock t (T,) s to `PAUSE`; return the new clock from 0 s, and the row after each pause.
+    """Return the times t (T,) s from 0 s, with each pause shortened to `PAUSE`, and the first row after each pause.
 
     A pause is a time step that is longer than five median time steps, or not positive because the clock restarted.
     """
