@@ -7,6 +7,7 @@ import numpy as np
 from scipy.signal import lfilter, savgol_coeffs, savgol_filter
 
 from r2s.adaptation import tuning
+from r2s.adaptation.offline_estimation import evenly_sampled
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 from r2s.recordings.speed_noise import HALF_S, PIECE_S, calm_rms
@@ -15,15 +16,26 @@ ROWS, PIECE = 2 * round(HALF_S / SIM_DT) + 1, round(PIECE_S / SIM_DT)  # Savitzk
 
 
 class SensorNoise(NamedTuple):
-    """Standard deviations of the white noise of a joint's sensors, by default a Panda's."""
+    """Standard deviations of the white noise of a joint's sensors."""
 
-    speed: float = tuning.SPEED_NOISE  # rad/s, of dq
-    angle: float = tuning.ANGLE_NOISE  # rad, of q
+    speed: float  # rad/s, of dq
+    angle: float  # rad, of q
+
+    @property
+    def combined(self) -> float:
+        """White noise, rad/s, of dq + ANGLE_RATE q: the observer computes speeds from both, see `update_wrench`."""
+        return float(np.hypot(self.speed, tuning.ANGLE_RATE * self.angle))
+
+
+def panda_noise() -> SensorNoise:
+    """Return the noise of a Panda's sensors."""
+    return SensorNoise(tuning.SPEED_NOISE, tuning.ANGLE_NOISE)
 
 
 def sensor_noise(recordings: Sequence[Recording]) -> SensorNoise:
-    """Return the noise of the noisiest joint of recordings with one row per millisecond.
+    """Return the noise of the noisiest joint; without a recording of one row per millisecond, return a Panda's.
 
+    Recordings with other or uneven time steps do not count, because interpolation would change their noise.
     The method is that of `speed_noise`: the noise of dq is its difference from the slope of a local cubic fit to q,
     and the noise of q its difference from this fit, both at low acceleration. The noise of dq is low-passed first
     (FAST_RATE), because the observer low-passes speeds, and sensors often low-pass dq themselves. The result is the
@@ -39,7 +51,7 @@ def sensor_noise(recordings: Sequence[Recording]) -> SensorNoise:
     ).sum()  # 1/s^2, per variance of the noise of q
     curvatures, speeds, angles = [], [], []
     for recording in recordings:
-        for rows in recording.stretches:
+        for rows in recording.stretches if evenly_sampled(recording) else ():
             q, dq = recording.q[rows], recording.dq[rows]
             if len(q) < ROWS + PIECE:
                 continue
@@ -52,10 +64,9 @@ def sensor_noise(recordings: Sequence[Recording]) -> SensorNoise:
             speeds.append(np.square(pieces[1]).mean(1))
             angles.append(np.square(pieces[2]).mean(1))
     if not curvatures:
-        return SensorNoise()
+        return panda_noise()
     angle = calm_rms(curvatures, angles) / np.sqrt(kept)
     square = (calm_rms(curvatures, speeds) ** 2 - slope_noise * angle**2) / passed
-    speed, share = np.sqrt(np.maximum(square, 0.0)).max(), tuning.LEAST_NOISE
-    return SensorNoise(
-        max(float(speed), share * tuning.SPEED_NOISE), max(float(angle.max()), share * tuning.ANGLE_NOISE)
-    )
+    speed, share = np.sqrt(np.maximum(square, 0.0)), tuning.LEAST_NOISE
+    least = panda_noise()
+    return SensorNoise(max(float(speed.max()), share * least.speed), max(float(angle.max()), share * least.angle))

@@ -90,7 +90,7 @@ LAG = SLOW_RATE / (FAST_RATE - SLOW_RATE)  # at constant acceleration, lag of th
 MOVES, RESTS, STILL_SPEED, STILL = 0.4, 0.2, 1.2, 25
 REVERSES = 1.2  # in units of the speed noise; a larger speed determines the direction of friction (side)
 # standard deviation of the speed that determines the direction of friction / speed noise
-# SIDE_NOISE: noise of that speed (0.39), derived from the low-passes for white noise at 1 kHz.
+# SIDE_NOISE: noise of that speed, from the low-passes at 1 kHz: 0.36 for noise of dq, and for that of q.
 # REVERSAL_NOISE: just after a reversal, for a gear that untwists at a few mrad/s; chosen on elastic twins 0 to 5.
 SIDE_NOISE, REVERSAL_NOISE = 0.4, 1.0
 # rad, motion over which the second value decays to the first: 1.5 Nm of friction twist a gear of 15 kNm/rad by 1e-4.

@@ -28,7 +28,7 @@ from r2s.adaptation import tuning
 from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimate, Estimator
 from r2s.adaptation.offline_estimation import LEAST_HZ, at_rate, pauses
-from r2s.adaptation.sensor_noise import SensorNoise, sensor_noise
+from r2s.adaptation.sensor_noise import SensorNoise, panda_noise, sensor_noise
 from r2s.adaptation.wrench_filter import update_wrench
 from r2s.adaptation.wrench_state import HANGING, IMPACT_SQUARE, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
 from r2s.errors import UserError
@@ -82,7 +82,8 @@ class WrenchObserver:
         position, axes = ee_pose(robot)
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
-        self._noise = wrench_noise(robot, dynamics, sensors)
+        self.sensors = panda_noise() if sensors is None else sensors
+        self._noise = wrench_noise(robot, dynamics, self.sensors)
         uncalibrated = (tuning.UNCALIBRATED * GAUSSIAN, np.inf)
         self.thresholds = np.array(uncalibrated if thresholds is None else thresholds, dtype=float)
         self._q, self._dq, self._tau = np.zeros((3, robot.n))
@@ -93,8 +94,8 @@ class WrenchObserver:
 
     def calibrate(self, robot: Robot, free: Sequence[Recording]) -> None:
         """Set sensor noise and contact thresholds from recordings without contact, see `contact_thresholds`."""
-        sensors = sensor_noise([at_rate(robot, recording) for recording in free])
-        self._noise = self._noise._replace(speed=sensors.speed, angle=sensors.angle)
+        self.sensors = sensor_noise(free)
+        self._noise = self._noise._replace(speed=self.sensors.combined, angle=self.sensors.angle)
         self.thresholds = contact_thresholds(robot, self, free)
 
     def begin(self) -> None:
@@ -133,11 +134,6 @@ class WrenchObserver:
         other._arm = self._arm._replace(compensated=compensated, declared=np.zeros(4))
         other.begin()
         return other
-
-    @property
-    def sensors(self) -> SensorNoise:
-        """Sensor noise that the observer assumes."""
-        return SensorNoise(self._noise.speed, self._noise.angle)
 
     @property
     def in_contact(self) -> bool:
@@ -200,7 +196,8 @@ def wrench_noise(robot: Robot, dynamics: Dynamics, sensors: SensorNoise | None =
     excess = np.where(measured[:, None], _excess(robot, dynamics), 0.0)
     excess_speed = tuning.EXCESS_SPEED * np.array(robot.dq_max)
     presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
-    rest = tuning.INERTIA_SHARE, *(sensors or SensorNoise()), tuning.FORCE_FLOOR * robot.payload_max[0]
+    sensors = panda_noise() if sensors is None else sensors
+    rest = tuning.INERTIA_SHARE, sensors.combined, sensors.angle, tuning.FORCE_FLOOR * robot.payload_max[0]
     return WrenchNoise(friction, np.ascontiguousarray(edges), excess, excess_speed, presliding, *rest)
 
 

@@ -39,7 +39,7 @@ class WrenchNoise(NamedTuple):
     excess_speed: np.ndarray  # (n,) rad/s, speed over which `excess` decays
     presliding: np.ndarray  # (n,) rad, decay length of presliding; 0: a joint sticks until it breaks away
     inertia: float  # inertia error as a share of a joint's net torque
-    speed: float  # rad/s, white noise of measured speeds
+    speed: float  # rad/s, white noise of the speeds from dq and q, see `SensorNoise.combined`
     angle: float  # rad, noise of measured angles
     floor: float  # N, per axis: force error beyond the filter's covariance
 
@@ -49,7 +49,7 @@ class WrenchState(NamedTuple):
 
     x: np.ndarray  # (N,), mean
     P: np.ndarray  # (N, N), covariance
-    joints: np.ndarray  # (ROWS, n), see ANGLE to SHAKE
+    joints: np.ndarray  # (ROWS, n), see ANGLE to PATH
     counts: np.ndarray  # (2,), COMMAND, CYCLE
     contact: np.ndarray  # (ENTRIES,), see SURPRISE to SURPRISED
     calm: np.ndarray  # (3, 3) N^2, covariance of the force in the impact test

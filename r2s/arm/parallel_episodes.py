@@ -102,13 +102,13 @@ _finished: Any = None  # shared number of finished goals
 
 
 def _initialize(job: Any, finished: Any, parent: int) -> None:
+    global _job, _finished
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not a handler inherited from the parent process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
     import torch
 
-    global _job, _finished
     _job, _finished = job, finished
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not a handler inherited from the parent process
     # a thread watches the parent: a killed parent cannot end this process, and the pool's queue reports no end
     threading.Thread(target=follow, args=(parent, threading.Event()), daemon=True, name="follow").start()
 

@@ -121,7 +121,7 @@ def from_table(table: Table, how: Options) -> Recording:
     saved = set(table) - set(SIGNALS) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
     repair = how.repair and not saved
     arrays, repairs = repair_rows(arrays) if repair else (arrays, [])
-    repairs = [*(notes["reader_note"].split("\n") if "reader_note" in notes else []), *repairs]
+    repairs = [*(str(notes["reader_note"]).split("\n") if "reader_note" in notes else []), *repairs]
     if how.restarts and "trajectory" not in arrays and (index := restart_index(arrays["t"])) is not None:
         arrays["trajectory"] = index
     if not saved:

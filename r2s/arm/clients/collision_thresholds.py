@@ -93,11 +93,11 @@ def thresholds_of(robot: Robot, limit: PushLimit | None, cause: str | None = Non
     lever = np.abs(limit.normal @ jacobian) + FRICTION * np.linalg.norm(jacobian, axis=0)  # m
     arm = float(np.linalg.norm(tool.tip)) + tool.radius  # type: ignore[union-attr]
     reached = most * lever, most * np.repeat([1.0, arm], 3)
-    torque, force = (np.maximum(low, ERROR * low + x) for low, x in zip(cautious, reached, strict=True))
+    torque, force = (np.maximum(low, ERROR * low + x).round(1) for low, x in zip(cautious, reached, strict=True))
     if max(torque.max(), force.max()) >= OFF:
         typed = f"{limit.force_max:g} N, with safety.speed_near of {limit.speed_near:.3g} m/s,"
         raise UserError(
             f"{cause or f'safety.force_max: {typed}'} allows {most:.3g} N on a rigid surface; for that the arm's "
             f"reflexes would be off ({OFF:g} N or Nm); lower one, or set arm.collision_torque and arm.collision_force"
         )
-    return CollisionThresholds(tuple(torque.round(1).tolist()), tuple(force.round(1).tolist()))
+    return CollisionThresholds(tuple(torque.tolist()), tuple(force.tolist()))
