@@ -40,10 +40,10 @@ ARMS = {  # N: momentum observer with the true parameters, moving and at rest, f
 }
 NOTE = (
     "Normal force in contact, RMSE. The constants of the filter were chosen on these three arms, rigid twins 0 to 6 "
-    f"and elastic twins 0 to 14; twins from {JUDGING['rigid'].start} (rigid) and {JUDGING['elastic'].start} (elastic) "
-    "are for judging. fused: with the identified surface, and with the same surface moved by 0.3 mm along its normal. "
-    "seen: share of time in motion with more than 5 N in which a contact is reported. A touch includes its bounces, if "
-    "the tip touches again within 0.2 s; an alarm within a touch is not false."
+    f"and elastic twins 0 to 14. Those from {JUDGING['rigid'].start} (rigid) and {JUDGING['elastic'].start} "
+    "(elastic) are for judging. fused: with the identified surface, and with the same surface moved by 0.3 mm along "
+    "its normal. seen: share of time in motion with more than 5 N in which a contact is reported. A touch includes "
+    "its bounces, if the tip touches again within 0.2 s; an alarm within a touch is not false."
 )
 EARLY, STILL, SLOW = 50, 30, 3e-3  # cycles, cycles, rad/s
 BOUNCE = 200  # cycles within which a touch belongs to the one before

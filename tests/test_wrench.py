@@ -269,6 +269,17 @@ def test_a_surface_sharpens_the_force_as_far_as_it_is_known():
         np.testing.assert_allclose(NORMAL @ P @ NORMAL, variance / (1.0 + variance), rtol=1e-6)
 
 
+def test_a_doubtful_surface_has_less_weight():
+    """A momentum that errs by 2.5 standard deviations of the innovation: the test does not reject the surface yet."""
+    variance = 1.0 + tuning.SURFACE_FLOOR**2 + (tuning.SURFACE_SHARE * 10.0) ** 2
+    error = 2.5 * np.sqrt(variance)
+    force, P, trusted = fused(SOFT, error=error, cycles=1500)  # until the test's low-pass has settled
+    assert trusted
+    weight = 1.0 / variance / (1.0 + tuning.INFLATION * 0.5**2)
+    np.testing.assert_allclose(NORMAL @ force, 10.0 + (1.0 - weight) * error, rtol=1e-4)
+    np.testing.assert_allclose(NORMAL @ P @ NORMAL, 1.0 - weight, rtol=1e-4)
+
+
 def test_a_surface_that_was_never_identified_changes_nothing():
     """One 0.5 mm off contradicts the momentum by 5 N, one twice as stiff by 10 N: both are refused."""
     for wrong in (replace(SOFT, point=5e-4 * NORMAL), replace(SOFT, stiffness=2e4)):

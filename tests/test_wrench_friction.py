@@ -121,7 +121,7 @@ def test_friction_at_rest_hides_its_band_and_no_more():
         observer(ROBOT.q_home, zero, zero)
     J, P = jacobian(ROBOT.q_home), observer.covariance
     torque = np.sqrt(np.einsum("cj,cd,dj->j", J, P, J))
-    hidden = np.sqrt(tuning.HIDDEN) * 2.0 * BAND
+    hidden = BAND / np.sqrt(3.0)  # of a torque anywhere within +-BAND
     assert observer.rests.all()
     assert np.max(torque / hidden) == pytest.approx(1.0, abs=0.1)
     for _ in range(round(5.0 / SIM_DT)):

@@ -10,8 +10,8 @@ The uncertainty of a joint's friction depends on whether the joint moves (wrench
   short correlation time. Near zero speed, b is larger for two reasons: sensor noise makes the direction of motion
   uncertain, and the model may lack a Stribeck effect (`excess_friction`).
 - A joint at rest yields only bounds on the wrench. Friction at rest balances all other torques, and may be any torque
-  between the negative and the positive breakaway torque (edges). The variance of friction at rest is at most HIDDEN
-  times the squared distance between the edges. If the friction family has bristles, the joint angle determines the
+  between the negative and the positive breakaway torque (edges). The variance of friction at rest is at most that of
+  a uniform distribution between the edges. If the friction family has bristles, the joint angle determines the
   bristle deflection and thereby the friction, with a smaller variance. The filter treats the edges as uncertain
   (EDGE_ERROR); otherwise, a joint at rest with a larger breakaway torque than identified would look like a force.
 The filter assumes that the wrench changes when the tip moves against stiff surroundings. If all joints rest, the
@@ -182,7 +182,7 @@ def _hidden(noise, joints, j):
     square = (noise.edges[j, 1] - noise.edges[j, 0]) ** 2
     if noise.presliding[j] > 0.0:
         return joints[FRICTION, j], tuning.BRISTLES_AT_REST * square
-    return 0.5 * (noise.edges[j, 0] + noise.edges[j, 1]), tuning.HIDDEN * square
+    return 0.5 * (noise.edges[j, 0] + noise.edges[j, 1]), square / 12.0
 
 
 @njit(cache=True, error_model="numpy")

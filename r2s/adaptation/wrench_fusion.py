@@ -8,8 +8,9 @@ angles are noisy.
 
 The force F_s is wrong if the tip touches a different surface or if the identified surface has moved. An innovation
 test (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking, 2001, 5.4) therefore rejects a surface
-if the low-passed innovation exceeds REFUSED standard deviations. The estimate ignores a rejected surface until the
-motion ends, because any surface would pass the test at a small force.
+if the low-passed innovation exceeds REFUSED standard deviations. Above INFLATED standard deviations, the surface's
+weight decreases. The estimate ignores a rejected surface until the motion ends, because any surface would pass the
+test at a small force.
 """
 
 from collections.abc import Sequence
@@ -164,6 +165,7 @@ def fuse(law, angle, force, covariance, tip, jacobian, memory, fused, fused_cova
         memory[TRUSTED] = 0.0
     if memory[TRUSTED] == 0.0:
         return
+    variance *= 1.0 + tuning.INFLATION * max(abs(memory[TESTED]) - tuning.INFLATED, 0.0) ** 2
     for i in range(3):
         fused[i] += gain[i] * memory[DIFFERENCE] / variance
         for k in range(3):
