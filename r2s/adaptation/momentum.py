@@ -110,7 +110,10 @@ def momentum(arm, q, dq, terms, work):
 
 @njit(cache=True, error_model="numpy")
 def _payload_columns(arm, R, p, w, v, terms, work):
-    """Write a payload's columns to `terms`; (R, p), (w, v): pose and twist of the last link about the base origin."""
+    """Write a payload's columns to `terms`.
+
+    (R, p): pose of the last link in the base frame; (w, v): its twist about the base origin.
+    """
     frame, (px, py, pz), (wx, wy, wz), (vx, vy, vz) = arm.payload_frame, p, w, v
     rx, ry, rz = rotate(R, frame[0], frame[1], frame[2])
     px, py, pz = px + rx, py + ry, pz + rz

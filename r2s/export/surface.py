@@ -75,8 +75,8 @@ def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray)
 def check_setpoint(goal: dict[str, Any], plan: np.ndarray) -> None:
     """Raise BundleError if the setpoint of the controller contradicts the plan's target, normal or force.
 
-    A setpoint's target must lie between the plan's targets of the same row and of the next row, because a setpoint
-    for a sliding target is that of the middle of the control period. The contract limits target velocity and
+    A setpoint's target must lie between the plan's targets of the same row and of the next row, because a sliding
+    target's setpoint contains the target in the middle of the control period. The contract limits target velocity and
     feedforward force.
 
     Args:

@@ -64,7 +64,8 @@ class ParameterSpace:
         nominal: dynamics at which a search starts; parameters that are not in x have their nominal value.
         robot: the arm; link inertia parameters are relative to the arm's links.
         breakaway_command: (n, 2) Nm, commands in ramps at which resting joints broke away. A breakaway torque is a
-            breakaway command plus the offset, or nominal if the command is unknown (NaN or None).
+            breakaway command plus the offset; if the command is unknown (NaN or None), the breakaway torque is
+            nominal.
         fixed: names of values that the user fixed, with bounds so narrow that no search changes them (stated.py).
     """
 
@@ -234,7 +235,7 @@ def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequen
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """Estimated parameter vector with arrays (P,) in SI units.
+    """Estimated parameters; each array is (P,), in SI units.
 
     Attributes:
         x: estimated values. identifiable: whether the data determine each value.

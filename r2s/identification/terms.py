@@ -132,5 +132,5 @@ def scaled_prior(
 
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
-    """Return `sizes` for each joint's torque limit or, if larger, the joint's largest recorded torque."""
+    """Return `sizes` for each joint's torque limit, or for its largest recorded torque where this is larger."""
     return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

@@ -25,7 +25,7 @@ class ArmData:
         excitation_seed: seed of the training motion; the validation motion has the next seed.
         excitation: file of the training motion; if None, r2s optimizes a training motion.
         ramp_poses: number of postures in which r2s records ramps of every joint in both directions; 0 means no ramps.
-        presses: number of contact motions (press and slide), which replace all motions without contact; 0 means none.
+        presses: number of contact motions (press and slide); if 0, the arm moves without contact instead.
         gears: whether to record, instead of all other motions, each joint sliding slowly under a multisine torque.
         press_point, press_normal: point (3,) m and normal (3,) of the nominal plane; if None, a work table below the
             tip in the home posture.

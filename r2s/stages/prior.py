@@ -64,8 +64,8 @@ def make_settings(cfg, torque, earlier=(), last=True):
     Args:
         earlier: list of `Earlier`, whose links and payload enter the prior. If an `Earlier` has the same kind of
             torque, all its values enter the prior, and the new model has the same friction family and terms.
-        last: whether `torque` is the last kind that r2s fits; all other fits use only the stated values of links and
-            payload.
+        last: whether `torque` is the last kind that r2s fits. Fits of earlier kinds use only the stated values of
+            links and payload.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings

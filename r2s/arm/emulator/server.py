@@ -23,10 +23,10 @@ BACKOFF_S = (1e-3, 0.4)  # s, range of the time between states, which doubles un
 class Server:
     """Serves one client at a time, in one thread.
 
-    A motion begins when the client answers the newest state. Before the client's first answer, the arm stands still,
-    and the server continues to send states, because a starting client may skip states. The server does not execute
-    the command in the first answer. The first executed command answers the first state whose
-    control_command_success_rate is above 0.
+    A motion begins when the client answers the newest state. Until the client's first answer, the arm stands still.
+    The server continues to send states, because a client that starts may miss some. The server does not execute the
+    command in the first answer. The first executed command answers the first state whose control_command_success_rate
+    is above 0.
     """
 
     def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):

@@ -8,7 +8,7 @@ rigid variant. The seed determines the robot's parameters, which only the twin r
 seeds >= 200 for evaluation.
 
 In each 1 ms cycle the control box adds gravity and friction compensation to the command. The code in
-elastic_joints.py then integrates rotors and links in steps of at most 0.05 ms. The sensors measure the motors up to
+elastic_joints.py then integrates rotors and links in steps of at most 0.05 ms. The sensors measure the motors at most
 0.5 ms before the end of the cycle.
 """
 

@@ -72,8 +72,8 @@ class GearProblem:
         slides: measured spectra. mass: (W, n, n) kg m^2, mass matrices of the links. tensors: (n, W, n, n) kg m^2,
             parts of `mass` due to each link's inertia tensor.
         rotor: (n,) kg m^2, prior median. stiffness: (n,) Nm/rad, prior median.
-        critical: (n,) critical damping of a gear / sqrt(stiffness). viscous: (n,) Nm s/rad, prior standard deviation
-            of `Drives.viscous`.
+        critical: (n,) ratio of a gear's critical damping to sqrt(stiffness). viscous: (n,) Nm s/rad, prior standard
+            deviation of `Drives.viscous`.
         noise: factor (W, 1) on `slides.sigma`.
     """
 
