@@ -249,12 +249,12 @@ SOFT = Surface(np.zeros(3), NORMAL, 1e4, exponent=1.0)
 
 def fused(surface, draws=(), error=1.0, cycles=500):
     """Return force, covariance, and whether trusted, at 10 N on SOFT with a momentum that errs along its normal."""
-    law = surface_law(surface, draws, 0.01)
+    law = surface_law(surface, draws, 0.01, 2e-5)
     memory, force, P = np.zeros(6), np.zeros(3), np.zeros((3, 3))
     memory[TRUSTED] = 1.0
     tip = (0.01 - 1e-3) * NORMAL  # 1 mm deep: 10 N
     for _ in range(cycles):
-        fuse(law, 2e-5, (10.0 + error) * NORMAL, np.eye(3), tip, np.zeros((6, 7)), memory, force, P)
+        fuse(law, (10.0 + error) * NORMAL, np.eye(3), tip, np.zeros((6, 7)), memory, force, P)
     return force, P, bool(memory[TRUSTED])
 
 

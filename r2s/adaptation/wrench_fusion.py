@@ -19,13 +19,14 @@ from typing import NamedTuple
 import numpy as np
 
 from r2s.adaptation import tuning
-from r2s.adaptation.sensor_noise import SensorNoise
+from r2s.adaptation.sensor_noise import SensorNoise, panda_noise
 from r2s.adaptation.wrench import WrenchObserver
 from r2s.compiled import njit
 from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface, normal_force
+from r2s.recordings.recording import Recording
 
 DIFFERENCE, TESTED, TRUSTED, DEPTH, RATE, SINCE = range(6)  # indices of `memory`
 LAW_K, LAW_EXPONENT, LAW_DAMPING, LAW_POINT, LAW_NORMAL, LAW = 0, 1, 2, 3, 6, 9  # columns of `SurfaceLaw.law`
@@ -36,13 +37,14 @@ class SurfaceLaw(NamedTuple):
 
     law: np.ndarray  # (1 + S, LAW): the estimate, then S posterior samples
     radius: float  # m, radius of the tip
+    angle: float  # rad, noise of measured angles
 
 
-def surface_law(surface: Surface, draws: Sequence[Surface], radius: float) -> SurfaceLaw:
+def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle: float) -> SurfaceLaw:
     """Return the `SurfaceLaw` of a surface and of at most `tuning.SURFACE_DRAWS` posterior samples."""
     each = [surface, *draws[: tuning.SURFACE_DRAWS]]
     law = [np.concatenate([[s.coefficient, s.exponent, s.damping], s.point, s.normal]) for s in each]
-    return SurfaceLaw(np.array(law, dtype=float), float(radius))
+    return SurfaceLaw(np.array(law, dtype=float), float(radius), float(angle))
 
 
 class FusedWrench(WrenchObserver):
@@ -67,9 +69,15 @@ class FusedWrench(WrenchObserver):
     ):
         if robot.tool is None:
             raise UserError("robot.tool: a force from a surface needs the tip that touches it, got none")
-        self._law = surface_law(surface, draws, robot.tool.radius)
+        sensors = panda_noise() if sensors is None else sensors
+        self._law = surface_law(surface, draws, robot.tool.radius, sensors.angle)
         self._fused, self._fused_covariance = np.zeros(3), np.zeros((3, 3))
         super().__init__(robot, dynamics, thresholds, sensors)
+
+    def calibrate(self, robot: Robot, free: Sequence[Recording]) -> None:
+        """Set sensor noise and contact thresholds from recordings without contact; see `WrenchObserver`."""
+        super().calibrate(robot, free)
+        self._law = self._law._replace(angle=self.sensors.angle)
 
     def begin(self) -> None:
         """Start a motion from rest; trust the surface again, even after a rejection by the innovation test."""
@@ -82,7 +90,6 @@ class FusedWrench(WrenchObserver):
         touches, state = super().__call__(q, dq, tau), self._state
         fuse(
             self._law,
-            self._noise.angle,
             state.x,
             state.P,
             state.place,
@@ -120,11 +127,8 @@ def surface_force(law, k, tip, rate):
 
 
 @njit(cache=True, error_model="numpy")
-def surface_variance(law, angle, force, depth, tip, rate, jacobian):
-    """Return the normal force's variance (N^2) due to posterior, encoder noise and errors of the contact law.
-
-    angle: rad, noise of measured angles.
-    """
+def surface_variance(law, force, depth, tip, rate, jacobian):
+    """Return the normal force's variance (N^2) due to posterior, encoder noise and errors of the contact law."""
     square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
     for k in range(1, count + 1):
         square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count
@@ -132,16 +136,13 @@ def surface_variance(law, angle, force, depth, tip, rate, jacobian):
     smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # share of the variance of white noise that passes the low-pass
     for j in range(jacobian.shape[1]):
         lever = normal[0] * jacobian[0, j] + normal[1] * jacobian[1, j] + normal[2] * jacobian[2, j]
-        square += smooth * (slope * lever * angle) ** 2
+        square += smooth * (slope * lever * law.angle) ** 2
     return square
 
 
 @njit(cache=True, error_model="numpy")
-def fuse(law, angle, force, covariance, tip, jacobian, memory, fused, fused_covariance):
-    """Compute the fused force (3,) N and its covariance (3, 3) N^2; update `memory` (6,) of the observer.
-
-    angle: rad, noise of measured angles.
-    """
+def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance):
+    """Compute the fused force (3,) N and its covariance (3, 3) N^2; update `memory` (6,) of the observer."""
     fused[:] = force[:3]
     fused_covariance[:] = covariance[:3, :3]
     normal = law.law[0, LAW_NORMAL : LAW_NORMAL + 3]
@@ -152,7 +153,7 @@ def fuse(law, angle, force, covariance, tip, jacobian, memory, fused, fused_cova
     if pressing <= 0.0:  # the tip does not touch the surface; another part of the arm may touch something
         memory[DIFFERENCE] = 0.0
         return
-    own = surface_variance(law, angle, pressing, depth, tip, memory[RATE], jacobian)
+    own = surface_variance(law, pressing, depth, tip, memory[RATE], jacobian)
     gain, variance, difference = np.zeros(3), own, pressing
     for i in range(3):
         for k in range(3):
