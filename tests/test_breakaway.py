@@ -163,6 +163,7 @@ def test_an_arm_that_stops_says_so(panda, truth):
 
 def test_ramps_come_back_as_they_were(recorded, tmp_path):
     ramps, path = recorded[0], tmp_path / "ramps.npz"
+    ramps = replace(ramps, recording=replace(ramps.recording, notes=("2 repeated rows are left out", "another note")))
     ramps.save(path)
     again = read_ramps(path)
     for field in ("joint", "sign", "pose"):
@@ -171,6 +172,7 @@ def test_ramps_come_back_as_they_were(recorded, tmp_path):
         np.testing.assert_array_equal(getattr(again.recording, field), getattr(ramps.recording, field))
         np.testing.assert_array_equal(getattr(read(path, torque="commanded"), field), getattr(ramps.recording, field))
     assert (again.recording.torque, again.recording.name) == ("commanded", ramps.recording.name)
+    assert again.recording.notes == ramps.recording.notes
     assert [p.name for p in tmp_path.iterdir()] == ["ramps.npz"]
     assert "ending in .npz, got 'ramps.csv'" in message(ramps.save, tmp_path / "ramps.csv")
     assert "no file" in message(read_ramps, tmp_path / "ramp.npz")

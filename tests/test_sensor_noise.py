@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from test_wrench import BAND, ROBOT, run, truth
+from test_wrench import BAND, ROBOT, free, run, truth
 
 from r2s.adaptation import tuning
 from r2s.adaptation.sensor_noise import panda_noise, sensor_noise
 from r2s.adaptation.wrench import GAUSSIAN, WrenchObserver
+from r2s.adaptation.wrench_fusion import FusedWrench
 from r2s.physics.robot import SIM_DT
+from r2s.physics.surface import Surface
 from r2s.recordings.recording import Recording
 
 
@@ -77,3 +79,22 @@ def test_only_recordings_of_one_row_per_millisecond_count():
     for recordings in ([slow], [jitter]):
         assert sensor_noise(recordings) == panda_noise()
     assert sensor_noise([slow, even]) == sensor_noise([even])
+    kept = np.delete(np.arange(len(even.t)), 7000)  # one lost row
+    lost = Recording(even.t[kept], even.q[kept], even.dq[kept], even.tau[kept], "commanded")
+    assert sensor_noise([lost]).combined == pytest.approx(sensor_noise([even]).combined, rel=0.05)
+
+
+@pytest.mark.long
+def test_a_calibrated_observer_has_the_noise_of_its_recordings():
+    """Also with a surface, whose force depends on the noise of the angles."""
+    noise, surface = np.random.default_rng(1).standard_normal((2, 3000, 7)), Surface(np.zeros(3), np.eye(3)[2], 1e4)
+    recordings = [
+        replace(free(seed), q=free(seed).q + 1e-4 * noise[0], dq=free(seed).dq + 1e-2 * noise[1]) for seed in (1, 2)
+    ]
+    found = sensor_noise(recordings)
+    for observer in (WrenchObserver(ROBOT, truth()), FusedWrench(ROBOT, truth(), surface)):
+        observer.calibrate(ROBOT, recordings)
+        assert observer.sensors == found
+        assert observer._noise.speed == found.combined > 2.0 * panda_noise().combined
+        assert observer._noise.angle == found.angle > 2.0 * panda_noise().angle
+    assert observer._law.angle == found.angle

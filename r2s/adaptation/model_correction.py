@@ -113,7 +113,7 @@ def _columns(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the regressors of links and gears (T, n, 5 n) and of joint terms (T, n, K), and two arrays (T, n).
 
-    The first array contains the residuals, Nm. The second array is True where a joint slides.
+    The former contains the residuals, Nm; the latter is True where a joint slides.
     """
     names = ("q", "dq", "friction", "y", "sliding", "acceleration", "torque_rate")
     q, v, friction, y, sliding, ddq, torque_rate = (np.array([getattr(r, name) for r in residuals]) for name in names)

@@ -55,13 +55,8 @@ def at_rate(robot: Robot, recording: Recording) -> Recording:
         raise UserError(f"data.torque: expected commanded, got {recording.torque}")
     if recording.rate_hz < LEAST_HZ:
         raise UserError(f"data: expected at least {LEAST_HZ:g} Hz, got {recording.rate_hz:.0f} Hz")
-    return recording if evenly_sampled(recording) else recording.resample(SIM_DT)
-
-
-def evenly_sampled(recording: Recording) -> bool:
-    """Return whether a recording has one row per millisecond."""
     steps = np.diff(recording.t)[np.diff(recording.trajectory) == 0]
-    return np.allclose(steps, SIM_DT, atol=1e-6)
+    return recording if np.allclose(steps, SIM_DT, atol=1e-6) else recording.resample(SIM_DT)
 
 
 def estimate_recording(

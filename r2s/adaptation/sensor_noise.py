@@ -7,10 +7,9 @@ import numpy as np
 from scipy.signal import lfilter, savgol_coeffs, savgol_filter
 
 from r2s.adaptation import tuning
-from r2s.adaptation.offline_estimation import evenly_sampled
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
-from r2s.recordings.speed_noise import HALF_S, PIECE_S, calm_rms
+from r2s.recordings.speed_noise import HALF_S, PIECE_S, calm_rms, even
 
 ROWS, PIECE = 2 * round(HALF_S / SIM_DT) + 1, round(PIECE_S / SIM_DT)  # Savitzky-Golay window, piece of a recording
 
@@ -33,9 +32,9 @@ def panda_noise() -> SensorNoise:
 
 
 def sensor_noise(recordings: Sequence[Recording]) -> SensorNoise:
-    """Return the noise of the noisiest joint; without a recording of one row per millisecond, return a Panda's.
+    """Return the noise of the noisiest joint; without parts of one row per millisecond, return a Panda's.
 
-    Recordings with other or uneven time steps do not count, because interpolation would change their noise.
+    Parts with other or uneven time steps do not count, because interpolation would change their noise.
     The method is that of `speed_noise`: the noise of dq is its difference from the slope of a local cubic fit to q,
     and the noise of q its difference from this fit, both at low acceleration. The noise of dq is low-passed first
     (FAST_RATE), because the observer low-passes speeds, and sensors often low-pass dq themselves. The result is the
@@ -51,7 +50,9 @@ def sensor_noise(recordings: Sequence[Recording]) -> SensorNoise:
     ).sum()  # 1/s^2, per variance of the noise of q
     curvatures, speeds, angles = [], [], []
     for recording in recordings:
-        for rows in recording.stretches if evenly_sampled(recording) else ():
+        for rows in even(recording):
+            if not np.allclose(np.diff(recording.t[rows]), SIM_DT, atol=1e-6):
+                continue
             q, dq = recording.q[rows], recording.dq[rows]
             if len(q) < ROWS + PIECE:
                 continue

@@ -101,7 +101,7 @@ CREPT, CREEP_RATE = 1.5, 50.0  # displacement of a creeping joint / angle noise;
 # BRISTLES: a moving joint in the middle of presliding; BRISTLES_AT_REST: a joint at rest, for a family with bristles.
 # With half of the latter, contact thresholds rise, and slow contacts are detected later.
 BRISTLES, BRISTLES_AT_REST = 0.06, 0.02
-MOMENTUM_NOISE = 1.33  # noise of the filtered speeds from which momenta are computed / speed noise
+MOMENTUM_NOISE = 1.33  # assumed noise of the speeds from which momenta are computed / their white noise
 # 1/s, high-pass of momenta; 1/s, low-pass of the high-passed momentum's square; noise variance / low-passed square
 SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
 FRICTION_NOISE_S = 0.02  # s, correlation time of the friction model's error
@@ -146,8 +146,9 @@ UNCALIBRATED = 2.4
 # wrench with a surface (wrench_fusion.py)
 DIFFERENCE_RATE, TEST_RATE, DEPTH_RATE = 50.0, 10.0, 100.0  # 1/s, low-passes: force difference, its test, depth rate
 REFUSED = 3.5  # standard deviations; a larger tested difference rejects a surface. Momentum errors last for seconds.
-# A tested difference T above INFLATED standard deviations inflates the variance by 1 + INFLATION (T - INFLATED)^2. On
-# the independent arms, T is below 1.9 for 99 % of the time with the right surface. All three were chosen there.
+# A tested difference T above INFLATED standard deviations multiplies the innovation's variance by
+# 1 + INFLATION (T - INFLATED)^2. On the independent arms, T is below 1.9 for 99 % of the time with the right surface.
+# All three were chosen there.
 INFLATED, INFLATION = 2.0, 10.0
 SURFACE_DRAWS = 16  # largest number of posterior draws
 SURFACE_SHARE, SURFACE_FLOOR = 0.02, 0.15  # error of the contact law on held-out presses: share of the force; N

@@ -71,7 +71,6 @@ class FusedWrench(WrenchObserver):
             raise UserError("robot.tool: a force from a surface needs the tip that touches it, got none")
         sensors = panda_noise() if sensors is None else sensors
         self._law = surface_law(surface, draws, robot.tool.radius, sensors.angle)
-        self._fused, self._fused_covariance = np.zeros(3), np.zeros((3, 3))
         super().__init__(robot, dynamics, thresholds, sensors)
 
     def calibrate(self, robot: Robot, free: Sequence[Recording]) -> None:
@@ -82,6 +81,7 @@ class FusedWrench(WrenchObserver):
     def begin(self) -> None:
         """Start a motion from rest; trust the surface again, even after a rejection by the innovation test."""
         super().begin()
+        self._fused, self._fused_covariance = np.zeros(3), np.zeros((3, 3))
         self._memory = np.zeros(6)
         self._memory[TRUSTED] = 1.0
 

@@ -235,7 +235,7 @@ def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequen
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """Estimated parameters; each array is (P,), in SI units.
+    """Estimated parameters in SI units; each array but `samples` is (P,).
 
     Attributes:
         x: estimated values. identifiable: whether the data determine each value.

@@ -113,7 +113,11 @@ def _check_clock(recording: Recording) -> np.ndarray:
 
 
 def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """Return the ratio (n,) of dq (T, n) rad/s to the slope of q (T, n) rad; nan for joints at rest."""
+    """Check dq (T, n) against the slope of q (T, n), rad/s; return their ratio (n,), nan for joints at rest.
+
+    Raises:
+        DataError: unit, sign or order of the joints differ.
+    """
     size = np.sqrt((slope**2).mean(0))
     seen, ratios = np.flatnonzero(size > MOVING), np.full(len(size), np.nan)
     if not len(seen):

@@ -135,7 +135,8 @@ def _from_columns(table: Table, how: Options) -> Ramps:
     trajectory = np.cumsum(cut)
     rows = np.bincount(trajectory)[trajectory] > 1  # a single row has no motion
     dropped = ("joint", "sign", *DEFAULT_COLUMNS["trajectory"])
-    table = {k: v[rows] if len(v) == len(t) else v for k, v in table.items() if v.ndim and k not in dropped}
+    noted = {k: v for k, v in table.items() if k == "reader_note"}
+    table = {k: v[rows] if len(v) == len(t) else v for k, v in table.items() if v.ndim and k not in dropped} | noted
     table["trajectory"] = np.unique(trajectory[rows], return_inverse=True)[1]
     columns = dict(columns) | {"trajectory": "trajectory"}
     motion = readers.from_table(table, replace(how, columns=columns, max_gap_s=np.inf))

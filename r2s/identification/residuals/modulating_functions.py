@@ -35,7 +35,7 @@ LAG_POINTS, LAG_WEIGHTS = (x[:12] for x in np.polynomial.laguerre.laggauss(16))
 
 @dataclass(frozen=True)
 class SlidingMotion:
-    """A recording of F samples, with an averaging window around each of T moments.
+    """A recording of F samples, and T moments with an averaging window around each at which a joint slides.
 
     Attributes:
         t: (T,) s, moments. q, dq, ddq: (F, n) rad, rad/s, rad/s^2, motion. bristle: (F, n), presliding state.

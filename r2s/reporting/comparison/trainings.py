@@ -92,7 +92,7 @@ def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[
 
 
 def why_not(folder: Path, stage: str, files: Iterable[str]) -> str:
-    """Return "" for the folder of a finished run of `stage` with all `files`, and otherwise what is missing."""
+    """Return why a folder is not that of a finished run of `stage` with all `files`, or "" if it is."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
         seen, status = meta.get("stage", "train"), meta["status"]
