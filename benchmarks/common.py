@@ -20,7 +20,7 @@ import yaml
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 NUMBER = r"\d+(\.\d+)?"
-CONSTANT = rf"[A-Z_]+={NUMBER}"
+CONSTANT = rf"[A-Z_]+={NUMBER}(e-?\d+)?"
 PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
 ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments; scripts not listed check their own
     "algorithms": ("page",),

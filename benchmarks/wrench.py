@@ -111,7 +111,8 @@ def twin(variant: str, seed: int) -> dict:
     observer = WrenchObserver(robot, calibrated(run, robot)[0])
     observer.calibrate(robot, free_recordings(run))
     recording, *true = press_twin(robot, variant, seed)
-    return scores(observe_recording(robot, observer, recording), recording, *true)
+    found = scores(observe_recording(robot, observer, recording), recording, *true)
+    return found | {"thresholds": observer.thresholds}
 
 
 def pooled(found: list[dict]) -> str:
@@ -162,7 +163,7 @@ def main() -> None:
         judging += [found] * judged
         cells = row(found) | {"fused, right / moved, N": "", "true parameters, N": ""}
         rows[f"{variant} twin {seed}" + " (judging)" * judged] = cells
-        print(variant, seed, cells, flush=True)
+        print(variant, seed, cells, "contact thresholds:", found["thresholds"].round(1), flush=True)
     if options.constants:
         return
     command = "python benchmarks/wrench.py" + f" --twins {options.twins}" * (

@@ -8,10 +8,12 @@ from scipy.signal import lfilter, savgol_coeffs, savgol_filter
 
 from r2s.adaptation import tuning
 from r2s.physics.robot import SIM_DT
+from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
-from r2s.recordings.speed_noise import HALF_S, PIECE_S, calm_rms, even
+from r2s.recordings.speed_noise import HALF_S, LONGEST_S, PIECE_S, calm_rms, even, in_pieces
 
-ROWS, PIECE = 2 * round(HALF_S / SIM_DT) + 1, round(PIECE_S / SIM_DT)  # Savitzky-Golay window, piece of a recording
+HALF, PIECE = round(HALF_S / SIM_DT), round(PIECE_S / SIM_DT)  # rows: half window of the local fits, a piece
+ROWS = 2 * HALF + 1
 
 
 class SensorNoise(NamedTuple):
@@ -43,31 +45,24 @@ def sensor_noise(recordings: Sequence[Recording]) -> SensorNoise:
     """
     gain = SIM_DT * tuning.FAST_RATE
     passed = gain / (2.0 - gain)  # share of the variance of white noise that passes the low-pass
-    kept = 1.0 - savgol_coeffs(ROWS, 3)[ROWS // 2]  # share of the variance of white noise that the fit leaves
+    kept = 1.0 - savgol_coeffs(ROWS, 3)[HALF]  # share of the variance of white noise that the fit leaves
     response = np.pad(savgol_coeffs(ROWS, 3, deriv=1, delta=SIM_DT), (0, 5 * round(1.0 / gain)))
-    slope_noise = np.square(
-        lfilter([gain], [1.0, gain - 1.0], response)
-    ).sum()  # 1/s^2, per variance of the noise of q
+    low_passed = lfilter([gain], [1.0, gain - 1.0], response)
+    slope_noise = np.square(low_passed).sum()  # 1/s^2, variance of the low-passed slope / variance of q
     curvatures, speeds, angles = [], [], []
-    for recording in recordings:
+    for recording in (spread(r, LONGEST_S) for r in recordings):
         for rows in even(recording):
-            if not np.allclose(np.diff(recording.t[rows]), SIM_DT, atol=1e-6):
-                continue
             q, dq = recording.q[rows], recording.dq[rows]
-            if len(q) < ROWS + PIECE:
+            if len(q) < ROWS + PIECE or not np.allclose(np.diff(recording.t[rows]), SIM_DT, atol=1e-6):
                 continue
             fit, slope, curvature = (savgol_filter(q, ROWS, 3, deriv=k, delta=SIM_DT, axis=0) for k in range(3))
             slow = lfilter([gain], [1.0, gain - 1.0], dq - slope, axis=0)
-            count = (len(q) - ROWS + 1) // PIECE
-            inside = slice(ROWS // 2, ROWS // 2 + count * PIECE)
-            pieces = [x[inside].reshape(count, PIECE, -1) for x in (np.abs(curvature), slow, q - fit)]
-            curvatures.append(pieces[0].max(1))
-            speeds.append(np.square(pieces[1]).mean(1))
-            angles.append(np.square(pieces[2]).mean(1))
+            curvatures.append(np.abs(in_pieces(curvature, HALF, PIECE)).max(1))
+            speeds.append(np.square(in_pieces(slow, HALF, PIECE)).mean(1))
+            angles.append(np.square(in_pieces(q - fit, HALF, PIECE)).mean(1))
     if not curvatures:
         return panda_noise()
     angle = calm_rms(curvatures, angles) / np.sqrt(kept)
     square = (calm_rms(curvatures, speeds) ** 2 - slope_noise * angle**2) / passed
-    speed, share = np.sqrt(np.maximum(square, 0.0)), tuning.LEAST_NOISE
-    least = panda_noise()
+    speed, share, least = np.sqrt(np.maximum(square, 0.0)), tuning.LEAST_NOISE, panda_noise()
     return SensorNoise(max(float(speed.max()), share * least.speed), max(float(angle.max()), share * least.angle))

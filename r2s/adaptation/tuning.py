@@ -147,8 +147,8 @@ UNCALIBRATED = 2.4
 DIFFERENCE_RATE, TEST_RATE, DEPTH_RATE = 50.0, 10.0, 100.0  # 1/s, low-passes: force difference, its test, depth rate
 REFUSED = 3.5  # standard deviations; a larger tested difference rejects a surface. Momentum errors last for seconds.
 # A tested difference T above INFLATED standard deviations multiplies the innovation's variance by
-# 1 + INFLATION (T - INFLATED)^2. On the independent arms, T is below 1.9 for 99 % of the time with the right surface.
-# All three were chosen there.
+# 1 + INFLATION (T - INFLATED)^2. By hand, T is below 2 for 99 % of the time on the independent arms with the right
+# surface. All three were chosen there.
 INFLATED, INFLATION = 2.0, 10.0
 SURFACE_DRAWS = 16  # largest number of posterior draws
 SURFACE_SHARE, SURFACE_FLOOR = 0.02, 0.15  # error of the contact law on held-out presses: share of the force; N

@@ -82,7 +82,7 @@ class WrenchObserver:
         position, axes = ee_pose(robot)
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
-        self.sensors = panda_noise() if sensors is None else sensors
+        self.sensors = sensors or panda_noise()
         self._noise = wrench_noise(robot, dynamics, self.sensors)
         uncalibrated = (tuning.UNCALIBRATED * GAUSSIAN, np.inf)
         self.thresholds = np.array(uncalibrated if thresholds is None else thresholds, dtype=float)
@@ -196,7 +196,7 @@ def wrench_noise(robot: Robot, dynamics: Dynamics, sensors: SensorNoise | None =
     excess = np.where(measured[:, None], _excess(robot, dynamics), 0.0)
     excess_speed = tuning.EXCESS_SPEED * np.array(robot.dq_max)
     presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
-    sensors = panda_noise() if sensors is None else sensors
+    sensors = sensors or panda_noise()
     rest = tuning.INERTIA_SHARE, sensors.combined, sensors.angle, tuning.FORCE_FLOOR * robot.payload_max[0]
     return WrenchNoise(friction, np.ascontiguousarray(edges), excess, excess_speed, presliding, *rest)
 

@@ -69,7 +69,7 @@ class FusedWrench(WrenchObserver):
     ):
         if robot.tool is None:
             raise UserError("robot.tool: a force from a surface needs the tip that touches it, got none")
-        sensors = panda_noise() if sensors is None else sensors
+        sensors = sensors or panda_noise()
         self._law = surface_law(surface, draws, robot.tool.radius, sensors.angle)
         super().__init__(robot, dynamics, thresholds, sensors)
 

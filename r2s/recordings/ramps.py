@@ -104,7 +104,7 @@ def read_ramps(
 def _saved(table: Table) -> Ramps:
     """Return the ramps in the table of a file that `Ramps.save` wrote."""
     t, q, dq, tau, trajectory = (table[k] for k in FIELDS)
-    notes = tuple(str(table["reader_note"]).split("\n")) if "reader_note" in table else ()
+    notes = readers.notes_of(table)
     motion = Recording(t, q, dq, tau, str(table["torque"]), trajectory, name=str(table["name"]), notes=notes)
     return Ramps(motion, table["joint"], table["sign"], table["pose"])
 

@@ -105,10 +105,15 @@ def read(
         raise UserError(f"{path}: {error}") from None
 
 
+def notes_of(table: Table) -> tuple[str, ...]:
+    """Return the notes that `Recording.save` or a reader wrote to a table."""
+    return tuple(str(table["reader_note"]).split("\n")) if "reader_note" in table else ()
+
+
 def from_table(table: Table, how: Options) -> Recording:
     """Build a recording from the columns of a file; error messages do not contain the file name."""
     notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars that `Recording.save` or a reader wrote
-    table = {k: v for k, v in table.items() if v.ndim > 0}
+    earlier, table = notes_of(table), {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(how.torque, notes.get("torque"))
     constant = how.torque_constant
     specs, names_of = specs_of(how.columns), how.robot_joints
@@ -121,7 +126,7 @@ def from_table(table: Table, how: Options) -> Recording:
     saved = set(table) - set(SIGNALS) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
     repair = how.repair and not saved
     arrays, repairs = repair_rows(arrays) if repair else (arrays, [])
-    repairs = [*(str(notes["reader_note"]).split("\n") if "reader_note" in notes else []), *repairs]
+    repairs = [*earlier, *repairs]
     if how.restarts and "trajectory" not in arrays and (index := restart_index(arrays["t"])) is not None:
         arrays["trajectory"] = index
     if not saved:

@@ -40,11 +40,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
             if half * step > MAX_HALF_S or len(t) < 2 * half + 1 + piece:
                 continue
             slope, curvature = (savgol_filter(q, 2 * half + 1, 3, deriv=k, delta=step, axis=0) for k in (1, 2))
-            count = (len(t) - 2 * half) // piece
-            inside = slice(half, half + count * piece)
-            error = (dq - slope)[inside].reshape(count, piece, -1)
-            curvatures.append(np.abs(curvature[inside]).reshape(count, piece, -1).max(1))
-            squares.append(np.square(error).mean(1))
+            curvatures.append(np.abs(in_pieces(curvature, half, piece)).max(1))
+            squares.append(np.square(in_pieces(dq - slope, half, piece)).mean(1))
     if not curvatures:
         return np.zeros(joints)
     noise = calm_rms(curvatures, squares)
@@ -55,6 +52,12 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
             f"{MAX_NOISE:g} is allowed: is dq in rad/s, and in the order of q?"
         )
     return noise
+
+
+def in_pieces(x: np.ndarray, half: int, piece: int) -> np.ndarray:
+    """Return x (T, n) without `half` rows at both ends as an array (pieces, `piece` rows, n); drop what remains."""
+    count = (len(x) - 2 * half) // piece
+    return x[half : half + count * piece].reshape(count, piece, -1)
 
 
 def calm_rms(curvatures: Sequence[np.ndarray], squares: Sequence[np.ndarray]) -> np.ndarray:
